@@ -1,0 +1,175 @@
+"""Every array that a run stores: name, dimensions, type, unit and sentence.
+
+Nothing is written that is not listed here; the attributes in the store come from here, so that
+``xarray.open_zarr(run, group="fit")`` shows dimensions, units and long names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["PARAMETERS", "VARIABLES", "Variable", "variables_of"]
+
+#: The four parameters of the PCD, in the order of every (…, parameter) axis.
+PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One stored array.
+
+    Attributes:
+        path: ``group/name`` in the store.
+        dims: names of the dimensions, slowest first.
+        dtype: numpy type, or ``"*"`` where the data decide (for example the frames).
+        unit: physical unit; ``"1"`` where there is none.
+        long_name: one sentence for people.
+        symbol: the symbol of the paper, if it has one.
+    """
+
+    path: str
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    long_name: str
+    symbol: str = ""
+
+    @property
+    def group(self) -> str:
+        """Name of the group that holds the array."""
+        return self.path.split("/", 1)[0]
+
+    @property
+    def name(self) -> str:
+        """Name of the array inside its group."""
+        return self.path.split("/", 1)[1]
+
+
+_MAP = ("y", "x")
+
+_PARAMETER_WORDS = {
+    "quanta_exposure": ("e-", "quanta exposure: mean number of electrons per frame", "H"),
+    "conversion_gain": ("e-/DN", "conversion gain", "g"),
+    "bias": ("DN", "bias: DN at zero electrons", "mu"),
+    "read_noise_dn": ("DN", "read noise, quantisation included", "sigma"),
+    "read_noise_e": ("e-", "read noise, quantisation included", "sigma_e-"),
+    "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R"),
+    "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time", "i_d"),
+}
+
+
+def _parameter(group: str, name: str, words: str = "") -> Variable:
+    unit, sentence, symbol = _PARAMETER_WORDS[name]
+    return Variable(f"{group}/{name}", _MAP, "float64", unit, words + sentence, symbol)
+
+
+def _stderr(group: str, name: str) -> Variable:
+    unit, sentence, _ = _PARAMETER_WORDS[name]
+    return Variable(f"{group}/{name}_stderr", _MAP, "float64", unit, f"standard error of the {sentence}")
+
+
+def _both(group: str, names: tuple[str, ...]) -> list[Variable]:
+    return [make(group, name) for name in names for make in (_parameter, _stderr)]
+
+
+_ALL: list[Variable] = [
+    Variable("frames/dn", ("frame", "y", "x"), "*", "DN", "raw frames"),
+    # counts per pixel; DN of bin b is origin + b
+    Variable("histogram/counts", ("y", "x", "bin"), "*", "1", "number of frames with DN = origin + bin"),
+    Variable("histogram/origin", _MAP, "int32", "DN", "DN of bin 0"),
+    Variable("histogram/under", _MAP, "uint32", "1", "number of frames below bin 0"),
+    Variable("histogram/over", _MAP, "uint32", "1", "number of frames above the last bin"),
+    Variable("histogram/minimum", _MAP, "int32", "DN", "smallest DN seen"),
+    Variable("histogram/maximum", _MAP, "int32", "DN", "largest DN seen"),
+    # what histograms lose: order in time and neighbours in space
+    Variable("summary/block_sum", ("block", "y", "x"), "int64", "DN", "sum over a block of frames"),
+    Variable(
+        "summary/block_sum_square", ("block", "y", "x"), "int64", "DN2", "sum of squares over a block of frames"
+    ),
+    Variable("summary/lag1_covariance", _MAP, "float64", "DN2", "covariance of successive frames, within blocks"),
+    Variable(
+        "summary/neighbour_covariance_x", _MAP, "float64", "DN2", "covariance with the pixel at x + 1, within blocks"
+    ),
+    Variable(
+        "summary/neighbour_covariance_y", _MAP, "float64", "DN2", "covariance with the pixel at y + 1, within blocks"
+    ),
+    Variable("summary/row_sum", ("frame", "y"), "int64", "DN", "sum over a row of a frame"),
+    Variable("summary/row_sum_square", ("frame", "y"), "int64", "DN2", "sum of squares over a row of a frame"),
+    Variable(
+        "summary/column_sum", ("frame", "row_group", "x"), "int64", "DN", "sum over 64 rows of a column of a frame"
+    ),
+    Variable("summary/frame_mean", ("frame",), "float64", "DN", "mean of a frame"),
+    Variable("summary/frame_variance", ("frame",), "float64", "DN2", "variance over the pixels of a frame"),
+    *_both("fit", PARAMETERS),
+    Variable(
+        "fit/covariance",
+        ("y", "x", "parameter", "parameter_2"),
+        "float64",
+        "1",
+        "covariance of (H, g, mu, sigma) from the observed information",
+    ),
+    Variable("fit/log_likelihood", _MAP, "float64", "nat", "log-likelihood at the estimate"),
+    Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up"),
+    Variable("fit/fit_status", _MAP, "uint16", "1", "reasons for caution or failure, as bits; 0 is fine"),
+    Variable("fit/n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel"),
+    Variable("fit/goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of the histogram, bins merged"),
+    Variable("fit/goodness_dof", _MAP, "int32", "1", "degrees of freedom of goodness_chi2"),
+    Variable("fit/goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds"),
+    *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")),
+    Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
+    # raw ensemble (paper, Sec. II-C): axis `dn`
+    Variable("ensemble/dn", ("dn",), "int32", "DN", "digital number"),
+    Variable("ensemble/counts", ("dn",), "int64", "1", "ensemble histogram of the chosen frames"),
+    Variable("ensemble/counts_all", ("dn",), "int64", "1", "ensemble histogram of all frames"),
+    Variable("ensemble/density", ("dn",), "float64", "1/DN", "ensemble histogram of the chosen frames, normalised"),
+    Variable("ensemble/density_all", ("dn",), "float64", "1/DN", "ensemble histogram of all frames, normalised"),
+    Variable("ensemble/epcd_exact", ("dn",), "float64", "1/DN", "EPCD: mean of the pixels' PCDs", "f_E"),
+    Variable("ensemble/epcd_dependent", ("dn",), "float64", "1/DN", "EPCD: 4-D histogram of the parameters", "f_E"),
+    Variable(
+        "ensemble/epcd_independent", ("dn",), "float64", "1/DN", "EPCD: product of four histograms", "f_E"
+    ),
+    # after two-point non-uniformity correction: axis `electrons`
+    Variable("ensemble/electrons", ("electrons",), "float64", "e-", "centre of the bin of NUCed data"),
+    Variable("ensemble/nuced_counts", ("electrons",), "int64", "1", "ensemble histogram of NUCed frames"),
+    Variable("ensemble/nuced_density", ("electrons",), "float64", "1/e-", "NUCed ensemble histogram, normalised"),
+    Variable("ensemble/nuced_exact", ("electrons",), "float64", "1/e-", "NUCed EPCD: mean over the pixels", "f_E'"),
+    Variable(
+        "ensemble/nuced_dependent", ("electrons",), "float64", "1/e-", "NUCed EPCD: 2-D histogram of (H, s_e)", "f_E'"
+    ),
+    Variable(
+        "ensemble/nuced_independent", ("electrons",), "float64", "1/e-", "NUCed EPCD: product of histograms", "f_E'"
+    ),
+    # electron numbers: axis `k`
+    Variable("ensemble/k", ("k",), "int32", "e-", "electron number", "k"),
+    Variable("ensemble/electron_counts", ("k",), "int64", "1", "histogram of the estimated electron numbers"),
+    Variable("ensemble/electron_mass", ("k",), "float64", "1", "histogram of electron numbers, normalised"),
+    Variable("ensemble/electron_pmf", ("k",), "float64", "1", "mass predicted from the map of H", "p_Ke"),
+    Variable("ensemble/electron_pmf_map", ("k",), "float64", "1", "mass that the estimator of k should show"),
+    Variable("ensemble/component_mean", ("k",), "float64", "DN", "mean of the EPCD's component k", "E(E|K_e=k)"),
+    Variable(
+        "ensemble/component_variance",
+        ("case", "k"),
+        "float64",
+        "DN2",
+        "variance of the EPCD's component k, parameters of the case held constant",
+        "Var(E|K_e=k)",
+    ),
+    Variable(
+        "ensemble/nuced_component_variance",
+        ("k",),
+        "float64",
+        "e-2",
+        "variance of the NUCed EPCD's component k",
+        "Var(E'|K_e=k)",
+    ),
+    Variable("electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"),
+    *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e")],
+    Variable("truth/electron_number", ("frame", "y", "x"), "uint16", "e-", "true electron number", "K"),
+]
+
+VARIABLES: dict[str, Variable] = {variable.path: variable for variable in _ALL}
+
+
+def variables_of(group: str) -> list[Variable]:
+    """Return the variables of a group, in the order of the registry."""
+    return [variable for variable in _ALL if variable.group == group]
