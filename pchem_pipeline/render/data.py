@@ -1,0 +1,98 @@
+"""What the report is made of: plain arrays and dictionaries, no store.
+
+The stage ``report`` fills a :class:`ReportData`; everything in ``render`` draws from it. A part that a run
+does not have is empty here, and ``missing`` says why in words for the reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
+
+FloatArray = NDArray[np.float64]
+
+#: The maps of Appendix C, in the order of the paper.
+MAP_NAMES = ("dark_current", "conversion_gain", "bias", "read_noise_e")
+
+#: The parts of a report that a run may lack; the keys of ``ReportData.missing``.
+PARTS = ("pixels", "maps", "dark_current", "ensemble", "nuced", "electrons", "components", "truth")
+
+
+@dataclass(frozen=True)
+class PixelFit:
+    """Histogram and fit of one shown pixel.
+
+    Attributes:
+        label: why the pixel is shown, e.g. ``"low read noise, high exposure"``.
+        y, x: position on the sensor; for ready-made histograms ``y = 0`` and ``x`` is the channel.
+        origin: DN of ``counts[0]``.
+        counts: number of frames at each DN, shape (n_bins,).
+        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN), ``read_noise_dn`` (DN)
+            and ``read_noise_e`` (e-); NaN where the fit failed.
+        stderr: standard errors under the same names; may lack some.
+        status: words of ``fit_status``; empty if all is well.
+        goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
+    """
+
+    label: str
+    y: int
+    x: int
+    origin: int
+    counts: NDArray[np.integer[Any]]
+    parameters: Mapping[str, float]
+    stderr: Mapping[str, float] = field(default_factory=dict)
+    status: str = ""
+    goodness_p: float = float("nan")
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that a report shows.
+
+    Attributes:
+        title: heading of the report.
+        shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
+        n_frames: frames per pixel, or None if pixels differ or it is unknown.
+        integration_time: seconds, or None.
+        maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
+        fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
+        status_words: bit of ``fit_status`` to its short sentence, gravest first.
+        failed_mask: bits of ``fit_status`` for which the parameters are NaN.
+        pixels: the shown pixels.
+        ensemble: arrays of group ``ensemble``.
+        ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
+        component_cases: name of each row of ``ensemble["component_variance"]``: the parameters held constant.
+        moments: rows ``{quantity, unit, predicted, observed, stderr}`` of Appendix A.
+        truth: true maps of simulated data.
+        config_yaml: the resolved configuration.
+        run: identity of the run: name, started, host, versions, seed, ...
+        inputs: one mapping per input file: name, size, hash, ...
+        stages: one mapping per stage: stage, state, seconds, peak_memory, ...
+        missing: part (see ``PARTS``) to the reason why it is absent.
+    """
+
+    title: str
+    shape: tuple[int, int]
+    n_frames: int | None = None
+    integration_time: float | None = None
+    maps: Mapping[str, FloatArray] = field(default_factory=dict)
+    fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    status_words: Mapping[int, str] = field(default_factory=dict)
+    failed_mask: int = 0
+    pixels: Sequence[PixelFit] = ()
+    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    ensemble_facts: Mapping[str, Any] = field(default_factory=dict)
+    component_cases: Sequence[str] = ()
+    moments: Sequence[Mapping[str, Any]] = ()
+    truth: Mapping[str, FloatArray] = field(default_factory=dict)
+    config_yaml: str = ""
+    run: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Sequence[Mapping[str, Any]] = ()
+    stages: Sequence[Mapping[str, Any]] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
