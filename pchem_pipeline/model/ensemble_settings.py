@@ -1,0 +1,84 @@
+"""Settings of the parameter maps and of the ensemble prediction."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from pchem_pipeline.settings import Section
+
+__all__ = ["EnsembleSettings", "MapsSettings"]
+
+
+class MapsSettings(Section):
+    """How the parameter maps are summarised; no setting changes a map."""
+
+    percentiles: tuple[float, ...] = Field(
+        default=(1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0),
+        description="percentiles in the summary of each map, % of the pixels that have a value",
+    )
+    outlier_sigmas: float = Field(
+        default=6.0,
+        gt=0,
+        description="a pixel is an outlier beyond this many robust standard deviations (1.4826 MAD) "
+        "from the median",
+    )
+
+    @field_validator("percentiles")
+    @classmethod
+    def _within_0_100(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if any(not 0 <= p <= 100 for p in value):
+            raise ValueError("every percentile lies in 0..100")
+        if list(value) != sorted(set(value)):
+            raise ValueError("percentiles increase, none twice")
+        return value
+
+
+class EnsembleSettings(Section):
+    """The ensemble histogram and its three predictions."""
+
+    frames: int | Literal["all"] = Field(
+        default=250,
+        description="number of frames in the ensemble histogram, or all; a shorter run gives what it has",
+    )
+    first_frame: int = Field(default=0, ge=0, description="first of the frames in the ensemble histogram")
+    parameter_bins: int = Field(
+        default=48,
+        ge=2,
+        le=1000,
+        description="bins of each parameter in the 4-D, 2-D and 1-D histograms of the parameter maps",
+    )
+    parameter_coverage: float = Field(
+        default=0.998,
+        gt=0,
+        le=1,
+        description="the equal-width bins span this central part of each map, one more bin at each end holds "
+        "the rest; 1 spans minimum to maximum, which a single hot pixel can stretch",
+    )
+    cell_representative: Literal["mean", "centre"] = Field(
+        default="mean",
+        description="parameters that stand for a bin: mean of the pixels in it, or its centre",
+    )
+    nuced_bin_width: float | None = Field(
+        default=None,
+        gt=0,
+        description="bin width of the NUCed histogram, e-; null: median conversion gain times "
+        "nuced_bin_steps, which keeps the number of DN per bin the same from bin to bin",
+    )
+    nuced_bin_steps: int = Field(
+        default=1, ge=1, le=100, description="DN per bin of the NUCed histogram when nuced_bin_width is null"
+    )
+    rmse_coverage: float = Field(
+        default=0.9999,
+        gt=0,
+        le=1,
+        description="RMSE and its noise floor are taken over the DN that hold this central part of the data",
+    )
+
+    @field_validator("frames")
+    @classmethod
+    def _at_least_one(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and value < 1:
+            raise ValueError("at least one frame, or all")
+        return value
