@@ -1,0 +1,56 @@
+"""Settings of the per-pixel fit (YAML section ``fit``)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pchem_pipeline.settings import Section
+
+__all__ = ["FitSettings"]
+
+
+class FitSettings(Section):
+    """How the parameters of the PCD are estimated from the histogram of each pixel."""
+
+    algorithm: Literal["newton", "em"] = Field(
+        default="newton",
+        description="newton: a few EM steps, then a safeguarded Newton finish on the exact likelihood. "
+        "em: the plain EM of the paper (slow when the read noise exceeds 0.4 e-)",
+    )
+    max_iterations: int = Field(
+        default=200,
+        ge=1,
+        description="largest number of likelihood evaluations per start, algorithm newton",
+    )
+    em_max_iterations: int = Field(
+        default=20_000, ge=1, description="largest number of EM iterations per start, algorithm em"
+    )
+    tolerance: float = Field(
+        default=1e-8,
+        gt=0,
+        le=1e-2,
+        description="nats: converged when the likelihood can rise by less (half the squared Newton decrement), "
+        "that is when the next step is below sqrt(2 tolerance) standard errors",
+    )
+    gap_threshold: float = Field(
+        default=5.0,
+        ge=0,
+        description="nats: the bias counts as ambiguous when a runner-up (one electron more or fewer) is closer",
+    )
+    read_noise_limit: float = Field(
+        default=0.5, gt=0, description="e-: above it one sample does not determine the parameters well; flagged"
+    )
+    goodness_limit: float = Field(
+        default=1e-6, ge=0, lt=1, description="a goodness-of-fit probability below it is flagged"
+    )
+    minimum_quanta_exposure: float = Field(
+        default=1e-4, gt=0, le=0.1, description="e-: lower bound of the quanta exposure in the fit"
+    )
+    allowed_failed_fraction: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="the run ends with exit code 3 when a larger fraction of the pixels could not be fitted",
+    )
