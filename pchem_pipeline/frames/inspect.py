@@ -1,0 +1,201 @@
+"""One look at all files, and one message on all that is wrong with them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.frames.base import FrameReader
+from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
+from pchem_pipeline.frames.registry import detect_format, reader_class
+from pchem_pipeline.frames.resolve import resolve_files
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["FileReport", "InputReport", "survey"]
+
+
+@dataclass
+class FileReport:
+    """What one file is, and what is wrong with it.
+
+    Attributes:
+        path: the file.
+        format: name of its format, empty if it is not known.
+        shape: (frames, rows, columns), None if it cannot be read.
+        dtype: type of the samples, empty if it cannot be read.
+        problem: why the file cannot be used; empty if it can.
+    """
+
+    path: Path
+    format: str = ""
+    shape: tuple[int, int, int] | None = None
+    dtype: str = ""
+    problem: str = ""
+
+
+@dataclass
+class InputReport:
+    """What was found in the input files.
+
+    Attributes:
+        files: one entry per file, in reading order.
+        notes: remarks that stop nothing, such as gaps in the numbers of the files.
+        skipped: whether the bad files were left out (``on_bad_file: skip``).
+    """
+
+    files: list[FileReport] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    skipped: bool = False
+
+    @property
+    def bad(self) -> list[FileReport]:
+        """The files that cannot be used."""
+        return [file for file in self.files if file.problem]
+
+    @property
+    def good(self) -> list[FileReport]:
+        """The files that can be used."""
+        return [file for file in self.files if not file.problem]
+
+    def message(self) -> str:
+        """Return one line on all bad files and what was done about them, and the notes; empty if all is well."""
+        lines = []
+        if bad := self.bad:
+            several = f"{len(bad)} of {len(self.files)} input files cannot be used: "
+            listed = "; ".join(f"{file.path}: {file.problem}" for file in bad)
+            lines.append((several if len(self.files) > 1 else "") + listed)
+            if self.skipped:
+                lines.append("they were left out (input.on_bad_file: skip)")
+        return "; ".join(lines + self.notes)
+
+    def raise_if_refused(self, on_bad_file: Literal["error", "skip"]) -> None:
+        """Raise InputError if there are bad files that are not to be skipped, or no good ones are left."""
+        self.skipped = on_bad_file == "skip"
+        if self.bad and (on_bad_file == "error" or not self.good):
+            cure = "" if len(self.files) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
+            self.skipped = False
+            raise InputError(self.message() + cure)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report for JSON, file names without folders."""
+        return {
+            "files": len(self.files),
+            "used": len(self.good),
+            "left_out": [{"name": file.path.name, "problem": file.problem} for file in self.bad],
+            "notes": list(self.notes),
+        }
+
+
+def survey(
+    settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True
+) -> tuple[list[FrameReader], InputReport]:
+    """Open all files; return the readers of the good ones, in order, and the report on all."""
+    report = InputReport()
+    opened: list[tuple[FileReport, FrameReader]] = []
+    for path in resolve_files(settings, base_dir):
+        entry = FileReport(path)
+        report.files.append(entry)
+        reader = _open(entry, settings)
+        if reader is not None:
+            opened.append((entry, reader))
+    _mark_repeated_paths(report.files)
+    _mark_odd(opened)
+    if check_duplicates:
+        _mark_duplicates(report.good)
+    readers = [reader for entry, reader in opened if not entry.problem]
+    report.notes += dict.fromkeys(note for reader in readers for note in reader.notes)
+    report.notes += _gaps([entry.path for entry in report.files])
+    return readers, report
+
+
+def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
+    try:
+        entry.format = settings.format if settings.format != "auto" else detect_format(entry.path)
+        reader = reader_class(entry.format).open(entry.path, settings)
+    except ConfigError:
+        raise
+    except InputError as error:
+        entry.problem = str(error).removeprefix(f"{entry.path}: ")
+        return None
+    entry.shape, entry.dtype = reader.shape, str(reader.dtype)
+    if reader.shape[0] == 0 or 0 in reader.shape:
+        entry.problem = "holds no frames; leave it out"
+        return None
+    return reader
+
+
+def _mark_repeated_paths(files: list[FileReport]) -> None:
+    seen: set[Path] = set()
+    for entry in files:
+        real = entry.path.resolve()
+        if real in seen:
+            entry.problem = entry.problem or "is named twice in input.files"
+        seen.add(real)
+
+
+def _mark_odd(opened: list[tuple[FileReport, FrameReader]]) -> None:
+    """Mark files whose frames differ in shape or type from those of most files."""
+    kinds = [(reader.shape[1:], str(reader.dtype)) for entry, reader in opened if not entry.problem]
+    if not kinds:
+        return
+    common, _ = Counter(kinds).most_common(1)[0]
+    for entry, reader in opened:
+        kind = (reader.shape[1:], str(reader.dtype))
+        if kind != common and not entry.problem:
+            entry.problem = f"has {_words(kind)} frames, where the others have {_words(common)}"
+
+
+def _words(kind: tuple[tuple[int, ...], str]) -> str:
+    return f"{kind[0][0]} x {kind[0][1]} {kind[1]}"
+
+
+def _mark_duplicates(files: list[FileReport]) -> None:
+    """Mark files with the content of an earlier one: by size, then by samples, then by all bytes."""
+    by_size: defaultdict[int, list[FileReport]] = defaultdict(list)
+    for entry in files:
+        by_size[file_size(entry.path)].append(entry)
+    for group in by_size.values():
+        if len(group) < 2:
+            continue
+        by_sample: defaultdict[str, list[FileReport]] = defaultdict(list)
+        for entry in group:
+            by_sample[sample_hash(entry.path)].append(entry)
+        for alike in by_sample.values():
+            if len(alike) > 1:
+                _mark_equal(alike)
+
+
+def _mark_equal(alike: list[FileReport]) -> None:
+    first: dict[str, FileReport] = {}
+    for entry in alike:
+        original = first.setdefault(hash_file(entry.path), entry)
+        if original is not entry:
+            entry.problem = f"has the same content as {original.path.name}"
+
+
+_LAST_NUMBER = re.compile(r"(\d+)(?=\D*$)")
+
+
+def _gaps(paths: list[Path]) -> list[str]:
+    """Say which numbers are missing in the names of a numbered sequence of files."""
+    groups: defaultdict[tuple[Path, str], list[int]] = defaultdict(list)
+    for path in paths:
+        match = _LAST_NUMBER.search(path.name)
+        if match:
+            groups[path.parent, _LAST_NUMBER.sub("#", path.name)].append(int(match[1]))
+    notes = []
+    for (_, pattern), numbers in groups.items():
+        if len(numbers) < 3:
+            continue
+        steps = Counter(b - a for a, b in zip(sorted(numbers), sorted(numbers)[1:], strict=False) if b > a)
+        usual = min(steps, default=1)
+        missing = sum((step // usual - 1) * count for step, count in steps.items())
+        if missing:
+            notes.append(
+                f"{missing} of the numbered files {pattern} are missing between the first and the last"
+            )
+    return notes

@@ -1,0 +1,49 @@
+"""The doors of this room: from the settings to one reader over all files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pchem_pipeline.frames.inspect import InputReport, survey
+from pchem_pipeline.frames.sequence import FrameSequence
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["inspect_files", "open_frames"]
+
+
+def inspect_files(settings: InputSettings, base_dir: Path) -> InputReport:
+    """Open every file, and report all that is wrong with them in one message.
+
+    Args:
+        settings: the section ``input``.
+        base_dir: folder to which relative paths refer.
+
+    Returns:
+        The report; nothing is raised for bad files, whatever ``on_bad_file`` says.
+
+    Raises:
+        InputError: a path is missing or a folder empty.
+        ConfigError: an unknown format, or an optional library is missing.
+    """
+    return survey(settings, base_dir)[1]
+
+
+def open_frames(settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True) -> FrameSequence:
+    """Open all camera files as one stack, with bit shift, region of interest and frame range applied.
+
+    Args:
+        settings: the section ``input``.
+        base_dir: folder to which relative paths refer.
+        check_duplicates: also look for files with the same content (reads a little of each file).
+
+    Returns:
+        One reader, that can be shared by threads and pickled to other processes; its ``report`` says what
+        was found and left out.
+
+    Raises:
+        InputError: bad files (all in one message), fewer than two frames, or a region outside of the frames.
+        ConfigError: an unknown format, or an optional library is missing.
+    """
+    readers, report = survey(settings, base_dir, check_duplicates=check_duplicates)
+    report.raise_if_refused(settings.on_bad_file)
+    return FrameSequence(readers, settings, report)

@@ -1,0 +1,138 @@
+"""Which reader is for which file: ours, and others' from the entry point group ``pchem_pipeline.readers``.
+
+Nothing heavy is imported before a file needs it. The name of an entry point is the ``format_name`` of its reader.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+from pchem_pipeline.errors import ConfigError, InputError, MissingDependencyError
+from pchem_pipeline.frames.base import FrameReader
+
+__all__ = ["ENTRY_POINT_GROUP", "detect_format", "frame_suffixes", "reader_class", "reader_names", "require"]
+
+ENTRY_POINT_GROUP = "pchem_pipeline.readers"
+
+#: module and class of each of our readers; raw comes last since any bytes could be raw
+_OURS = {
+    "npy": ("npy", "NpyReader"),
+    "tiff": ("tiff", "TiffReader"),
+    "fits": ("fits", "FitsReader"),
+    "hdf5": ("hdf5", "Hdf5Reader"),
+    "zarr": ("omezarr", "ZarrReader"),
+    "ser": ("ser", "SerReader"),
+    "raw": ("raw", "RawReader"),
+}
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    """Return others' readers by format name, not loaded; refuse doubles."""
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        other = found.get(point.name)
+        if other is not None and other.value == point.value:
+            continue  # the same distribution seen twice on the path
+        if other is not None or point.name in _OURS or point.name in ("auto", "histogram"):
+            first = other.value if other is not None else "pchem_pipeline itself"
+            raise ConfigError(
+                f"two readers are named {point.name!r}: {first} and {point.value}; uninstall or rename one of them"
+            )
+        found[point.name] = point
+    return found
+
+
+def reader_names() -> list[str]:
+    """Return the names of all formats, ours first."""
+    return [*_OURS, *_plugins()]
+
+
+def reader_class(name: str) -> type[FrameReader]:
+    """Return the reader of a format, importing it only now.
+
+    Raises:
+        ConfigError: no such format, or a plug-in that is not a reader.
+    """
+    if name in _OURS:
+        module, cls = _OURS[name]
+        found: type[FrameReader] = getattr(importlib.import_module(f"pchem_pipeline.frames.{module}"), cls)
+        return found
+    plugins = _plugins()
+    if name not in plugins:
+        known = ", ".join([*_OURS, *plugins, "histogram"])
+        raise ConfigError(f"input.format {name!r} is not known; choose one of: auto, {known}")
+    return _load(plugins[name])
+
+
+def _load(point: EntryPoint) -> type[FrameReader]:
+    try:
+        cls = point.load()
+    except Exception as error:
+        raise ConfigError(
+            f"the reader {point.name!r} ({point.value}) cannot be loaded: {error}; repair or uninstall that package"
+        ) from error
+    if not (isinstance(cls, type) and issubclass(cls, FrameReader)) or cls.format_name != point.name:
+        raise ConfigError(
+            f"the reader {point.name!r} ({point.value}) must be a FrameReader with format_name = {point.name!r}; "
+            "repair or uninstall that package"
+        )
+    return cls
+
+
+def frame_suffixes(name: str = "auto") -> dict[str, str]:
+    """Return suffix -> format name, of one format or of all."""
+    names = reader_names() if name == "auto" else [name]
+    table: dict[str, str] = {}
+    for each in names:
+        for suffix in reader_class(each).suffixes:
+            table.setdefault(suffix, each)
+    return table
+
+
+def detect_format(path: Path) -> str:
+    """Return the format of a file: from its first bytes, then from its suffix.
+
+    Raises:
+        InputError: the file is missing, empty, or of no known format.
+    """
+    try:
+        head = b"" if path.is_dir() else _head(path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+        ) from error
+    if not head and not path.is_dir():
+        raise InputError(f"{path}: the file is empty; copy it again or leave it out")
+    names = reader_names()
+    for name in names:
+        if reader_class(name).recognises(path, head):
+            return name
+    suffixes = frame_suffixes()
+    by_suffix = suffixes.get(path.suffix.lower())
+    if by_suffix is None:
+        raise InputError(
+            f"{path}: not a known camera format ({', '.join(names)}); name it in input.format "
+            "(raw needs input.shape and input.dtype, or a sidecar file)"
+        )
+    return by_suffix
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(64)
+
+
+def require(module: str, extra: str, what: str) -> None:
+    """Check that an optional library can be imported.
+
+    Raises:
+        MissingDependencyError: it cannot; the message names the extra to install.
+    """
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f'reading and writing {what} needs {module}; install it: pip install "pchem-pipeline[{extra}]"'
+        ) from error

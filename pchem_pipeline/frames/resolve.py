@@ -1,0 +1,96 @@
+"""From paths, globs and folders to a list of files in natural order."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.frames.registry import frame_suffixes
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["HISTOGRAM_SUFFIXES", "natural_key", "resolve_files"]
+
+HISTOGRAM_SUFFIXES = {".csv": "histogram", ".npy": "histogram", ".npz": "histogram", ".txt": "histogram"}
+_GLOB = re.compile(r"[*?\[]")
+_NUMBER = re.compile(r"(\d+)")
+
+
+def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
+    """Return a key that sorts frame2 before frame10, folders first."""
+    pieces = _NUMBER.split(str(path).casefold())
+    return tuple((0, int(p)) if p.isdigit() else (1, p) for p in pieces if p), str(path)
+
+
+def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
+    """Return the files that ``input.files`` names, in natural order; a path named twice is there twice.
+
+    Args:
+        settings: the section ``input``.
+        base_dir: folder to which relative paths refer.
+
+    Raises:
+        ConfigError: no files are named.
+        InputError: a path is missing, a glob matches nothing, a folder holds no camera files or several formats.
+    """
+    if not settings.files:
+        raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")
+    found: list[Path] = []
+    for entry in settings.files:
+        path = Path(entry).expanduser()
+        path = path if path.is_absolute() else base_dir / path
+        if path.is_dir() and not _is_zarr(path):
+            found += _folder(path, settings)
+        elif path.exists():
+            found.append(path)
+        elif _GLOB.search(entry):
+            found += _glob(path, entry, settings)
+        else:
+            raise InputError(f"{path}: no such file or folder; correct input.files")
+    return sorted(found, key=natural_key)
+
+
+def _is_zarr(path: Path) -> bool:
+    return any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
+
+
+def _glob(pattern: Path, entry: str, settings: InputSettings) -> list[Path]:
+    relative = pattern.relative_to(pattern.anchor)
+    matches = list(Path(pattern.anchor).glob(str(relative)))
+    files = [path for path in matches if not path.name.startswith(".") and not _is_sidecar(path)]
+    plain = [path for path in files if path.is_file() or _is_zarr(path)]
+    if not plain:
+        raise InputError(f"{entry}: matches no file; correct input.files")
+    return plain
+
+
+def _is_sidecar(path: Path) -> bool:
+    """Tell a description (``frames.raw.json``) from frames: it is named after a file that is there."""
+    return path.suffix.lower() in (".json", ".yaml", ".yml")
+
+
+def _folder(folder: Path, settings: InputSettings) -> list[Path]:
+    if settings.format == "histogram":
+        suffixes = HISTOGRAM_SUFFIXES
+    else:
+        suffixes = frame_suffixes(settings.format)
+    entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    files = [path for path in entries if path.is_file() and path.suffix.lower() in suffixes]
+    if not files:
+        files = (
+            [path for path in entries if path.is_dir() and _is_zarr(path)]
+            if "zarr" in suffixes.values()
+            else []
+        )
+    if not files:
+        kinds = ", ".join(sorted(suffixes))
+        raise InputError(
+            f"{folder}: the folder holds no camera files ({kinds}); correct input.files or input.format"
+        )
+    formats = sorted({suffixes.get(path.suffix.lower(), "zarr") for path in files})
+    if len(formats) > 1:
+        raise InputError(
+            f"{folder}: the folder holds files of several formats ({', '.join(formats)}); "
+            "set input.format, or name the files by a glob"
+        )
+    return files

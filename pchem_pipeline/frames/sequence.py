@@ -1,0 +1,189 @@
+"""Several files as one stack: concatenation, frame range, region of interest, bit shift."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+from pchem_pipeline.frames.base import FrameReader, check_window
+from pchem_pipeline.frames.inspect import InputReport
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["FrameSequence"]
+
+_SCRATCH_BYTES = 1 << 24
+
+
+class FrameSequence(FrameReader):
+    """All frames of a list of readers of equal frame shape and type, as the settings want them.
+
+    Attributes:
+        report: what was found in the files and what was done about it.
+    """
+
+    format_name = "sequence"
+
+    def __init__(self, readers: Sequence[FrameReader], settings: InputSettings, report: InputReport) -> None:
+        """Join the readers; see `pchem_pipeline.frames.open.open_frames`, which makes them.
+
+        Raises:
+            InputError: fewer than two frames, a region of interest or frame range outside of the stack, or
+                files that contradict each other on bit depth, bit shift or integration time.
+        """
+        self.report = report
+        self._readers = tuple(readers)
+        self.paths = tuple(path for reader in readers for path in reader.paths)
+        self._ends = np.cumsum([reader.shape[0] for reader in readers]).tolist()
+        total = self._ends[-1] if self._ends else 0
+        if total < 2:
+            raise InputError(
+                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)} in all; at least 2 are needed, and some "
+                "thousands for useful estimates; add frames to input.files"
+            )
+        self._first, end = _frame_range(settings, total)
+        rows, columns = readers[0].shape[1:]
+        self._y0, y1, self._x0, self._x1 = _region(settings, rows, columns)
+        self._columns = columns
+        self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
+        self.dtype = readers[0].dtype
+        self._set_facts(readers, settings, end)
+
+    def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:
+        """Take bit shift, bit depth, integration time and times from the settings, else from the files."""
+        shift = settings.bit_shift
+        self.bit_shift = _agreed(readers, "bit_shift") or 0 if shift is None else shift
+        size = 8 * self.dtype.itemsize
+        if self.bit_shift >= size:
+            raise InputError(
+                f"{_where(self.paths)}: input.bit_shift {self.bit_shift} leaves nothing of {self.dtype} samples; correct it"
+            )
+        depth = settings.bit_depth
+        if depth is None:
+            depth = size - self.bit_shift if self.bit_shift else _agreed(readers, "bit_depth")
+        self.bit_depth = depth
+        if depth is not None and depth > size - self.bit_shift:
+            raise InputError(
+                f"{_where(self.paths)}: a bit depth of {depth} does not fit into {self.dtype} samples shifted by "
+                f"{self.bit_shift}; correct input.bit_depth or input.bit_shift"
+            )
+        time = settings.integration_time
+        self.integration_time = _agreed(readers, "integration_time") if time is None else time
+        times = [reader.timestamps for reader in readers]
+        if all(each is not None for each in times):
+            self.timestamps = np.concatenate([each for each in times if each is not None])[self._first : end]
+        self.notes = tuple(dict.fromkeys(note for reader in readers for note in reader.notes))
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """Not for single files: use `pchem_pipeline.frames.open.open_frames`."""
+        raise NotImplementedError("use open_frames")
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """See `FrameReader.read_into`; rows count from the top of the region of interest.
+
+        Raises:
+            InputError: also where dropped bits are not zero, or a value does not fit the bit depth.
+        """
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        rows = (y0 + self._y0, y1 + self._y0)
+        t, end = t0 + self._first, t1 + self._first
+        while t < end:
+            number = bisect_right(self._ends, t)
+            reader = self._readers[number]
+            start = self._ends[number] - reader.shape[0]
+            stop = min(end, self._ends[number])
+            part = buffer[t - self._first - t0 : stop - self._first - t0]
+            self._read_part(reader, part, t - start, stop - start, rows)
+            self._check_bits(reader, part)
+            t = stop
+
+    def _read_part(
+        self, reader: FrameReader, part: NDArray[Any], t0: int, t1: int, rows: tuple[int, int]
+    ) -> None:
+        """Read from one file, through a bounded scratch buffer if only some columns are wanted."""
+        if (self._x0, self._x1) == (0, self._columns):
+            reader.read_into(part, t0, t1, *rows)
+            return
+        height = rows[1] - rows[0]
+        step = max(1, _SCRATCH_BYTES // max(1, height * self._columns * self.dtype.itemsize))
+        scratch = np.empty((min(step, t1 - t0), height, self._columns), self.dtype)
+        for t in range(t0, t1, step):
+            stop = min(t + step, t1)
+            reader.read_into(scratch[: stop - t], t, stop, *rows)
+            part[t - t0 : stop - t0] = scratch[: stop - t, :, self._x0 : self._x1]
+
+    def _check_bits(self, reader: FrameReader, part: NDArray[Any]) -> None:
+        """Shift left-justified samples, refusing to lose bits; check that values fit the bit depth."""
+        size = 8 * self.dtype.itemsize
+        depth = size - self.bit_shift if self.bit_depth is None else self.bit_depth
+        if part.size == 0 or (self.bit_shift == 0 and depth == size):
+            return
+        used = int(np.bitwise_or.reduce(part, axis=None))
+        name = reader.paths[0]
+        if used & ((1 << self.bit_shift) - 1):
+            raise InputError(
+                f"{name}: the lowest {self.bit_shift} bits are not all zero, so the samples are not left-justified "
+                f"by that many; correct input.bit_shift"
+            )
+        if self.bit_shift:
+            np.right_shift(part, self.bit_shift, out=part)
+        if used >> self.bit_shift >> depth:
+            raise InputError(
+                f"{name}: values need more than the bit depth of {depth}; correct input.bit_depth, "
+                "input.bit_shift or input.byte_order"
+            )
+
+    def close(self) -> None:
+        """Close all readers."""
+        for reader in self._readers:
+            reader.close()
+
+
+def _where(paths: Sequence[Path]) -> str:
+    if not paths:
+        return "input.files"
+    return str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+
+
+def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
+    """Return a fact that all files state alike; None if a file does not state it."""
+    values = {reader.paths[0].name: getattr(reader, name) for reader in readers}
+    distinct = set(values.values())
+    if len(distinct) > 1 and None not in distinct:
+        shown = ", ".join(f"{value} in {file}" for file, value in _first_of_each(values))
+        raise InputError(f"the files state different {name}: {shown}; set input.{name}, or read them apart")
+    return distinct.pop() if len(distinct) == 1 else None
+
+
+def _first_of_each(values: dict[str, Any]) -> list[tuple[str, Any]]:
+    seen: dict[Any, str] = {}
+    for file, value in values.items():
+        seen.setdefault(value, file)
+    return [(file, value) for value, file in seen.items()][:4]
+
+
+def _frame_range(settings: InputSettings, total: int) -> tuple[int, int]:
+    first, end = settings.frame_range or (0, None)
+    end = total if end is None else end
+    if end > total or end - first < 2:
+        raise InputError(
+            f"input.frame_range [{first}, {end}] does not hold at least 2 of the {total} frames; correct it"
+        )
+    return first, end
+
+
+def _region(settings: InputSettings, rows: int, columns: int) -> tuple[int, int, int, int]:
+    if settings.roi is None:
+        return 0, rows, 0, columns
+    y0, y1, x0, x1 = settings.roi
+    if y1 > rows or x1 > columns:
+        raise InputError(
+            f"input.roi {list(settings.roi)} reaches beyond the frames of {rows} rows and {columns} columns; correct it"
+        )
+    return y0, y1, x0, x1

@@ -1,0 +1,104 @@
+"""The YAML section ``input``: which camera files are read, and how."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from pchem_pipeline.settings import Section
+
+__all__ = ["InputSettings"]
+
+
+class InputSettings(Section):
+    """Camera files (or ready-made histograms) and what their format does not say itself.
+
+    A value given here wins over what the file, its header or its sidecar says. ``None`` means:
+    take it from the file; if the file does not say, the value stays unknown and is never guessed.
+    """
+
+    files: tuple[str, ...] = Field(
+        default=(),
+        description="camera files, globs or folders, relative to this YAML file; "
+        "read in natural order of their names (frame2 before frame10)",
+    )
+    format: str = Field(
+        default="auto",
+        description="auto (from the content, then the suffix), raw, npy, tiff, fits, hdf5, zarr, ser, "
+        "histogram (ready-made histograms), or the name of a reader from a plug-in",
+    )
+    mode: Literal["copy", "reference"] = Field(
+        default="copy",
+        description="copy: frames go into the store; reference: nothing is copied, the camera files must stay",
+    )
+    shape: tuple[int, ...] | None = Field(
+        default=None,
+        description="raw only: [rows, columns], or [frames, rows, columns]; null: from the sidecar file",
+    )
+    dtype: Literal["uint8", "uint16", "uint32"] | None = Field(
+        default=None,
+        description="raw: type of a sample; other formats: reads signed samples of that size as unsigned, "
+        "negative values being refused; null: from the file or its sidecar",
+    )
+    byte_order: Literal["little", "big"] | None = Field(
+        default=None,
+        description="raw and SER: order of the bytes of a sample; null: from the file, else little",
+    )
+    header_bytes: int | None = Field(
+        default=None,
+        ge=0,
+        description="raw only: bytes before the first frame; null: from the sidecar, else 0",
+    )
+    frame_padding_bytes: int | None = Field(
+        default=None, ge=0, description="raw only: bytes after each frame; null: from the sidecar, else 0"
+    )
+    dataset: str | None = Field(
+        default=None,
+        description="HDF5 and zarr: path of the array inside the file; null: the only 3-D array there",
+    )
+    bit_shift: int | None = Field(
+        default=None,
+        ge=0,
+        le=31,
+        description="bits to shift right, for left-justified data (12 bits in 16: 4); the bits dropped must "
+        "be zero; null: from the sidecar, else 0",
+    )
+    bit_depth: int | None = Field(
+        default=None,
+        ge=1,
+        le=32,
+        description="bits of the ADC, after bit_shift; null: from the file, else unknown (then saturation at the "
+        "top of the range cannot be told from a clipped histogram)",
+    )
+    roi: tuple[int, int, int, int] | None = Field(
+        default=None, description="region of interest [y0, y1, x0, x1] in pixels, ends excluded; null: all"
+    )
+    frame_range: tuple[int, int | None] | None = Field(
+        default=None,
+        description="[first, end] frame over all files together, end excluded, null end: to the last; null: all",
+    )
+    integration_time: float | None = Field(
+        default=None,
+        gt=0,
+        description="integration time of a frame, s; null: from the file, else unknown (no dark current then)",
+    )
+    on_bad_file: Literal["error", "skip"] = Field(
+        default="error",
+        description="unreadable, truncated, duplicate or odd-shaped files: error stops and lists them all; "
+        "skip leaves them out and reports them",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.shape is not None and (len(self.shape) not in (2, 3) or min(self.shape) < 1):
+            raise ValueError("shape must be [rows, columns] or [frames, rows, columns], each at least 1")
+        if self.roi is not None:
+            y0, y1, x0, x1 = self.roi
+            if not (0 <= y0 < y1 and 0 <= x0 < x1):
+                raise ValueError("roi must be [y0, y1, x0, x1] with 0 <= y0 < y1 and 0 <= x0 < x1")
+        if self.frame_range is not None:
+            first, end = self.frame_range
+            if first < 0 or (end is not None and end <= first):
+                raise ValueError("frame_range must be [first, end] with 0 <= first < end")
+        return self
