@@ -82,21 +82,46 @@ _ALL: list[Variable] = [
     Variable("histogram/minimum", _MAP, "int32", "DN", "smallest DN seen"),
     Variable("histogram/maximum", _MAP, "int32", "DN", "largest DN seen"),
     # what histograms lose: order in time and neighbours in space
+    Variable("summary/block_start", ("block",), "int64", "1", "first frame of the block"),
     Variable("summary/block_sum", ("block", "y", "x"), "int64", "DN", "sum over a block of frames"),
     Variable(
-        "summary/block_sum_square", ("block", "y", "x"), "int64", "DN2", "sum of squares over a block of frames"
+        "summary/block_sum_square",
+        ("block", "y", "x"),
+        "int64",
+        "DN2",
+        "sum of squares over a block of frames",
     ),
-    Variable("summary/lag1_covariance", _MAP, "float64", "DN2", "covariance of successive frames, within blocks"),
     Variable(
-        "summary/neighbour_covariance_x", _MAP, "float64", "DN2", "covariance with the pixel at x + 1, within blocks"
+        "summary/lag1_covariance",
+        _MAP,
+        "float64",
+        "DN2",
+        "covariance of successive frames, within blocks; 0 is expected of independent frames",
     ),
     Variable(
-        "summary/neighbour_covariance_y", _MAP, "float64", "DN2", "covariance with the pixel at y + 1, within blocks"
+        "summary/neighbour_covariance_x",
+        _MAP,
+        "float64",
+        "DN2",
+        "covariance with the pixel at x + 1, within blocks; NaN in the last column",
+    ),
+    Variable(
+        "summary/neighbour_covariance_y",
+        _MAP,
+        "float64",
+        "DN2",
+        "covariance with the pixel at y + 1, within blocks; NaN in the last row of 64",
     ),
     Variable("summary/row_sum", ("frame", "y"), "int64", "DN", "sum over a row of a frame"),
-    Variable("summary/row_sum_square", ("frame", "y"), "int64", "DN2", "sum of squares over a row of a frame"),
     Variable(
-        "summary/column_sum", ("frame", "row_group", "x"), "int64", "DN", "sum over 64 rows of a column of a frame"
+        "summary/row_sum_square", ("frame", "y"), "int64", "DN2", "sum of squares over a row of a frame"
+    ),
+    Variable(
+        "summary/column_sum",
+        ("frame", "row_group", "x"),
+        "int32",
+        "DN",
+        "sum over 64 rows of a column of a frame",
     ),
     Variable("summary/frame_mean", ("frame",), "float64", "DN", "mean of a frame"),
     Variable("summary/frame_variance", ("frame",), "float64", "DN2", "variance over the pixels of a frame"),
@@ -121,23 +146,43 @@ _ALL: list[Variable] = [
     Variable("ensemble/dn", ("dn",), "int32", "DN", "digital number"),
     Variable("ensemble/counts", ("dn",), "int64", "1", "ensemble histogram of the chosen frames"),
     Variable("ensemble/counts_all", ("dn",), "int64", "1", "ensemble histogram of all frames"),
-    Variable("ensemble/density", ("dn",), "float64", "1/DN", "ensemble histogram of the chosen frames, normalised"),
-    Variable("ensemble/density_all", ("dn",), "float64", "1/DN", "ensemble histogram of all frames, normalised"),
+    Variable(
+        "ensemble/density", ("dn",), "float64", "1/DN", "ensemble histogram of the chosen frames, normalised"
+    ),
+    Variable(
+        "ensemble/density_all", ("dn",), "float64", "1/DN", "ensemble histogram of all frames, normalised"
+    ),
     Variable("ensemble/epcd_exact", ("dn",), "float64", "1/DN", "EPCD: mean of the pixels' PCDs", "f_E"),
-    Variable("ensemble/epcd_dependent", ("dn",), "float64", "1/DN", "EPCD: 4-D histogram of the parameters", "f_E"),
+    Variable(
+        "ensemble/epcd_dependent", ("dn",), "float64", "1/DN", "EPCD: 4-D histogram of the parameters", "f_E"
+    ),
     Variable(
         "ensemble/epcd_independent", ("dn",), "float64", "1/DN", "EPCD: product of four histograms", "f_E"
     ),
     # after two-point non-uniformity correction: axis `electrons`
     Variable("ensemble/electrons", ("electrons",), "float64", "e-", "centre of the bin of NUCed data"),
     Variable("ensemble/nuced_counts", ("electrons",), "int64", "1", "ensemble histogram of NUCed frames"),
-    Variable("ensemble/nuced_density", ("electrons",), "float64", "1/e-", "NUCed ensemble histogram, normalised"),
-    Variable("ensemble/nuced_exact", ("electrons",), "float64", "1/e-", "NUCed EPCD: mean over the pixels", "f_E'"),
     Variable(
-        "ensemble/nuced_dependent", ("electrons",), "float64", "1/e-", "NUCed EPCD: 2-D histogram of (H, s_e)", "f_E'"
+        "ensemble/nuced_density", ("electrons",), "float64", "1/e-", "NUCed ensemble histogram, normalised"
     ),
     Variable(
-        "ensemble/nuced_independent", ("electrons",), "float64", "1/e-", "NUCed EPCD: product of histograms", "f_E'"
+        "ensemble/nuced_exact", ("electrons",), "float64", "1/e-", "NUCed EPCD: mean over the pixels", "f_E'"
+    ),
+    Variable(
+        "ensemble/nuced_dependent",
+        ("electrons",),
+        "float64",
+        "1/e-",
+        "NUCed EPCD: 2-D histogram of (H, s_e)",
+        "f_E'",
+    ),
+    Variable(
+        "ensemble/nuced_independent",
+        ("electrons",),
+        "float64",
+        "1/e-",
+        "NUCed EPCD: product of histograms",
+        "f_E'",
     ),
     # electron numbers: axis `k`
     Variable("ensemble/k", ("k",), "int32", "e-", "electron number", "k"),
@@ -145,7 +190,9 @@ _ALL: list[Variable] = [
     Variable("ensemble/electron_mass", ("k",), "float64", "1", "histogram of electron numbers, normalised"),
     Variable("ensemble/electron_pmf", ("k",), "float64", "1", "mass predicted from the map of H", "p_Ke"),
     Variable("ensemble/electron_pmf_map", ("k",), "float64", "1", "mass that the estimator of k should show"),
-    Variable("ensemble/component_mean", ("k",), "float64", "DN", "mean of the EPCD's component k", "E(E|K_e=k)"),
+    Variable(
+        "ensemble/component_mean", ("k",), "float64", "DN", "mean of the EPCD's component k", "E(E|K_e=k)"
+    ),
     Variable(
         "ensemble/component_variance",
         ("case", "k"),
@@ -162,7 +209,9 @@ _ALL: list[Variable] = [
         "variance of the NUCed EPCD's component k",
         "Var(E'|K_e=k)",
     ),
-    Variable("electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"),
+    Variable(
+        "electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"
+    ),
     *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e")],
     Variable("truth/electron_number", ("frame", "y", "x"), "uint16", "e-", "true electron number", "K"),
 ]
