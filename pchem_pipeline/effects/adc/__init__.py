@@ -1,0 +1,1 @@
+"""Effects on the signal at the ADC, before rounding."""

@@ -1,0 +1,1 @@
+"""Effects on the mean number of electrons per frame."""

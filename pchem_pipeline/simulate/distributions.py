@@ -1,0 +1,113 @@
+"""Distributions of a pixel parameter over the sensor, as they are written in the YAML.
+
+Only the settings live here; ``quantiles.py`` turns them into numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from pchem_pipeline.settings import Section
+from pchem_pipeline.simulate.patterns import Pattern
+
+__all__ = [
+    "Constant",
+    "Distribution",
+    "DistributionBase",
+    "Gamma",
+    "LogNormal",
+    "LogUniform",
+    "Normal",
+    "Uniform",
+]
+
+
+class DistributionBase(Section):
+    """What every distribution has: bounds and spatial patterns.
+
+    The distribution is truncated to ``minimum .. maximum`` (the shape inside is kept);
+    patterns are applied after that and the sum is cut at the bounds.
+    """
+
+    minimum: float | None = Field(
+        default=None, description="smallest value allowed, in the parameter's unit; null: none"
+    )
+    maximum: float | None = Field(
+        default=None, description="largest value allowed, in the parameter's unit; null: none"
+    )
+    patterns: tuple[Pattern, ...] = Field(
+        default=(), description="patterns on top: column, row, gradient, radial"
+    )
+
+    @model_validator(mode="after")
+    def _bounds_in_order(self) -> Self:
+        if self.minimum is not None and self.maximum is not None and not self.minimum < self.maximum:
+            raise ValueError(f"minimum {self.minimum} is not below maximum {self.maximum}; swap them")
+        return self
+
+
+class Constant(DistributionBase):
+    """The same value in every pixel."""
+
+    kind: Literal["constant"] = Field(default="constant", description="shape of the distribution")
+    value: float = Field(description="value of every pixel, unit of the parameter")
+
+
+class Normal(DistributionBase):
+    """Normal distribution."""
+
+    kind: Literal["normal"] = Field(default="normal", description="shape of the distribution")
+    mean: float = Field(description="mean before truncation, unit of the parameter")
+    std: float = Field(gt=0, description="standard deviation before truncation, unit of the parameter")
+
+
+class LogNormal(DistributionBase):
+    """Log-normal distribution: skewed to the right, never negative."""
+
+    kind: Literal["lognormal"] = Field(default="lognormal", description="shape of the distribution")
+    median: float = Field(gt=0, description="median before truncation, unit of the parameter")
+    log_std: float = Field(gt=0, description="standard deviation of the natural logarithm, no unit")
+
+
+class Gamma(DistributionBase):
+    """Gamma distribution by its mean and standard deviation."""
+
+    kind: Literal["gamma"] = Field(default="gamma", description="shape of the distribution")
+    mean: float = Field(gt=0, description="mean before truncation, unit of the parameter")
+    std: float = Field(gt=0, description="standard deviation before truncation, unit of the parameter")
+
+
+class Uniform(DistributionBase):
+    """Uniform distribution."""
+
+    kind: Literal["uniform"] = Field(default="uniform", description="shape of the distribution")
+    low: float = Field(description="lower end, unit of the parameter")
+    high: float = Field(description="upper end, unit of the parameter")
+
+    @model_validator(mode="after")
+    def _ends_in_order(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low {self.low} is not below high {self.high}; swap them or use kind: constant")
+        return self
+
+
+class LogUniform(DistributionBase):
+    """Uniform distribution of the logarithm: equal numbers of pixels per decade."""
+
+    kind: Literal["loguniform"] = Field(default="loguniform", description="shape of the distribution")
+    low: float = Field(gt=0, description="lower end, unit of the parameter")
+    high: float = Field(gt=0, description="upper end, unit of the parameter")
+
+    @model_validator(mode="after")
+    def _ends_in_order(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low {self.low} is not below high {self.high}; swap them or use kind: constant")
+        return self
+
+
+Distribution = Annotated[
+    Constant | Normal | LogNormal | Gamma | Uniform | LogUniform,
+    Field(discriminator="kind"),
+]
