@@ -1,0 +1,1 @@
+"""The YAML tree of a run: sections, loading, writing, and checks across stages."""

@@ -1,0 +1,215 @@
+"""Run a function on many items, on any backend, and hear of each result as it comes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor as Pool
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+from pchem_pipeline.compute.environment import available_workers, prepare_environment
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.errors import ConfigError, IncompleteRunError, MissingDependencyError, PchEmError
+
+__all__ = ["Executor", "Outcome", "Stop", "make_executor"]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one item: a value, or an error with its traceback."""
+
+    value: Any = None
+    error: BaseException | None = None
+    trace: str = ""
+
+
+class Stop(Exception):
+    """Raised by ``on_result`` to end the work: nothing new starts, what runs is finished."""
+
+
+OnResult = Callable[[Any, Outcome], None]
+
+
+class Executor(Protocol):
+    """The interface of every backend."""
+
+    workers: int
+    #: workers share the memory of this process
+    shares_memory: bool
+
+    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
+        """Call ``function`` on each item and ``on_result(item, outcome)`` here, in any order."""
+        ...
+
+    def close(self) -> None:
+        """Free the workers."""
+        ...
+
+
+def guarded(function: Callable[[T], Any], item: T) -> Outcome:
+    """Call ``function`` and turn what it raises into an outcome: one bad tile stops no run."""
+    try:
+        return Outcome(value=function(item))
+    except Exception as error:
+        return Outcome(error=error, trace=traceback.format_exc())
+
+
+class SerialExecutor:
+    """One item after the other, in this thread."""
+
+    workers = 1
+    shares_memory = True
+
+    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
+        """See :class:`Executor`."""
+        for item in items:
+            on_result(item, guarded(function, item))
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class DaskPoolExecutor:
+    """dask's local scheduler on a pool of threads or of spawned processes."""
+
+    def __init__(self, workers: int, *, processes: bool) -> None:
+        self.workers = workers
+        self.shares_memory = not processes
+        self._processes = processes
+
+    def _pool(self) -> Pool:
+        if self._processes:
+            # a forked child deadlocks in zarr's event loop
+            context = multiprocessing.get_context("spawn")
+            return ProcessPoolExecutor(self.workers, mp_context=context, initializer=prepare_environment)
+        return ThreadPoolExecutor(self.workers, thread_name_prefix="tile")
+
+    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
+        """See :class:`Executor`.
+
+        Raises:
+            IncompleteRunError: a worker process died.
+        """
+        from dask.callbacks import Callback
+
+        todo: Sequence[T] = list(items)
+        # the item is bound inside the callable, where dask does not look for keys
+        graph = {("tile", number): (partial(guarded, function, item),) for number, item in enumerate(todo)}
+
+        def posttask(key: tuple[str, int], value: Outcome, *_: object) -> None:
+            on_result(todo[key[1]], value)
+
+        if self._processes:
+            from dask.multiprocessing import get
+
+            get = partial(get, chunksize=1, optimize_graph=False)
+        else:
+            from dask.threaded import get
+        with self._pool() as pool, Callback(posttask=posttask):
+            try:
+                get(graph, list(graph), num_workers=self.workers, pool=pool)
+            except BrokenProcessPool as error:
+                raise IncompleteRunError(
+                    "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
+                    "resume, with fewer --workers if memory was short"
+                ) from error
+
+    def close(self) -> None:
+        """The pool lives only during :meth:`map`."""
+
+
+class DistributedExecutor:
+    """A dask.distributed cluster: local, at an address, or made by a class from the settings."""
+
+    shares_memory = False
+
+    def __init__(self, settings: ComputeSettings, workers: int) -> None:
+        try:
+            import distributed
+        except ImportError as error:
+            raise MissingDependencyError(
+                'compute.backend: distributed needs another library: pip install "pchem-pipeline[cluster]"'
+            ) from error
+        self._cluster: Any = None
+        try:
+            if settings.scheduler is not None:
+                is_address = "://" in settings.scheduler
+                self._client = distributed.Client(
+                    **{("address" if is_address else "scheduler_file"): settings.scheduler}, timeout="20s"
+                )
+            elif settings.cluster is not None:
+                self._cluster = _cluster_class(settings.cluster.cls)(**settings.cluster.kwargs)
+                self._cluster.scale(settings.cluster.scale)
+                self._client = distributed.Client(self._cluster)
+            else:
+                self._cluster = distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+                )
+                self._client = distributed.Client(self._cluster)
+        except OSError as error:
+            raise ConfigError(
+                f"compute.scheduler: no scheduler answers at {settings.scheduler} ({error}); "
+                "start one with: dask scheduler"
+            ) from error
+        self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        self._client.run(prepare_environment)
+
+    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
+        """See :class:`Executor`."""
+        from distributed import as_completed
+
+        todo = list(items)
+        futures = self._client.map(guarded, [function] * len(todo), todo, pure=False)
+        item_of = {future.key: item for future, item in zip(futures, todo, strict=True)}
+        try:
+            for future in as_completed(futures):
+                error = future.exception()
+                outcome = Outcome(error=error, trace=str(error)) if error else future.result()
+                on_result(item_of[future.key], outcome)
+        except Stop:
+            self._client.cancel(futures)
+            raise
+
+    def close(self) -> None:
+        """Leave the cluster, and end it if this run made it."""
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+
+def _cluster_class(name: str) -> Any:
+    import importlib
+
+    module, _, attribute = name.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"compute.cluster.class: cannot import {name} ({error})") from error
+
+
+def make_executor(settings: ComputeSettings) -> Executor:
+    """Return the executor that the settings ask for.
+
+    Raises:
+        PchEmError: it cannot be had; the message says why.
+    """
+    workers = available_workers() if settings.workers == "auto" else settings.workers
+    if workers < 1:
+        raise ConfigError(f"compute.workers: {workers} workers cannot do anything; use 1 or more, or auto")
+    match settings.backend:
+        case "serial":
+            return SerialExecutor()
+        case "threads":
+            return DaskPoolExecutor(workers, processes=False)
+        case "processes":
+            return DaskPoolExecutor(workers, processes=True)
+        case "distributed":
+            return DistributedExecutor(settings, workers)
+    raise PchEmError(f"unknown backend {settings.backend}")

@@ -1,0 +1,110 @@
+"""Reading a run's YAML, with errors that name the key and the cure."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.errors import ConfigError
+
+__all__ = ["dump_config", "load_config", "parse_config", "setting_of"]
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """A safe loader that refuses a key given twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def load_config(path: Path) -> RunConfig:
+    """Return the configuration in a YAML file.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or a setting is wrong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; write one with: pchem init {path}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
+    return parse_config(text, str(path))
+
+
+def parse_config(text: str, name: str = "config") -> RunConfig:
+    """Return the configuration in a YAML text; ``name`` is used in messages.
+
+    Raises:
+        ConfigError: the text is not YAML or a setting is wrong.
+    """
+    try:
+        content = yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{name}: holds no settings; write a commented default with: pchem init")
+    try:
+        return RunConfig.model_validate(content)
+    except ValidationError as error:
+        raise ConfigError(f"{name}: {_sentence(error)}") from error
+
+
+def dump_config(config: RunConfig) -> str:
+    """Return the resolved YAML text of a configuration, every setting spelled out."""
+    content = config.model_dump(mode="json", by_alias=True)
+    if content["simulate"] is None:
+        del content["simulate"]
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def setting_of(config: RunConfig, dotted: str) -> Any:
+    """Return the value of ``section.key`` as plain JSON data."""
+    value: Any = config
+    for name in dotted.split("."):
+        value = getattr(value, name)
+    return value.model_dump(mode="json", by_alias=True) if isinstance(value, BaseModel) else _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _sentence(error: ValidationError) -> str:
+    return "; ".join(_complaint(item) for item in error.errors())
+
+
+def _complaint(item: Any) -> str:
+    where = ".".join(str(part) for part in item["loc"])
+    message = item["msg"].removeprefix("Value error, ")
+    if item["type"] == "extra_forbidden":
+        close = difflib.get_close_matches(str(item["loc"][-1]), _keys_at(item["loc"][:-1]), 1)
+        return f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else "")
+    given = "" if isinstance(item["input"], dict | BaseModel) else f" (given: {item['input']!r})"
+    return f"{where}: {message}{given}" if where else message
+
+
+def _keys_at(location: tuple[Any, ...]) -> list[str]:
+    """Return the keys that the section at ``location`` knows."""
+    model: Any = RunConfig
+    for name in location:
+        fields = getattr(model, "model_fields", {})
+        if name not in fields:
+            return []
+        kinds = (fields[name].annotation, *get_args(fields[name].annotation))
+        model = next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)
+    return list(getattr(model, "model_fields", {}))

@@ -1,0 +1,80 @@
+"""The commented YAML that ``pchem init`` writes, made from the sections themselves."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from pchem_pipeline.config.tree import RunConfig
+
+__all__ = ["commented_config"]
+
+_HEAD = """\
+# A run of pchem_pipeline. Every setting is shown with its default; delete what you do not change.
+# Paths are relative to this file. Start with: pchem run {name}
+"""
+
+
+def commented_config(name: str, *, files: list[str], simulated: bool = False) -> str:
+    """Return a YAML text with every setting, its default and what it means.
+
+    Args:
+        name: file name, for the comment on top.
+        files: what to write as ``input.files``.
+        simulated: include the section ``simulate``.
+    """
+    given = {"input.files": files}
+    lines = [_HEAD.format(name=name)]
+    for key, field in RunConfig.model_fields.items():
+        if key == "simulate" and not simulated:
+            continue
+        model = _section_of(field)
+        assert model is not None
+        lines += [f"# {field.description}", f"{key}:", *_section(model, key, given, 1), ""]
+    return "\n".join(lines)
+
+
+def _section(model: type[BaseModel], path: str, given: dict[str, Any], depth: int) -> list[str]:
+    pad = "  " * depth
+    lines: list[str] = []
+    for key, field in model.model_fields.items():
+        name = field.alias or key
+        value = given.get(f"{path}.{key}", _default(field))
+        width = max(40, 100 - len(pad))
+        lines += [f"{pad}# {line}" for line in textwrap.wrap(field.description or "", width)]
+        section = _section_of(field)
+        if isinstance(value, BaseModel) and section is not None and type(value) is section:
+            lines += [f"{pad}{name}:", *_section(section, f"{path}.{key}", given, depth + 1)]
+        else:
+            lines += _entry(name, _plain(value), pad)
+    return lines
+
+
+def _entry(name: str, value: Any, pad: str) -> list[str]:
+    text = yaml.safe_dump(
+        {name: value}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=90
+    )
+    return [pad + line for line in text.rstrip("\n").split("\n")]
+
+
+def _default(field: FieldInfo) -> Any:
+    value = field.get_default(call_default_factory=True, validated_data={})
+    return None if value is PydanticUndefined else value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", by_alias=True)
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _section_of(field: FieldInfo) -> type[BaseModel] | None:
+    kinds = (field.annotation, *get_args(field.annotation))
+    return next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)

@@ -1,0 +1,70 @@
+"""The whole YAML of a run; each section lives beside the code that it configures."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.model.ensemble_settings import EnsembleSettings, MapsSettings
+from pchem_pipeline.model.histogram_settings import HistogramSettings
+from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.render.settings import ReportSettings
+from pchem_pipeline.settings import Section
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+__all__ = ["RunConfig", "RunSettings"]
+
+
+class RunSettings(Section):
+    """What concerns the run as a whole."""
+
+    store: str = Field(default="run.zarr", min_length=1, description="folder of the run's store (zarr)")
+    title: str = Field(default="", description="title of the report; empty: the name of the store")
+    tile: Literal[8, 16, 32, 64, 128, 256] = Field(
+        default=64, description="side of a tile, pixels: the unit of work and of storage"
+    )
+    allowed_failed_pixels: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="fraction of pixels without a value above which the exit code is 3",
+    )
+
+
+class RunConfig(Section):
+    """The configuration of a run.
+
+    Raises:
+        pydantic.ValidationError: a key is unknown, a value is out of range, or there is no input.
+    """
+
+    run: RunSettings = Field(default_factory=RunSettings, description="the run as a whole")
+    simulate: SimulateSettings | None = Field(
+        default=None, description="simulated camera; remove this section to use files of your own"
+    )
+    input: InputSettings = Field(default_factory=InputSettings, description="camera files")
+    histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="counting")
+    fit: FitSettings = Field(default_factory=FitSettings, description="PCH-EM")
+    maps: MapsSettings = Field(default_factory=MapsSettings, description="parameter maps")
+    ensemble: EnsembleSettings = Field(default_factory=EnsembleSettings, description="ensemble distributions")
+    report: ReportSettings = Field(default_factory=ReportSettings, description="report.html and figures")
+    compute: ComputeSettings = Field(default_factory=ComputeSettings, description="who does the work")
+
+    @field_validator(
+        "run", "input", "histogram", "fit", "maps", "ensemble", "report", "compute", mode="before"
+    )
+    @classmethod
+    def _empty_section(cls, value: object) -> object:
+        """Take a section of which every line is a comment as a section of defaults."""
+        return {} if value is None else value
+
+    @model_validator(mode="after")
+    def _has_input(self) -> RunConfig:
+        if self.simulate is None and not self.input.files:
+            raise ValueError(
+                "input.files: there is nothing to read; name camera files, or add a section simulate"
+            )
+        return self

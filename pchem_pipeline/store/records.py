@@ -1,0 +1,95 @@
+"""What a run remembers of its stages: fingerprints, records, and a marker for each finished tile."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.store.files import canonical_json, read_json, write_json
+
+__all__ = ["Records", "StageRecord", "fingerprint_of"]
+
+
+def fingerprint_of(content: dict[str, Any]) -> str:
+    """Return the SHA-256 of the canonical JSON of ``content``."""
+    return hashlib.sha256(canonical_json(content)).hexdigest()
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """How a stage was last run.
+
+    Attributes:
+        stage: its name.
+        version: version of its algorithm.
+        fingerprint: digest of all that decides the result.
+        content: what the digest was taken of: settings read, upstream fingerprints, input identity.
+        keys: how many unit markers the complete stage has.
+        started: UTC time, ISO 8601.
+        seconds: wall time, summed over the runs that completed it.
+        cpu_seconds: CPU time of this process and its children.
+        peak_rss_bytes: largest resident set of a process.
+        failed: key and reason of each unit that failed.
+        notes: one-line remarks that the report repeats.
+        versions: versions of Python and of the libraries.
+    """
+
+    stage: str
+    version: int
+    fingerprint: str
+    content: dict[str, Any]
+    keys: int = 0
+    started: str = ""
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    peak_rss_bytes: int = 0
+    failed: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    versions: dict[str, str] = field(default_factory=dict)
+
+
+class Records:
+    """The stage records and unit markers below one folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def read(self, stage: str) -> StageRecord | None:
+        """Return the record of a stage, or None if it never started."""
+        content = read_json(self._folder / "stages" / f"{stage}.json")
+        if content is None:
+            return None
+        return StageRecord(**{**content, "notes": tuple(content.get("notes", ()))})
+
+    def write(self, record: StageRecord) -> None:
+        """Store the record of a stage."""
+        write_json(self._folder / "stages" / f"{record.stage}.json", asdict(record))
+
+    def forget(self, stage: str) -> None:
+        """Drop the record and all markers of a stage."""
+        (self._folder / "stages" / f"{stage}.json").unlink(missing_ok=True)
+        shutil.rmtree(self._folder / "done" / stage, ignore_errors=True)
+
+    def mark(self, stage: str, fingerprint: str, key: str, summary: dict[str, Any]) -> None:
+        """Say that a unit of a stage is whole in the store."""
+        write_json(self._marker(stage, fingerprint, key), summary)
+
+    def unmark(self, stage: str, fingerprint: str, key: str) -> None:
+        """Say that a unit has to be done again."""
+        self._marker(stage, fingerprint, key).unlink(missing_ok=True)
+
+    def done(self, stage: str, fingerprint: str) -> set[str]:
+        """Return the keys of the finished units of a stage in its present form."""
+        folder = self._marker(stage, fingerprint, "x").parent
+        return {path.name.removesuffix(".json") for path in folder.glob("[!.]*.json")}
+
+    def summaries(self, stage: str, fingerprint: str) -> dict[str, dict[str, Any]]:
+        """Return the summary that each finished unit left, in the order of the keys."""
+        keys = sorted(self.done(stage, fingerprint))
+        return {key: read_json(self._marker(stage, fingerprint, key)) or {} for key in keys}
+
+    def _marker(self, stage: str, fingerprint: str, key: str) -> Path:
+        return self._folder / "done" / stage / fingerprint[:16] / f"{key}.json"

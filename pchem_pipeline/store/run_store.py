@@ -1,0 +1,276 @@
+"""One run on disk: a zarr (format 3) root that xarray can open, and the run's own files beside it.
+
+```
+run.zarr/
+  zarr.json              schema version in the attributes
+  frames/ histogram/ summary/ fit/ maps/ ensemble/ electrons/ truth/
+  report.html, report.json, figures/
+  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock
+```
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from filelock import FileLock, Timeout
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import LockedError, StoreError
+from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.records import Records
+from pchem_pipeline.variables import VARIABLES
+
+if TYPE_CHECKING:
+    import zarr
+
+__all__ = ["SCHEMA_VERSION", "RunStore"]
+
+#: Version of the layout; another version is refused.
+SCHEMA_VERSION = 1
+
+_PRIVATE = ".pchem"
+_Region = tuple[slice | int, ...]
+
+
+class RunStore:
+    """A run's arrays and files. Open it with :meth:`open` or make it with :meth:`create`."""
+
+    def __init__(self, path: Path, root: zarr.Group) -> None:
+        self.path = path
+        self._root = root
+        self.records = Records(path / _PRIVATE)
+
+    # -- opening ------------------------------------------------------------------------------
+
+    @classmethod
+    def create(cls, path: Path) -> RunStore:
+        """Open the store at ``path``, made new where there is none.
+
+        Raises:
+            StoreError: something else is at that path, or it cannot be written.
+        """
+        import zarr
+
+        if (path / "zarr.json").exists():
+            return cls.open(path, writable=True)
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise StoreError(f"{path} exists and is not a run; choose another --store or remove it")
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            root = zarr.create_group(str(path), zarr_format=3, attributes={"pchem_schema": SCHEMA_VERSION})
+        except OSError as error:
+            raise storage_error(error, path) from error
+        return cls(path, root)
+
+    @classmethod
+    def open(cls, path: Path, *, writable: bool = False) -> RunStore:
+        """Open an existing store.
+
+        Raises:
+            StoreError: there is none, it is damaged, or it has another schema version.
+        """
+        import zarr
+
+        if not (path / "zarr.json").exists():
+            raise StoreError(f"there is no run at {path}; make one with: pchem run FILES --store {path}")
+        try:
+            root = zarr.open_group(str(path), mode="r+" if writable else "r")
+            schema = root.attrs.get("pchem_schema")
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            raise StoreError(f"{path} is damaged ({error}); restore it or start the run again") from error
+        if schema != SCHEMA_VERSION:
+            raise StoreError(
+                f"{path} has schema version {schema}, this program reads version {SCHEMA_VERSION}; "
+                "use the program that made it, or start a new run"
+            )
+        return cls(path, root)
+
+    # -- arrays -------------------------------------------------------------------------------
+
+    def has(self, name: str) -> bool:
+        """Tell whether the array or group ``name`` exists."""
+        return name in self._root
+
+    def create_array(
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        *,
+        chunks: tuple[int, ...],
+        dtype: Any = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Make the array of a registered variable, replacing an older one.
+
+        Args:
+            name: path in :data:`pchem_pipeline.variables.VARIABLES`.
+            shape: its shape.
+            chunks: chunk shape; one task must write whole chunks.
+            dtype: only for variables whose type the data decide.
+            attributes: further attributes (JSON).
+
+        Raises:
+            StoreError: the file system refused.
+        """
+        variable = VARIABLES[name]
+        kind = np.dtype(variable.dtype if dtype is None else dtype)
+        attrs = {"units": variable.unit, "long_name": variable.long_name}
+        if variable.symbol:
+            attrs["symbol"] = variable.symbol
+        with self._translated(name):
+            self._root.create_array(
+                name,
+                shape=shape,
+                chunks=tuple(max(1, min(c, s)) for c, s in zip(chunks, shape, strict=True)),
+                dtype=kind,
+                fill_value=np.nan if kind.kind == "f" else 0,
+                compressors=_compressors(name, kind),
+                dimension_names=variable.dims,
+                attributes={**attrs, **(attributes or {})},
+                config={"write_empty_chunks": True},
+                overwrite=True,
+            )
+
+    def write_array(self, name: str, data: NDArray[Any], attributes: Mapping[str, Any] | None = None) -> None:
+        """Make a small array and write it whole, in one chunk."""
+        dtype = data.dtype if VARIABLES[name].dtype == "*" else None
+        self.create_array(name, data.shape, chunks=data.shape, dtype=dtype, attributes=attributes)
+        self.write(name, (slice(None),) * data.ndim, data)
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Return the zarr array ``name``, for its shape, chunks and attributes.
+
+        Raises:
+            StoreError: it is not in the store.
+        """
+        import zarr
+
+        try:
+            found = self._root[name]
+        except KeyError as error:
+            raise StoreError(f"{self.path} has no {name}; run the stage that writes it") from error
+        if not isinstance(found, zarr.Array):
+            raise StoreError(f"{self.path}: {name} is not an array; start the run again")
+        return found
+
+    def read(self, name: str, region: _Region | None = None) -> NDArray[Any]:
+        """Return the array ``name``, or a region of it.
+
+        Raises:
+            StoreError: it is missing or a chunk is corrupt.
+        """
+        array = self.array(name)
+        with self._translated(name, region):
+            return np.asarray(array[region if region is not None else ...])
+
+    def write(self, name: str, region: _Region, data: NDArray[Any]) -> None:
+        """Write ``data`` into a region made of whole chunks.
+
+        Raises:
+            StoreError: the file system refused.
+        """
+        with self._translated(name, region):
+            self.array(name)[region] = data
+
+    def delete(self, name: str) -> None:
+        """Remove an array or a group, if it exists."""
+        if name in self._root:
+            with self._translated(name):
+                del self._root[name]
+
+    def attributes(self, name: str = "") -> dict[str, Any]:
+        """Return the attributes of a group or array (of the root by default); empty where there is none."""
+        if name and name not in self._root:
+            return {}
+        return dict((self._root[name] if name else self._root).attrs)
+
+    def set_attributes(self, name: str, values: Mapping[str, Any]) -> None:
+        """Add attributes (JSON) to a group, making the group where needed."""
+        with self._translated(name):
+            self._root.require_group(name).attrs.update(values)
+
+    # -- files --------------------------------------------------------------------------------
+
+    def write_file(self, name: str, data: bytes) -> Path:
+        """Write a file of the run, atomically, and return its path."""
+        path = self.path / name
+        write_atomic(path, data)
+        return path
+
+    def write_config(self, text: str) -> None:
+        """Keep the resolved YAML of the run."""
+        write_atomic(self.path / _PRIVATE / "config.yaml", text.encode())
+
+    def config_text(self) -> str | None:
+        """Return the resolved YAML that made the run, or None."""
+        try:
+            return (self.path / _PRIVATE / "config.yaml").read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+
+    # -- housekeeping -------------------------------------------------------------------------
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the run's lock; the kernel frees it when the process ends, however it ends.
+
+        Raises:
+            LockedError: another process holds it.
+            StoreError: the lock file cannot be written.
+        """
+        private = self.path / _PRIVATE
+        try:
+            private.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(private / "lock")
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise LockedError(
+                f"{self.path} is in use by another pchem process; wait for it or use another --store"
+            ) from error
+        except OSError as error:
+            raise storage_error(error, private) from error
+        try:
+            self._sweep()
+            yield
+        finally:
+            lock.release()
+
+    def _sweep(self) -> None:
+        """Remove what a killed process left: partial files never become part of the run."""
+        for path in self.path.rglob("*.partial"):
+            path.unlink(missing_ok=True)
+
+    def free_bytes(self) -> int:
+        """Return the free space of the disk that holds the store."""
+        return shutil.disk_usage(self.path).free
+
+    @contextmanager
+    def _translated(self, name: str, region: _Region | None = None) -> Iterator[None]:
+        where = f"{self.path}: {name}" + (f" {_words(region)}" if region else "")
+        try:
+            yield
+        except OSError as error:
+            raise storage_error(error, where) from error
+        except (ValueError, RuntimeError) as error:
+            raise StoreError(
+                f"{where} cannot be read ({error}); redo that stage with --force, or those tiles with --tiles"
+            ) from error
+
+
+def _words(region: _Region) -> str:
+    return "[" + ", ".join(f"{p.start}:{p.stop}" if isinstance(p, slice) else str(p) for p in region) + "]"
+
+
+def _compressors(name: str, dtype: np.dtype[Any]) -> list[Any]:
+    """Fast for frames, small for the rest; a checksum, so that a corrupt chunk is never silent."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    cname: Literal["lz4", "zstd"] = "lz4" if name == "frames/dn" else "zstd"
+    shuffle: Literal["bitshuffle", "shuffle"] = "bitshuffle" if name == "frames/dn" else "shuffle"
+    return [BloscCodec(cname=cname, clevel=1, shuffle=shuffle, typesize=dtype.itemsize), Crc32cCodec()]
