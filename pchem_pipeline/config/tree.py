@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.frames.settings import InputSettings
@@ -60,6 +60,27 @@ class RunConfig(Section):
     def _empty_section(cls, value: object) -> object:
         """Take a section of which every line is a comment as a section of defaults."""
         return {} if value is None else value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_what_is_simulated(cls, data: Any) -> Any:
+        """Let the input be the simulated camera's files, where no files are named."""
+        if not isinstance(data, dict) or data.get("simulate") is None:
+            return data
+        given = data.get("input") or {}
+        if not isinstance(given, dict) or given.get("files"):
+            return data
+        try:
+            simulated = SimulateSettings.model_validate(data["simulate"])
+        except ValidationError:
+            return data  # said once more, with its place in the tree, by the field itself
+        files = [str(simulated.output)]
+        known = {
+            "format": simulated.format,
+            "integration_time": simulated.integration_time,
+            "bit_depth": simulated.bit_depth,
+        }
+        return {**data, "input": {**known, **given, "files": files}}
 
     @model_validator(mode="after")
     def _has_input(self) -> RunConfig:

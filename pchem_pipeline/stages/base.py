@@ -215,25 +215,28 @@ class StageContext:
         task: Callable[[AnyUnit], Mapping[str, Any] | None],
         *,
         unit_name: str = "tile",
+        needs: str | None = None,
     ) -> dict[str, dict[str, Any]]:
         """Run ``task`` on every unit that is chosen and not done yet, and mark each.
 
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
-        every unit (a full disk). Returns the summaries of all finished units by key, earlier runs included.
+        every unit (a full disk). With ``needs``, an upstream stage of the same tiles, units that it has
+        not finished are failures too. Returns the summaries of all finished units by key, earlier
+        runs included.
 
         Raises:
             InterruptedRunError: a signal asked for a stop; running units were finished.
             StoreError: the store cannot be written.
         """
         self.n_keys = sum(len(unit.keys) for unit in units)
-        todo = self.pending(units)
+        todo = self._ready(self.pending(units), needs)
         for unit in todo:
             for key in unit.keys:
                 self.store.records.unmark(self.stage, self.fingerprint, key)
         marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
         fatal: list[BaseException] = []
-        done = len(units) - len(todo)
-        with self.reporter.progress(self.stage, len(units), unit_name, done) as advance:
+        total = len(self.selected(units))
+        with self.reporter.progress(self.stage, total, unit_name, total - len(todo)) as advance:
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
                 advance()
@@ -250,6 +253,16 @@ class StageContext:
                     raise fatal[0] from fatal[0].__cause__
         self.stop.check()
         return self.store.records.summaries(self.stage, self.fingerprint)
+
+    def _ready(self, units: list[AnyUnit], needs: str | None) -> list[AnyUnit]:
+        """Split off the units that an upstream stage has not finished."""
+        if needs is None:
+            return units
+        there = self.tiles_done(needs)
+        for unit in units:
+            if not set(unit.keys) <= there:
+                self.failed[unit.key] = f"stage {needs} has not finished it"
+        return [unit for unit in units if set(unit.keys) <= there]
 
     def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:
         error = outcome.error

@@ -1,0 +1,185 @@
+"""One command from start to end: find the run, lock it, bring its stages up to date, say how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pchem_pipeline.compute.executor import SerialExecutor, make_executor
+from pchem_pipeline.config.load import dump_config, load_config, parse_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.errors import ConfigError, IncompleteRunError, StoreError
+from pchem_pipeline.stages.base import Options, StageContext
+from pchem_pipeline.stages.interrupt import StopRequest, stop_on_signals
+from pchem_pipeline.stages.pipeline import StageState, execute, load_stage, pipeline_of, status
+from pchem_pipeline.stages.reporting import ProgressMode, Reporter
+from pchem_pipeline.store.files import read_json, write_json
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["Command", "Target", "find_run", "run_status", "run_stages", "working_run"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A run: its configuration, the folder its paths refer to, and its store."""
+
+    config: RunConfig
+    base_dir: Path
+    store: Path
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the command line asked for, beside the configuration.
+
+    Attributes:
+        options: force, dry run, tiles, region.
+        workers: overrides ``compute.workers``.
+        backend: overrides ``compute.backend``.
+        roi_is_input: the region crops the input (ingest) instead of choosing tiles.
+        progress: auto | on | off.
+        quiet: say warnings only.
+        log_json: file for JSON lines.
+    """
+
+    options: Options = field(default_factory=Options)
+    workers: int | None = None
+    backend: str | None = None
+    progress: ProgressMode = "auto"
+    quiet: bool = False
+    log_json: Path | None = None
+
+
+def find_run(path: Path) -> Target:
+    """Return the run that a YAML file or a store belongs to.
+
+    Raises:
+        ConfigError: neither a YAML file nor a store, or its content is wrong.
+        StoreError: the store is damaged.
+    """
+    if path.is_dir():
+        store = RunStore.open(path)
+        text = store.config_text()
+        if text is None:
+            raise StoreError(f"{path} holds no configuration; give the YAML file that made it")
+        location = read_json(path / ".pchem" / "location.json") or {}
+        return Target(parse_config(text, str(path)), Path(location.get("base_dir", path.parent)), path)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        what = "is neither a YAML file nor a run" if path.exists() else "does not exist"
+        raise ConfigError(f"{path} {what}; give a config.yaml or the store of a run")
+    config = load_config(path)
+    base_dir = path.resolve().parent
+    return Target(config, base_dir, base_dir / config.run.store)
+
+
+def with_overrides(target: Target, command: Command) -> Target:
+    """Return the target with the command line's compute settings."""
+    changes = {
+        key: value
+        for key, value in (("workers", command.workers), ("backend", command.backend))
+        if value is not None
+    }
+    if not changes:
+        return target
+    content = target.config.model_dump(by_alias=True)
+    content["compute"] = {**content["compute"], **changes}
+    return Target(RunConfig.model_validate(content), target.base_dir, target.store)
+
+
+def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
+    """Bring ``stages`` up to date, in order, and return their states.
+
+    Failed tiles stop nothing: the stages after them work on the others, and the error comes at the end.
+
+    Raises:
+        IncompleteRunError: tiles failed, or more pixels failed than the configuration allows.
+        PchEmError: a stage cannot be done; the message says why.
+    """
+    if command.options.dry_run:
+        return _dry_run(target, stages, command)
+    with working_run(target, command) as context:
+        states = [execute(name, context) for name in stages]
+        context.reporter.event("end", states={state.stage: state.words() for state in states})
+        failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
+        if failed:
+            raise IncompleteRunError("; ".join(failed) + "; the rest is kept, run again to retry")
+        if "fit" in stages:
+            _check_failed_pixels(context)
+    return states
+
+
+@contextlib.contextmanager
+def working_run(target: Target, command: Command) -> Iterator[StageContext]:
+    """Open and lock the run, and yield what its stages need.
+
+    Raises:
+        LockedError: another process works on the run.
+        PchEmError: the store or the workers cannot be had.
+    """
+    target = with_overrides(target, command)
+    store = RunStore.create(target.store)
+    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
+    with contextlib.ExitStack() as stack:
+        stack.callback(reporter.close)
+        stack.enter_context(store.locked())
+        stop = stack.enter_context(stop_on_signals())
+        store.write_config(dump_config(target.config))
+        write_json(store.path / ".pchem" / "location.json", {"base_dir": os.fspath(target.base_dir)})
+        executor = make_executor(target.config.compute)
+        stack.callback(executor.close)
+        yield StageContext(
+            target.config, target.base_dir, store, executor, reporter, stop, options=command.options
+        )
+
+
+def run_status(target: Target) -> list[StageState]:
+    """Return the state of every stage, without changing anything."""
+    stages = pipeline_of(target.config)
+    if not (target.store / "zarr.json").exists():
+        return [StageState(name, "missing") for name in stages]
+    context = _reading_context(target, Reporter("off", quiet=True), Options())
+    states: list[StageState] = []
+    stale: str | None = None
+    for name in stages:
+        state = status(load_stage(name), context)
+        if stale is not None and state.state in ("complete", "partial"):
+            state = StageState(name, "stale", f"{stale} is stale", state.done, state.total)
+        if state.state == "stale" and stale is None:
+            stale = name
+        states.append(state)
+    return states
+
+
+def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
+    """Say what would be done, without writing anything."""
+    states = {state.stage: state for state in run_status(target)}
+    reporter = Reporter("off", quiet=command.quiet)
+    for name in stages:
+        state = states.get(name, StageState(name, "missing"))
+        runs = state.state != "complete" or command.options.force
+        reporter.info(f"{name}: {state.words()}" + (" -> would run" if runs else " -> nothing to do"))
+    return [states.get(name, StageState(name, "missing")) for name in stages]
+
+
+def _reading_context(target: Target, reporter: Reporter, options: Options) -> StageContext:
+    store = RunStore.open(target.store)
+    return StageContext(
+        target.config, target.base_dir, store, SerialExecutor(), reporter, StopRequest(), options=options
+    )
+
+
+def _check_failed_pixels(context: StageContext) -> None:
+    """Complain if more pixels have no value than the configuration allows."""
+    from pchem_pipeline.model.fit_status import FAILED
+
+    words = context.store.read("fit/fit_status")
+    failed = int(((words & int(FAILED)) != 0).sum())
+    allowed = context.config.run.allowed_failed_pixels
+    if failed > allowed * words.size:
+        raise IncompleteRunError(
+            f"{failed} of {words.size} pixels have no value, more than run.allowed_failed_pixels ({allowed:g}); "
+            "the report lists the reasons"
+        )
