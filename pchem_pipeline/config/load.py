@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import to_jsonable_python
 
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError
@@ -77,11 +78,7 @@ def setting_of(config: RunConfig, dotted: str) -> Any:
     value: Any = config
     for name in dotted.split("."):
         value = getattr(value, name)
-    return value.model_dump(mode="json", by_alias=True) if isinstance(value, BaseModel) else _plain(value)
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return to_jsonable_python(value, by_alias=True)
 
 
 def _sentence(error: ValidationError) -> str:

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
+from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pchem_pipeline.config.tree import RunConfig
 
@@ -51,28 +51,18 @@ def _section(model: type[BaseModel], path: str, given: dict[str, Any], depth: in
         if isinstance(value, BaseModel) and section is not None and type(value) is section:
             lines += [f"{pad}{name}:", *_section(section, f"{path}.{key}", given, depth + 1)]
         else:
-            lines += _entry(name, _plain(value), pad)
+            lines += _entry(name, to_jsonable_python(value, by_alias=True), pad)
     return lines
 
 
 def _entry(name: str, value: Any, pad: str) -> list[str]:
-    text = yaml.safe_dump(
-        {name: value}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=90
-    )
-    return [pad + line for line in text.rstrip("\n").split("\n")]
+    text = yaml.safe_dump(value, sort_keys=False, allow_unicode=True, default_flow_style=True, width=10**6)
+    return [f"{pad}{name}: {text.removesuffix('...' + chr(10)).strip()}"]
 
 
 def _default(field: FieldInfo) -> Any:
     value = field.get_default(call_default_factory=True, validated_data={})
     return None if value is PydanticUndefined else value
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json", by_alias=True)
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _section_of(field: FieldInfo) -> type[BaseModel] | None:

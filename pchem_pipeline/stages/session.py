@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pchem_pipeline.compute.executor import SerialExecutor, make_executor
@@ -19,7 +19,7 @@ from pchem_pipeline.stages.reporting import ProgressMode, Reporter
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Command", "Target", "find_run", "run_status", "run_stages", "working_run"]
+__all__ = ["Command", "Target", "cropped", "find_run", "run_stages", "run_status", "working_run"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,17 @@ class Target:
     base_dir: Path
     store: Path
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of this run, in order."""
+        return pipeline_of(self.config)
+
+    def changed(self, section: str, **values: object) -> Target:
+        """Return the same run with other values in a section of its configuration."""
+        content = self.config.model_dump(by_alias=True)
+        content[section] = {**content[section], **values}
+        return replace(self, config=RunConfig.model_validate(content))
+
 
 @dataclass(frozen=True)
 class Command:
@@ -39,7 +50,6 @@ class Command:
         options: force, dry run, tiles, region.
         workers: overrides ``compute.workers``.
         backend: overrides ``compute.backend``.
-        roi_is_input: the region crops the input (ingest) instead of choosing tiles.
         progress: auto | on | off.
         quiet: say warnings only.
         log_json: file for JSON lines.
@@ -77,16 +87,17 @@ def find_run(path: Path) -> Target:
 
 def with_overrides(target: Target, command: Command) -> Target:
     """Return the target with the command line's compute settings."""
-    changes = {
-        key: value
-        for key, value in (("workers", command.workers), ("backend", command.backend))
-        if value is not None
-    }
-    if not changes:
-        return target
-    content = target.config.model_dump(by_alias=True)
-    content["compute"] = {**content["compute"], **changes}
-    return Target(RunConfig.model_validate(content), target.base_dir, target.store)
+    given = {"workers": command.workers, "backend": command.backend}
+    changes = {key: value for key, value in given.items() if value is not None}
+    return target.changed("compute", **changes) if changes else target
+
+
+def cropped(target: Target, command: Command) -> tuple[Target, Command]:
+    """Turn the region of the command line into a crop of the input, where there is one."""
+    roi = command.options.roi
+    if roi is None:
+        return target, command
+    return target.changed("input", roi=roi), replace(command, options=replace(command.options, roi=None))
 
 
 def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
@@ -180,6 +191,6 @@ def _check_failed_pixels(context: StageContext) -> None:
     allowed = context.config.run.allowed_failed_pixels
     if failed > allowed * words.size:
         raise IncompleteRunError(
-            f"{failed} of {words.size} pixels have no value, more than run.allowed_failed_pixels ({allowed:g}); "
+            f"{failed} of {words.size} pixels have no value, above run.allowed_failed_pixels ({allowed:g}); "
             "the report lists the reasons"
         )

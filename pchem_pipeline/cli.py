@@ -1,0 +1,265 @@
+"""The ``pchem`` command: it translates the command line and calls the library once.
+
+Heavy libraries are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+import typer
+
+from pchem_pipeline import __version__
+from pchem_pipeline.errors import ConfigError, ExitCode, PchEmError
+
+if TYPE_CHECKING:
+    from pchem_pipeline.stages.session import Command
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="pchem",
+    help="Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
+Force = Annotated[bool, typer.Option("--force", help="do it again even if it is up to date")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="say what would be done and why; write nothing")]
+Tiles = Annotated[str | None, typer.Option(help="only these tiles, iy.ix: 0.3,2.1 or ranges 0:2.0:4")]
+Roi = Annotated[
+    str | None,
+    typer.Option(help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, others do its tiles"),
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
+Backend = Annotated[
+    Literal["serial", "threads", "processes", "distributed"] | None,
+    typer.Option(help="who does the work [default: compute.backend]"),
+]
+LogJson = Annotated[Path | None, typer.Option(help="append JSON lines about the run to this file")]
+Progress = Annotated[
+    Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
+
+
+def _roi(text: str | None) -> tuple[int, int, int, int] | None:
+    if text is None:
+        return None
+    try:
+        (y0, y1), (x0, x1) = (map(int, part.split(":")) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--roi {text!r}: write y0:y1,x0:x1 in pixels, such as 0:128,64:192") from None
+    return y0, y1, x0, x1
+
+
+def _command(
+    *,
+    force: bool,
+    dry_run: bool,
+    tiles: str | None,
+    roi: str | None,
+    workers: int | None,
+    backend: str | None,
+    log_json: Path | None,
+    progress: Literal["auto", "on", "off"],
+    quiet: bool,
+) -> Command:
+    from pchem_pipeline.stages.base import Options
+    from pchem_pipeline.stages.session import Command
+
+    options = Options(force=force, dry_run=dry_run, tiles=tiles, roi=_roi(roi))
+    return Command(
+        options, workers=workers, backend=backend, progress=progress, quiet=quiet, log_json=log_json
+    )
+
+
+def _stage_command(name: str, summary: str) -> None:
+    """Add the command of one stage; all stages take the same options."""
+
+    def stage(
+        target: Target,
+        force: Force = False,
+        dry_run: DryRun = False,
+        tiles: Tiles = None,
+        roi: Roi = None,
+        workers: Workers = None,
+        backend: Backend = None,
+        log_json: LogJson = None,
+        progress: Progress = "auto",
+        quiet: Quiet = False,
+    ) -> None:
+        from pchem_pipeline.stages.session import cropped, find_run, run_stages
+
+        command = _command(
+            force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
+            log_json=log_json, progress=progress, quiet=quiet,
+        )  # fmt: skip
+        run = find_run(target)
+        if name == "ingest":
+            run, command = cropped(run, command)
+        run_stages(run, [name], command)
+
+    stage.__doc__ = summary
+    app.command(name)(stage)
+
+
+@app.command()
+def init(
+    path: Annotated[Path, typer.Argument(help="YAML file to write")] = Path("config.yaml"),
+    files: Annotated[list[str] | None, typer.Argument(help="camera files, globs or folders")] = None,
+    simulated: Annotated[bool, typer.Option("--simulated", help="include a simulated camera")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
+) -> None:
+    """Write a YAML file with every setting explained."""
+    from pchem_pipeline.stages.start import write_template
+
+    write_template(path, files or [], simulated=simulated, force=force)
+    typer.echo(path)
+
+
+@app.command()
+def run(
+    targets: Annotated[
+        list[Path], typer.Argument(help="a config.yaml, a store, or camera files and folders")
+    ],
+    store: Annotated[
+        Path | None, typer.Option(help="camera files: store of the run [default: run.zarr]")
+    ] = None,
+    integration_time: Annotated[
+        float | None, typer.Option(help="camera files: integration time of a frame, s")
+    ] = None,
+    bit_depth: Annotated[int | None, typer.Option(help="camera files: bits of the ADC")] = None,
+    mode: Annotated[
+        Literal["copy", "reference"] | None,
+        typer.Option(help="camera files: copy them into the store, or leave them where they are"),
+    ] = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    tiles: Tiles = None,
+    roi: Roi = None,
+    workers: Workers = None,
+    backend: Backend = None,
+    log_json: LogJson = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Do every stage, from camera files to the report.
+
+    What is up to date is not done again.
+    """
+    from pchem_pipeline.stages.session import cropped, run_stages
+    from pchem_pipeline.stages.start import find_or_start
+
+    command = _command(
+        force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
+        log_json=log_json, progress=progress, quiet=quiet,
+    )  # fmt: skip
+    given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
+    target, is_new = find_or_start(targets, store, {k: v for k, v in given.items() if v is not None})
+    if is_new:
+        target, command = cropped(target, command)
+    run_stages(target, target.stages, command)
+    if not dry_run:
+        typer.echo(target.store / "report.html")
+
+
+@app.command()
+def status(target: Target) -> None:
+    """Print how far each stage is, and why one is stale."""
+    from pchem_pipeline.stages.session import find_run, run_status
+
+    for state in run_status(find_run(target)):
+        typer.echo(f"{state.stage:<10} {state.words()}")
+
+
+@app.command()
+def export(
+    target: Target,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("export"),
+    formats: Annotated[
+        str, typer.Option("--format", help="fits, tiff, npz and csv (summary), separated by commas")
+    ] = "fits,csv",
+) -> None:
+    """Write maps as FITS, TIFF or npz, and a CSV summary."""
+    from pchem_pipeline.stages.export import export_run
+
+    for path in export_run(target, output, tuple(part.strip() for part in formats.split(","))):
+        typer.echo(path)
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
+    size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
+    frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
+    seed: Annotated[int, typer.Option(min=0, help="root of the random numbers")] = 1,
+    quiet: Quiet = False,
+) -> None:
+    """Run everything on a small simulated sensor.
+
+    Prints the estimated parameters beside the true ones, and the path of the report.
+    """
+    from pchem_pipeline.stages.demo import run_demo
+
+    typer.echo(run_demo(output, size=size, n_frames=frames, seed=seed, quiet=quiet))
+
+
+for _name, _summary in {
+    "simulate": "Write a simulated camera's frames, and its truth.",
+    "ingest": "Check the camera files; copy or reference their frames.",
+    "histogram": "Count every pixel's DN; keep summaries in time and space.",
+    "fit": "Fit H, g, mu and sigma of every pixel by PCH-EM.",
+    "maps": "Make the maps, with units, standard errors and quality.",
+    "ensemble": "Predict the ensemble from the maps; compare with the data.",
+    "report": "Write report.html, report.json and the figures.",
+    "electrons": "Write the stack of electron numbers into the store.",
+}.items():
+    _stage_command(_name, _summary)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"pchem {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
+    ] = False,
+) -> None:
+    """Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM."""
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    typer.echo(f"pchem: {' '.join(message.split())}", err=True)
+    sys.exit(code)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
+    from pchem_pipeline.compute.environment import prepare_environment
+
+    prepare_environment()
+    call: Any = app
+    try:
+        call(args=arguments, prog_name="pchem")
+    except PchEmError as error:
+        _fail(str(error), error.exit_code)
+    except MemoryError:
+        _fail("out of memory; use fewer --workers or a smaller histogram.band_memory", ExitCode.INTERNAL)
+    except KeyboardInterrupt:
+        _fail(
+            "stopped by SIGINT; finished tiles are kept, run the same command again to go on", ExitCode.SIGINT
+        )
+
+
+if __name__ == "__main__":
+    main()

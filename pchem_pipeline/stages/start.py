@@ -1,0 +1,84 @@
+"""How a run begins: from a template, or straight from camera files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.config.load import dump_config, parse_config
+from pchem_pipeline.config.template import commented_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.stages.session import Target, find_run
+from pchem_pipeline.store.files import write_atomic
+
+__all__ = ["find_or_start", "write_template"]
+
+_YAML = (".yaml", ".yml")
+
+
+def write_template(path: Path, files: Sequence[str], *, simulated: bool, force: bool) -> None:
+    """Write the commented YAML of a new run.
+
+    Raises:
+        ConfigError: the file exists, and ``force`` is not given.
+    """
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists; choose another name, or replace it with --force")
+    given = list(files) or ([] if simulated else ["frames/*.tif"])
+    text = commented_config(path.name, files=given, simulated=simulated)
+    parse_config(text, str(path))
+    write_atomic(path, text.encode())
+
+
+def find_or_start(
+    targets: Sequence[Path], store: Path | None, given: Mapping[str, Any]
+) -> tuple[Target, bool]:
+    """Return the run that ``targets`` name, and whether it was made from camera files.
+
+    One YAML file or one store is an existing run. Anything else is camera files: a YAML with the
+    settings in ``given`` is written beside the store, and used.
+
+    Raises:
+        ConfigError: options do not fit the target, or the YAML exists with other settings.
+    """
+    first = targets[0]
+    if len(targets) == 1 and (first.suffix.lower() in _YAML or (first / ".pchem").is_dir()):
+        if store is not None or given:
+            names = [*(["store"] if store is not None else []), *given]
+            options = ", ".join("--" + name.replace("_", "-") for name in names)
+            raise ConfigError(
+                f"{options}: only for camera files; {first} has its own settings, change them there"
+            )
+        return find_run(first), False
+    missing = [path for path in targets if not path.exists() and not set("*?[") & set(str(path))]
+    if missing:
+        raise ConfigError(
+            f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
+        )
+    place = (store or Path("run.zarr")).resolve()
+    path = place.with_suffix(".yaml")
+    config = RunConfig.model_validate(
+        {"run": {"store": place.name}, "input": {"files": _file_list(targets, path.parent), **given}}
+    )
+    text = dump_config(config)
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise ConfigError(
+            f"{path} exists with other settings; use them with: pchem run {path}, or choose another --store"
+        )
+    write_atomic(path, text.encode())
+    return Target(config, path.parent, place), True
+
+
+def _file_list(targets: Sequence[Path], base_dir: Path) -> list[str]:
+    """Return the files relative to ``base_dir``; a whole folder that the shell spelled out as one glob."""
+    files = [Path(os.path.relpath(path, base_dir)) for path in targets]
+    folders, suffixes = {path.parent for path in files}, {path.suffix for path in files}
+    if len(files) > 8 and len(folders) == 1 and len(suffixes) == 1:
+        pattern = f"*{suffixes.pop()}"
+        folder = folders.pop()
+        if len(list((base_dir / folder).glob(pattern))) == len(files):
+            return [str(folder / pattern)]
+    return [str(path) for path in files]
