@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -106,11 +107,57 @@ class ParameterSettings(Section):
         for first, second in (("quanta_exposure", "dark_current"), ("dn_per_electron", "conversion_gain")):
             if (getattr(self, first) is None) == (getattr(self, second) is None):
                 raise ValueError(f"give exactly one of {first} and {second}, and null for the other")
-        for correlation in self.correlations:
-            for name in correlation.between:
-                if getattr(self, name) is None:
-                    raise ValueError(f"correlations name {name}, which is not given; use the name that is")
+        if self.dead_fraction + self.stuck_fraction + self.hot_pixels.fraction > 1:
+            raise ValueError("dead_fraction + stuck_fraction + hot_pixels.fraction is above 1; lower them")
         return self
+
+    @model_validator(mode="after")
+    def _correlations_possible(self) -> Self:
+        pairs = [frozenset(correlation.between) for correlation in self.correlations]
+        for pair in pairs:
+            for name in pair - self.given().keys():
+                raise ValueError(f"correlations name {name}, which is not given; use the name that is")
+            if pairs.count(pair) > 1:
+                raise ValueError(f"correlation of {' and '.join(sorted(pair))} is given twice; keep one")
+        if not _positive_definite(self.copula()):
+            raise ValueError("correlations contradict each other (matrix not positive definite); weaken them")
+        return self
+
+    def given(self) -> dict[str, Distribution]:
+        """Return the four distributions given, in the order exposure, gain, bias, read noise."""
+        names = (
+            ("quanta_exposure", "dark_current"),
+            ("dn_per_electron", "conversion_gain"),
+            ("bias",),
+            ("analog_read_noise_e",),
+        )
+        return {
+            name: getattr(self, name) for ways in names for name in ways if getattr(self, name) is not None
+        }
+
+    def copula(self) -> list[list[float]]:
+        """Return the correlation matrix of the normals behind the four parameters, in the order of `given`.
+
+        Spearman's rank correlation r needs normals correlated by 2 sin(pi r / 6).
+        """
+        names = list(self.given())
+        matrix = [[float(i == j) for j in range(len(names))] for i in range(len(names))]
+        for correlation in self.correlations:
+            i, j = (names.index(name) for name in correlation.between)
+            matrix[i][j] = matrix[j][i] = 2 * math.sin(math.pi * correlation.rank / 6)
+        return matrix
+
+
+def _positive_definite(matrix: list[list[float]]) -> bool:
+    # Gaussian elimination by hand: numpy would make every import of the settings slow
+    rows = [list(row) for row in matrix]
+    for i, row in enumerate(rows):
+        if row[i] <= 1e-9:
+            return False
+        for other in rows[i + 1 :]:
+            factor = other[i] / row[i]
+            other[:] = [b - factor * a for a, b in zip(row, other, strict=True)]
+    return True
 
 
 class SimulateSettings(Section):

@@ -1,0 +1,222 @@
+"""The forward chain: exposure -> charge -> analog -> ADC -> readout.
+
+Hendrickson et al., eq. PCD_RV_definition: ``X = round((K + R) / g + mu)``, ``K ~ Poisson(H)``,
+``R ~ N(0, sigma_R^2)``. Rounding is to the nearest whole DN (halves to even), and what the ADC cannot express
+ends at 0 or at 2**bit_depth - 1: that cut always happens, with or without effects.
+
+Without effects one compiled pass does everything. With effects the same numbers go plane by plane; an
+effect of no strength changes nothing, not even the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pchem_pipeline.effects.context import EffectContext
+from pchem_pipeline.effects.plane import Plane
+from pchem_pipeline.errors import ConfigError, PchEmError
+from pchem_pipeline.simulate.chain_numba import simulate_rows
+from pchem_pipeline.simulate.streams import (
+    KeyedStreams,
+    make_key,
+    normal_quantile,
+    poisson_quantile,
+    to_words,
+    uniform_pair,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.base import Effect
+    from pchem_pipeline.simulate.settings import SimulateSettings
+    from pchem_pipeline.simulate.truth import TruthMaps
+
+__all__ = ["dn_dtype", "frames_per_block", "simulate_block"]
+
+_SAMPLE_PURPOSE = "sample"
+# bytes per sample while a block is simulated: result and electrons; and some eight float64 planes
+_BYTES_PLAIN = 8
+_BYTES_WITH_EFFECTS = 80
+
+
+def dn_dtype(bit_depth: int) -> np.dtype[Any]:
+    """Return the smallest unsigned type (8, 16 or 32 bits) that holds the ADC's range."""
+    return np.dtype(np.uint8 if bit_depth <= 8 else np.uint16 if bit_depth <= 16 else np.uint32)
+
+
+def frames_per_block(settings: SimulateSettings, n_rows: int, budget: int) -> int:
+    """Return how many frames of a band of rows can be simulated at once within a budget of bytes."""
+    per_sample = _BYTES_WITH_EFFECTS if settings.effects else _BYTES_PLAIN
+    n_rows = n_rows + 2 * sum(effect.halo() for effect in settings.effects)
+    return max(1, budget // (per_sample * n_rows * settings.shape[1]))
+
+
+def simulate_block(
+    truth: TruthMaps,
+    settings: SimulateSettings,
+    frames: tuple[int, int],
+    rows: tuple[int, int] | None = None,
+    *,
+    electron_frames: int | None = None,
+) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+    """Simulate a block of frames of a band of rows; the same at every division into blocks and bands.
+
+    Args:
+        truth: maps of the whole sensor.
+        settings: the section ``simulate``.
+        frames: first frame and the frame after the last.
+        rows: first row and the row after the last; ``None`` for all.
+        electron_frames: for how many of the block's first frames the electron number is wanted;
+            ``None`` for all.
+
+    Returns:
+        Digital numbers (frame, y, x), DN, unsigned; true electron numbers (frame, y, x), e-.
+
+    Raises:
+        ConfigError: if the truth is not of the sensor's shape.
+        PchEmError: if an effect fails or returns something impossible; names it.
+    """
+    if truth.shape != settings.shape:
+        raise ConfigError(
+            f"truth has shape {truth.shape}, simulate.shape is {settings.shape}; make them equal"
+        )
+    rows = rows or (0, settings.shape[0])
+    wanted = frames[1] - frames[0] if electron_frames is None else min(electron_frames, frames[1] - frames[0])
+    if settings.effects:
+        dn, electrons = _simulate_planes(truth, settings, frames, rows)
+        return dn, electrons[:wanted]
+    return _simulate_plain(truth, settings, frames, rows, wanted)
+
+
+def _simulate_plain(
+    truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int], rows: tuple[int, int], wanted: int
+) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+    band = truth.band(*rows)
+    size = (rows[1] - rows[0], settings.shape[1])
+    dn = np.empty((frames[1] - frames[0], *size), dn_dtype(settings.bit_depth))
+    electrons = np.empty((wanted, *size), np.uint32)
+    simulate_rows(
+        band.quanta_exposure,
+        band.conversion_gain,
+        band.bias,
+        band.analog_read_noise_e,
+        to_words(np.arange(*frames)),
+        to_words(np.arange(*rows)),
+        to_words(np.arange(settings.shape[1])),
+        *make_key(settings.seed, _SAMPLE_PURPOSE),
+        float(2**settings.bit_depth - 1),
+        dn,
+        electrons,
+    )
+    return dn, electrons
+
+
+def _simulate_planes(
+    truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int], rows: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+    halo = sum(effect.halo() for effect in settings.effects)
+    history = sum(effect.history() for effect in settings.effects)
+    first, last = max(0, rows[0] - halo), min(settings.shape[0], rows[1] + halo)
+    block = _Block(
+        settings, truth.band(first, last), np.arange(frames[0] - history, frames[1]), np.arange(first, last)
+    )
+    dn, charge = block.run()
+    keep = (slice(history, None), slice(rows[0] - first, rows[1] - first))
+    return dn[keep], charge[keep].astype(np.uint32)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A block with its halo and history, on its way through the planes."""
+
+    settings: SimulateSettings
+    truth: TruthMaps
+    frames: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    def run(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Return digital numbers and electron numbers of the block."""
+        settings, truth = self.settings, self.truth
+        columns = np.arange(settings.shape[1])
+        frames, ys, xs = (to_words(axis) for axis in (self.frames, self.rows, columns))
+        u, v = uniform_pair(make_key(settings.seed, _SAMPLE_PURPOSE), frames, ys, xs)
+
+        context = self._context()
+        exposure = self._apply(
+            Plane.EXPOSURE, np.array(np.broadcast_to(truth.quanta_exposure, u.shape)), context
+        )
+        context = replace(context, exposure=_frozen(exposure))
+        charge = self._apply(Plane.CHARGE, poisson_quantile(u, exposure), context)
+        context = replace(context, charge=_frozen(charge))
+        noise = truth.analog_read_noise_e * normal_quantile(v)
+        context = replace(context, read_noise=_frozen(noise))
+        analog = self._apply(Plane.ANALOG, charge + noise, context)
+        at_adc = self._apply(Plane.ADC, analog / truth.conversion_gain + truth.bias, context)
+        top = 2**settings.bit_depth - 1
+        dn = np.clip(np.rint(at_adc), 0, top).astype(dn_dtype(settings.bit_depth))
+        dn = self._apply(Plane.READOUT, dn, context)
+        if dn.size and int(dn.max()) > top:
+            raise PchEmError(
+                f"an effect on the readout returned {dn.max()} DN, above the ADC's {top}; correct it"
+            )
+        return dn, charge
+
+    def _streams(self, purpose: str) -> KeyedStreams:
+        columns = np.arange(self.settings.shape[1])
+        return KeyedStreams(self.settings.seed, purpose, self.frames, self.rows, columns)
+
+    def _context(self) -> EffectContext:
+        settings = self.settings
+        maps = {name: _frozen(values) for name, values in self.truth.arrays().items()}
+        return EffectContext(
+            frames=_frozen(self.frames),
+            n_frames=settings.n_frames,
+            rows=_frozen(self.rows),
+            shape=settings.shape,
+            integration_time=settings.integration_time,
+            bit_depth=settings.bit_depth,
+            truth=maps,
+            random=self._streams("effect"),
+        )
+
+    def _apply(self, plane: Plane, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        for position, effect in _of_plane(self.settings.effects, plane):
+            random = self._streams(f"effect/{effect.tag}/{position}")
+            values = _checked(effect, plane, values, replace(context, random=random))
+        return values
+
+
+def _of_plane(effects: Sequence[Effect], plane: Plane) -> list[tuple[int, Effect]]:
+    """Return the effects of a plane, each with how many of its tag come before it in the whole list."""
+    tags = [effect.tag for effect in effects]
+    return [(tags[:i].count(effect.tag), effect) for i, effect in enumerate(effects) if effect.plane is plane]
+
+
+def _checked(effect: Effect, plane: Plane, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    name = f"effect {effect.tag!r} ({type(effect).__module__})"
+    try:
+        result = effect.apply(_frozen(values), context)
+    except Exception as error:
+        raise PchEmError(
+            f"{name} failed: {type(error).__name__}: {error}; correct it or leave it out"
+        ) from error
+    if not isinstance(result, np.ndarray) or result.shape != values.shape or result.dtype != values.dtype:
+        got = f"{result.dtype}{result.shape}" if isinstance(result, np.ndarray) else type(result).__name__
+        raise PchEmError(f"{name} returned {got} instead of {values.dtype}{values.shape}; correct it")
+    if result.dtype.kind == "f" and not np.isfinite(result).all():
+        raise PchEmError(f"{name} returned NaN or infinity; correct its parameters")
+    if plane in (Plane.EXPOSURE, Plane.CHARGE) and result.size and result.min() < 0:
+        raise PchEmError(f"{name} returned a negative number of electrons; correct its parameters")
+    return result
+
+
+def _frozen(values: NDArray[Any]) -> NDArray[Any]:
+    view = values.view()
+    view.flags.writeable = False
+    return view

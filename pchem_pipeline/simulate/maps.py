@@ -1,0 +1,151 @@
+"""Draw the parameter maps of a sensor: distributions, correlations, patterns and defects.
+
+A pixel's values depend on the seed and on its own position only, so a larger sensor with the same seed
+contains the smaller one (but for gradients, which are stretched), and any band of rows can be drawn alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import special
+
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.simulate.patterns import (
+    ColumnPattern,
+    GradientPattern,
+    Pattern,
+    RadialPattern,
+    RowPattern,
+)
+from pchem_pipeline.simulate.quantiles import truncated_quantile
+from pchem_pipeline.simulate.streams import KeyedStreams
+from pchem_pipeline.simulate.truth import Defect, TruthMaps
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from pchem_pipeline.simulate.distributions import Distribution
+    from pchem_pipeline.simulate.settings import SimulateSettings
+
+__all__ = ["draw_truth"]
+
+
+def draw_truth(settings: SimulateSettings, rows: tuple[int, int] | None = None) -> TruthMaps:
+    """Draw the true parameter maps (y, x) of the sensor, or of a band of its rows.
+
+    Args:
+        settings: the section ``simulate``.
+        rows: first row and the row after the last; ``None`` for all.
+
+    Raises:
+        ConfigError: if a value is impossible (H < 0, g <= 0, read noise < 0).
+    """
+    ys = np.arange(*(rows or (0, settings.shape[0])))
+    given = settings.parameters.given()
+    maps = {
+        name: _with_patterns(truncated_quantile(distribution, u), name, distribution, settings, ys)
+        for (name, distribution), u in zip(given.items(), _copula(settings, ys), strict=True)
+    }
+    for name, values in maps.items():
+        _refuse_impossible(name, values)
+    if "dark_current" in maps:
+        maps["quanta_exposure"] = maps["dark_current"] * settings.integration_time
+    if "dn_per_electron" in maps:
+        maps["conversion_gain"] = 1.0 / maps["dn_per_electron"]
+    truth = TruthMaps(
+        quanta_exposure=maps["quanta_exposure"],
+        conversion_gain=maps["conversion_gain"],
+        bias=maps["bias"],
+        analog_read_noise_e=maps["analog_read_noise_e"],
+        defect=np.zeros(maps["bias"].shape, np.uint8),
+    )
+    return _with_defects(truth, settings, ys)
+
+
+def _streams(settings: SimulateSettings, purpose: str, ys: NDArray[np.int64]) -> KeyedStreams:
+    return KeyedStreams(
+        settings.seed, f"map/{purpose}", np.zeros(1, np.int64), ys, np.arange(settings.shape[1])
+    )
+
+
+def _copula(settings: SimulateSettings, ys: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return uniforms (parameter, y, x) with the rank correlations asked for."""
+    factor = np.linalg.cholesky(np.array(settings.parameters.copula()))
+    normals = [_streams(settings, f"parameter {i}", ys).normal(("y", "x"))[0] for i in range(len(factor))]
+    uniforms: NDArray[np.float64] = special.ndtr(np.tensordot(factor, np.stack(normals), axes=1))
+    return uniforms
+
+
+def _with_patterns(
+    values: NDArray[np.float64],
+    name: str,
+    distribution: Distribution,
+    settings: SimulateSettings,
+    ys: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    for i, pattern in enumerate(distribution.patterns):
+        streams = _streams(settings, f"{name} pattern {i}", ys)
+        shift = _pattern(pattern, streams, settings.shape)
+        values = values * (1.0 + shift) if pattern.relative else values + shift
+    if distribution.minimum is None and distribution.maximum is None:
+        return values
+    return np.clip(values, distribution.minimum, distribution.maximum)
+
+
+def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return a pattern on the band, broadcastable to (y, x)."""
+    # position from -1/2 to 1/2 across the sensor; a single row or column is in the middle
+    y = (streams.rows[:, None] - (shape[0] - 1) / 2) / max(shape[0] - 1, 1)
+    x = (streams.columns[None, :] - (shape[1] - 1) / 2) / max(shape[1] - 1, 1)
+    match pattern:
+        case ColumnPattern():
+            return _floats(pattern.amplitude * streams.normal(("x",))[0])
+        case RowPattern():
+            return _floats(pattern.amplitude * streams.normal(("y",))[0])
+        case GradientPattern():
+            angle = np.deg2rad(pattern.angle)
+            return _floats(pattern.amplitude * (x * np.cos(angle) + y * np.sin(angle)))
+        case RadialPattern():
+            return _floats(pattern.amplitude * 2.0 * (x**2 + y**2))
+
+
+def _floats(values: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(values, dtype=np.float64)
+
+
+def _refuse_impossible(name: str, values: NDArray[np.float64]) -> None:
+    if name == "bias":
+        return
+    must_be_positive = name in ("conversion_gain", "dn_per_electron")
+    lowest = float(values.min())
+    if lowest < 0 or (must_be_positive and lowest == 0):
+        raise ConfigError(
+            f"simulate.parameters.{name} reaches {lowest:.4g} in some pixels, which is impossible; "
+            f"give it a minimum {'above' if must_be_positive else 'of'} 0"
+        )
+
+
+def _with_defects(truth: TruthMaps, settings: SimulateSettings, ys: NDArray[np.int64]) -> TruthMaps:
+    """Return the maps with hot, dead and stuck pixels; a pixel has one defect at most."""
+    parameters = settings.parameters
+    streams = _streams(settings, "defect", ys)
+    lot = streams.uniform(("y", "x"), draw=0)[0]
+    ends = np.cumsum([parameters.dead_fraction, parameters.stuck_fraction, parameters.hot_pixels.fraction])
+    dead = lot < ends[0]
+    stuck = (lot >= ends[0]) & (lot < ends[1])
+    hot = (lot >= ends[1]) & (lot < ends[2])
+    multiplier = truncated_quantile(parameters.hot_pixels.multiplier, streams.uniform(("y", "x"), draw=1)[0])
+    code = np.floor(streams.uniform(("y", "x"), draw=2)[0] * 2.0**settings.bit_depth)
+    exposure = np.where(hot, truth.quanta_exposure * multiplier, truth.quanta_exposure)
+    defect = np.select([dead, stuck, hot], [Defect.DEAD, Defect.STUCK, Defect.HOT], Defect.NONE)
+    return replace(
+        truth,
+        quanta_exposure=np.where(dead | stuck, 0.0, exposure),
+        # without electrons and noise, the bias is what comes out, always
+        bias=np.where(stuck, code, truth.bias),
+        analog_read_noise_e=np.where(stuck, 0.0, truth.analog_read_noise_e),
+        defect=defect.astype(np.uint8),
+    )

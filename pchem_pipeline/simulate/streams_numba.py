@@ -1,0 +1,258 @@
+"""Compiled random numbers: Philox4x32-10 blocks, normal and Poisson numbers by inversion.
+
+Every number is a function of a key and a position, so there is no state to pass on and no order
+in which numbers must be drawn. One block of 128 bits gives two uniform numbers of 52 bits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+__all__ = [
+    "fill_uniform",
+    "normal_from_uniform",
+    "philox_block",
+    "poisson_from_uniform",
+    "poisson_quantile",
+    "poisson_start",
+    "uniform_row",
+]
+
+_MASK = np.uint64(0xFFFFFFFF)
+_HALF = np.uint64(32)
+# multipliers and Weyl constants of Philox4x32 (Salmon, Moraes, Dror and Shaw, SC11)
+_M0 = np.uint64(0xD2511F53)
+_M1 = np.uint64(0xCD9E8D57)
+_W0 = np.uint64(0x9E3779B9)
+_W1 = np.uint64(0xBB67AE85)
+_SHIFT = np.uint64(12)
+_TO_UNIT = 2.0**-52
+_LARGEST = 1.0 - 2.0**-53
+
+
+@njit(nogil=True, cache=True, inline="always")
+def philox_block(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
+    """Return the four 32-bit words of one Philox4x32-10 block, as uint64 (arguments: uint64 below 2**32)."""
+    for _ in range(10):
+        p0 = _M0 * c0
+        p1 = _M1 * c2
+        c0, c1, c2, c3 = (p1 >> _HALF) ^ c1 ^ k0, p1 & _MASK, (p0 >> _HALF) ^ c3 ^ k1, p0 & _MASK
+        k0 = (k0 + _W0) & _MASK
+        k1 = (k1 + _W1) & _MASK
+    return c0, c1, c2, c3
+
+
+@njit(nogil=True, cache=True)
+def uniform_row(frame, y, xs, draw, k0, k1, first, second):  # type: ignore[no-untyped-def]
+    """Fill ``first`` and ``second`` with the uniforms in (0, 1) of a row's positions (all uint64)."""
+    for i in range(xs.size):
+        a, b, c, d = philox_block(frame, xs[i], y, draw, k0, k1)
+        # half a step off the grid: never 0 and never 1, so that every quantile is finite
+        first[i] = (np.float64(((a << _HALF) | b) >> _SHIFT) + 0.5) * _TO_UNIT
+        second[i] = (np.float64(((c << _HALF) | d) >> _SHIFT) + 0.5) * _TO_UNIT
+
+
+@njit(nogil=True, cache=True)
+def fill_uniform(frames, ys, xs, draw, k0, k1, first, second):  # type: ignore[no-untyped-def]
+    """Fill two (frame, y, x) arrays with the uniforms of all combinations of the coordinates (uint64)."""
+    for t in range(frames.size):
+        for j in range(ys.size):
+            uniform_row(frames[t], ys[j], xs, draw, k0, k1, first[t, j], second[t, j])
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _normal_centre(q):  # type: ignore[no-untyped-def]
+    r = 0.180625 - q * q
+    num = (
+        (
+            (
+                (
+                    ((2.5090809287301226727e3 * r + 3.3430575583588128105e4) * r + 6.7265770927008700853e4)
+                    * r
+                    + 4.5921953931549871457e4
+                )
+                * r
+                + 1.3731693765509461125e4
+            )
+            * r
+            + 1.9715909503065514427e3
+        )
+        * r
+        + 1.3314166789178437745e2
+    ) * r + 3.3871328727963666080e0
+    den = (
+        (
+            (
+                (
+                    ((5.2264952788528545610e3 * r + 2.8729085735721942674e4) * r + 3.9307895800092710610e4)
+                    * r
+                    + 2.1213794301586595867e4
+                )
+                * r
+                + 5.3941960214247511077e3
+            )
+            * r
+            + 6.8718700749205790830e2
+        )
+        * r
+        + 4.2313330701600911252e1
+    ) * r + 1.0
+    return q * num / den
+
+
+@njit(nogil=True, cache=True)
+def _normal_tail(q, tail):  # type: ignore[no-untyped-def]
+    r = math.sqrt(-math.log(tail))
+    if r <= 5.0:
+        r -= 1.6
+        num = (
+            (
+                (
+                    (
+                        (
+                            (7.74545014278341407640e-4 * r + 2.27238449892691845833e-2) * r
+                            + 2.41780725177450611770e-1
+                        )
+                        * r
+                        + 1.27045825245236838258e0
+                    )
+                    * r
+                    + 3.64784832476320460504e0
+                )
+                * r
+                + 5.76949722146069140550e0
+            )
+            * r
+            + 4.63033784615654529590e0
+        ) * r + 1.42343711074968357734e0
+        den = (
+            (
+                (
+                    (
+                        (
+                            (1.05075007164441684324e-9 * r + 5.47593808499534494600e-4) * r
+                            + 1.51986665636164571966e-2
+                        )
+                        * r
+                        + 1.48103976427480074590e-1
+                    )
+                    * r
+                    + 6.89767334985100004550e-1
+                )
+                * r
+                + 1.67638483018380384940e0
+            )
+            * r
+            + 2.05319162663775882187e0
+        ) * r + 1.0
+    else:
+        r -= 5.0
+        num = (
+            (
+                (
+                    (
+                        (
+                            (2.01033439929228813265e-7 * r + 2.71155556874348757815e-5) * r
+                            + 1.24266094738807843860e-3
+                        )
+                        * r
+                        + 2.65321895265761230930e-2
+                    )
+                    * r
+                    + 2.96560571828504891230e-1
+                )
+                * r
+                + 1.78482653991729133580e0
+            )
+            * r
+            + 5.46378491116411436990e0
+        ) * r + 6.65790464350110377720e0
+        den = (
+            (
+                (
+                    (
+                        (
+                            (2.04426310338993978564e-15 * r + 1.42151175831644588870e-7) * r
+                            + 1.84631831751005468180e-5
+                        )
+                        * r
+                        + 7.86869131145613259100e-4
+                    )
+                    * r
+                    + 1.48753612908506148525e-2
+                )
+                * r
+                + 1.36929880922735805310e-1
+            )
+            * r
+            + 5.99832206555887937690e-1
+        ) * r + 1.0
+    z = num / den
+    return -z if q < 0.0 else z
+
+
+@njit(nogil=True, cache=True)
+def normal_from_uniform(p, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with standard normal quantiles of ``p`` (1-D), Wichura 1988, AS 241, PPND16.
+
+    Two passes: the centre for everybody, which the compiler vectorises, then the tails.
+    """
+    for i in range(p.size):
+        out[i] = _normal_centre(p[i] - 0.5)
+    for i in range(p.size):
+        q = p[i] - 0.5
+        if abs(q) > 0.425:
+            out[i] = _normal_tail(q, p[i] if q < 0.0 else 1.0 - p[i])
+
+
+@njit(nogil=True, cache=True)
+def poisson_start(mean):  # type: ignore[no-untyped-def]
+    """Return the first electron number whose probability matters, its probability, and the last one."""
+    spread = 9.0 * math.sqrt(mean)
+    first = max(0, int(mean - spread - 10.0))
+    last = int(mean + spread + 20.0)
+    if first == 0:
+        return 0, math.exp(-mean), last
+    return first, math.exp(first * math.log(mean) - mean - math.lgamma(first + 1.0)), last
+
+
+@njit(nogil=True, cache=True)
+def poisson_quantile(u, mean):  # type: ignore[no-untyped-def]
+    """Return the smallest k with P(K <= k) >= u for K ~ Poisson(mean), by adding up the masses."""
+    k, mass, last = poisson_start(mean)
+    below = mass
+    while u > below and k < last:
+        k += 1
+        mass *= mean / k
+        below += mass
+    return k
+
+
+@njit(nogil=True, cache=True)
+def poisson_from_uniform(u, mean, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with the Poisson quantiles of ``u`` (all 1-D, same length)."""
+    for i in range(u.size):
+        out[i] = poisson_quantile(u[i], mean[i])
+
+
+@njit(nogil=True, cache=True)
+def poisson_table(mean, table):  # type: ignore[no-untyped-def]
+    """Write the cumulative masses into ``table``; return (first k, number of entries).
+
+    The sums are those of :func:`poisson_quantile`, so that looking up gives the same numbers.
+    """
+    k, mass, last = poisson_start(mean)
+    first = k
+    below = mass
+    n = 0
+    while True:
+        table[n] = below
+        n += 1
+        if below >= _LARGEST or k >= last:
+            return first, n
+        k += 1
+        mass *= mean / k
+        below += mass

@@ -1,0 +1,70 @@
+"""The parameter maps of a simulated sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["Defect", "TruthMaps"]
+
+# variance of rounding to whole DN, uniform over one DN (sigma_Q of the paper)
+_QUANTISATION_VARIANCE = 1.0 / 12.0
+
+
+class Defect(IntEnum):
+    """What is special about a simulated pixel."""
+
+    NONE = 0
+    HOT = 1
+    DEAD = 2
+    STUCK = 3
+
+
+@dataclass(frozen=True)
+class TruthMaps:
+    """True parameters of the pixels, all (y, x).
+
+    Attributes:
+        quanta_exposure: H, e-.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        analog_read_noise_e: sigma_R, e-, without quantisation.
+        defect: uint8, see :class:`Defect`.
+    """
+
+    quanta_exposure: NDArray[np.float64]
+    conversion_gain: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    analog_read_noise_e: NDArray[np.float64]
+    defect: NDArray[np.uint8]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, px."""
+        rows, columns = self.bias.shape
+        return rows, columns
+
+    @property
+    def read_noise_dn(self) -> NDArray[np.float64]:
+        """Read noise with quantisation, DN: sigma = (sigma_R^2 / g^2 + 1/12)^(1/2)."""
+        return np.sqrt((self.analog_read_noise_e / self.conversion_gain) ** 2 + _QUANTISATION_VARIANCE)
+
+    @property
+    def read_noise_e(self) -> NDArray[np.float64]:
+        """Read noise with quantisation, e-: sigma_e- = g sigma."""
+        return self.conversion_gain * self.read_noise_dn
+
+    def band(self, start: int, stop: int) -> TruthMaps:
+        """Return the maps of rows ``start .. stop - 1``."""
+        return replace(self, **{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return every map by its name in the group ``truth`` of a store."""
+        names = (*(f.name for f in fields(self)), "read_noise_dn", "read_noise_e")
+        return {name: getattr(self, name) for name in names}
