@@ -125,7 +125,8 @@ def check_window(
         or not buffer.flags.c_contiguous
     ):
         raise ValueError(
-            f"buffer {buffer.shape} {buffer.dtype} does not fit {(t1 - t0, y1 - y0, nx)} {reader.dtype}, C order"
+            f"buffer {buffer.shape} {buffer.dtype} does not fit {(t1 - t0, y1 - y0, nx)} {reader.dtype}, "
+            "C order"
         )
     return y0, y1
 

@@ -50,7 +50,7 @@ def hash_file(path: Path) -> str:
 
 
 def sample_hash(path: Path) -> str:
-    """Return a hash of the first, middle and last 64 KiB: different means different, equal means look closer."""
+    """Return a hash of the first, middle and last 64 KiB; where it is equal, look closer."""
     hasher = xxhash.xxh3_128()
     for part in _parts(path)[:64]:
         size = part.stat().st_size

@@ -62,7 +62,7 @@ class InputReport:
         return [file for file in self.files if not file.problem]
 
     def message(self) -> str:
-        """Return one line on all bad files and what was done about them, and the notes; empty if all is well."""
+        """Return one line: all bad files, what was done about them, and notes; empty if all is well."""
         lines = []
         if bad := self.bad:
             several = f"{len(bad)} of {len(self.files)} input files cannot be used: "

@@ -1,6 +1,7 @@
 """Which reader is for which file: ours, and others' from the entry point group ``pchem_pipeline.readers``.
 
-Nothing heavy is imported before a file needs it. The name of an entry point is the ``format_name`` of its reader.
+Nothing heavy is imported before a file needs it. The name of an entry point is the ``format_name`` of its
+reader.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def _plugins() -> dict[str, EntryPoint]:
         if other is not None or point.name in _OURS or point.name in ("auto", "histogram"):
             first = other.value if other is not None else "pchem_pipeline itself"
             raise ConfigError(
-                f"two readers are named {point.name!r}: {first} and {point.value}; uninstall or rename one of them"
+                f"two readers are named {point.name!r}: {first} and {point.value}; uninstall or rename "
+                "one of them"
             )
         found[point.name] = point
     return found
@@ -71,11 +73,13 @@ def _load(point: EntryPoint) -> type[FrameReader]:
         cls = point.load()
     except Exception as error:
         raise ConfigError(
-            f"the reader {point.name!r} ({point.value}) cannot be loaded: {error}; repair or uninstall that package"
+            f"the reader {point.name!r} ({point.value}) cannot be loaded: {error}; repair or uninstall "
+            "that package"
         ) from error
     if not (isinstance(cls, type) and issubclass(cls, FrameReader)) or cls.format_name != point.name:
         raise ConfigError(
-            f"the reader {point.name!r} ({point.value}) must be a FrameReader with format_name = {point.name!r}; "
+            f"the reader {point.name!r} ({point.value}) must be a FrameReader with format_name = "
+            f"{point.name!r}; "
             "repair or uninstall that package"
         )
     return cls

@@ -31,7 +31,8 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
 
     Raises:
         ConfigError: no files are named.
-        InputError: a path is missing, a glob matches nothing, a folder holds no camera files or several formats.
+        InputError: a path is missing, a glob matches nothing, a folder holds no camera files or several
+            formats.
     """
     if not settings.files:
         raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")

@@ -43,7 +43,8 @@ class FrameSequence(FrameReader):
         total = self._ends[-1] if self._ends else 0
         if total < 2:
             raise InputError(
-                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)} in all; at least 2 are needed, and some "
+                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)} in all; at least 2 are needed, "
+                "and some "
                 "thousands for useful estimates; add frames to input.files"
             )
         self._first, end = _frame_range(settings, total)
@@ -61,7 +62,8 @@ class FrameSequence(FrameReader):
         size = 8 * self.dtype.itemsize
         if self.bit_shift >= size:
             raise InputError(
-                f"{_where(self.paths)}: input.bit_shift {self.bit_shift} leaves nothing of {self.dtype} samples; correct it"
+                f"{_where(self.paths)}: input.bit_shift {self.bit_shift} leaves nothing of {self.dtype} "
+                "samples; correct it"
             )
         depth = settings.bit_depth
         if depth is None:
@@ -69,7 +71,8 @@ class FrameSequence(FrameReader):
         self.bit_depth = depth
         if depth is not None and depth > size - self.bit_shift:
             raise InputError(
-                f"{_where(self.paths)}: a bit depth of {depth} does not fit into {self.dtype} samples shifted by "
+                f"{_where(self.paths)}: a bit depth of {depth} does not fit into {self.dtype} samples "
+                "shifted by "
                 f"{self.bit_shift}; correct input.bit_depth or input.bit_shift"
             )
         time = settings.integration_time
@@ -128,7 +131,8 @@ class FrameSequence(FrameReader):
         name = reader.paths[0]
         if used & ((1 << self.bit_shift) - 1):
             raise InputError(
-                f"{name}: the lowest {self.bit_shift} bits are not all zero, so the samples are not left-justified "
+                f"{name}: the lowest {self.bit_shift} bits are not all zero, so the samples are not "
+                "left-justified "
                 f"by that many; correct input.bit_shift"
             )
         if self.bit_shift:
@@ -184,6 +188,7 @@ def _region(settings: InputSettings, rows: int, columns: int) -> tuple[int, int,
     y0, y1, x0, x1 = settings.roi
     if y1 > rows or x1 > columns:
         raise InputError(
-            f"input.roi {list(settings.roi)} reaches beyond the frames of {rows} rows and {columns} columns; correct it"
+            f"input.roi {list(settings.roi)} reaches beyond the frames of {rows} rows and {columns} "
+            "columns; correct it"
         )
     return y0, y1, x0, x1

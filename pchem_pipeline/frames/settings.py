@@ -30,7 +30,8 @@ class InputSettings(Section):
     )
     mode: Literal["copy", "reference"] = Field(
         default="copy",
-        description="copy: frames go into the store; reference: nothing is copied, the camera files must stay",
+        description="copy: frames go into the store; reference: nothing is copied, the camera files must "
+        "stay",
     )
     shape: tuple[int, ...] | None = Field(
         default=None,
@@ -68,7 +69,8 @@ class InputSettings(Section):
         default=None,
         ge=1,
         le=32,
-        description="bits of the ADC, after bit_shift; null: from the file, else unknown (then saturation at the "
+        description="bits of the ADC, after bit_shift; null: from the file, else unknown (then "
+        "saturation at the "
         "top of the range cannot be told from a clipped histogram)",
     )
     roi: tuple[int, int, int, int] | None = Field(
@@ -76,12 +78,14 @@ class InputSettings(Section):
     )
     frame_range: tuple[int, int | None] | None = Field(
         default=None,
-        description="[first, end] frame over all files together, end excluded, null end: to the last; null: all",
+        description="[first, end] frame over all files together, end excluded, null end: to the last; "
+        "null: all",
     )
     integration_time: float | None = Field(
         default=None,
         gt=0,
-        description="integration time of a frame, s; null: from the file, else unknown (no dark current then)",
+        description="integration time of a frame, s; null: from the file, else unknown (no dark current "
+        "then)",
     )
     on_bad_file: Literal["error", "skip"] = Field(
         default="error",
