@@ -22,7 +22,7 @@ class HistogramSettings(Section):
         default=256,
         ge=1,
         le=16384,
-        description="first frames of the stack, from which the number of bins is decided",
+        description="frames that are read at a time; the first of them decide the number of bins",
     )
     max_bins: int = Field(
         default=1024,

@@ -1,0 +1,255 @@
+"""Per-pixel histograms against numpy, their windows, and the choice of the number of bins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+from pchem_pipeline.model import histogram, histogram_numba
+from pchem_pipeline.model.histogram import (
+    HistogramAccumulator,
+    RangeAccumulator,
+    RowHistograms,
+    choose_bins,
+    counts_dtype,
+    histogram_frames,
+)
+
+
+def pcd_like(seed: int, shape: tuple[int, int, int], dtype: type = np.uint16) -> NDArray[np.unsignedinteger]:
+    rng = np.random.default_rng(seed)
+    bias = rng.normal(100, 6, shape[1:])
+    return np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(dtype)
+
+
+def expand(histograms: RowHistograms, y: int, x: int, size: int) -> NDArray[np.int64]:
+    """Counts of a pixel on the axis DN = 0, 1, ... size - 1."""
+    full = np.zeros(size + histograms.counts.shape[2], np.int64)
+    start = histograms.origin[y, x]
+    full[start : start + histograms.counts.shape[2]] = histograms.counts[y, x]
+    assert not full[size:].any()
+    return full[:size]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+def test_equals_bincount_of_every_pixel(dtype):
+    frames = pcd_like(1, (700, 5, 7), dtype)
+    result = histogram_frames(frames)
+    assert result.counts.dtype == np.uint16
+    for y in range(5):
+        for x in range(7):
+            expected = np.bincount(frames[:, y, x], minlength=512)
+            np.testing.assert_array_equal(expand(result, y, x, 512), expected)
+    assert not result.under.any()
+    assert not result.over.any()
+    np.testing.assert_array_equal(result.minimum, frames.min(axis=0))
+    np.testing.assert_array_equal(result.maximum, frames.max(axis=0))
+
+
+def test_what_fits_is_in_the_middle_of_its_window():
+    frames = pcd_like(2, (300, 3, 4)) + np.uint16(1000)
+    result = histogram_frames(frames, bins=256)
+    left = result.minimum - result.origin
+    right = result.origin + 255 - result.maximum
+    assert np.all((right - left >= 0) & (right - left <= 1))
+
+
+def test_window_near_zero_does_not_begin_below_it():
+    frames = np.tile(np.array([0, 3, 1], np.uint16)[:, None, None], (1, 2, 2))
+    result = histogram_frames(frames, bins=32)
+    assert np.all(result.origin == 0)
+    np.testing.assert_array_equal(result.counts[0, 0, :4], [1, 1, 0, 1])
+
+
+def test_constant_pixel_has_one_occupied_bin():
+    result = histogram_frames(np.full((50, 2, 3), 77, np.uint16), bins=32)
+    assert np.all(np.count_nonzero(result.counts, axis=2) == 1)
+    assert np.all(result.counts.max(axis=2) == 50)
+    assert np.all(result.minimum == 77)
+
+
+def test_top_of_the_range_of_the_type():
+    for dtype in (np.uint8, np.uint16):
+        top = np.iinfo(dtype).max
+        frames = np.array([top, top - 1, top, 0], dtype)[:, None, None]
+        result = histogram_frames(frames[:3], bins=32)
+        assert expand(result, 0, 0, top + 1)[top] == 2
+        whole = histogram_frames(frames, bins=32)
+        assert (whole.under[0, 0], whole.over[0, 0], whole.counts.sum()) == (1, 0, 3)
+
+
+def test_window_follows_a_pixel_that_fits_wherever_it_goes():
+    # a drift of 90 DN through a window of 128: the counts must be moved, several times, and stay exact
+    drift = np.rint(500 - 90 * np.arange(2000) / 2000).astype(np.uint16)[:, None, None]
+    frames = (drift + pcd_like(3, (2000, 2, 3)) % 16).astype(np.uint16)
+    result = histogram_frames(frames, bins=128, window_frames=100)
+    for y in range(2):
+        for x in range(3):
+            np.testing.assert_array_equal(
+                expand(result, y, x, 600), np.bincount(frames[:, y, x], minlength=600)
+            )
+
+
+def test_a_late_glitch_is_counted_as_over_and_moves_nothing():
+    frames = pcd_like(4, (600, 2, 2))
+    clean = histogram_frames(frames, bins=160)
+    frames[450, 0, 1] = 4000
+    frames[500, 0, 1] = 1
+    result = histogram_frames(frames, bins=160)
+    assert (result.under[0, 1], result.over[0, 1]) == (1, 1)
+    assert result.counts[0, 1].sum() == 598
+    assert (result.minimum[0, 1], result.maximum[0, 1]) == (1, 4000)
+    others = np.ones((2, 2), bool)
+    others[0, 1] = False
+    np.testing.assert_array_equal(result.counts[others], clean.counts[others])
+
+
+def test_an_early_glitch_does_not_take_the_window_with_it():
+    frames = pcd_like(5, (600, 1, 2))
+    frames[0] = 4095
+    result = histogram_frames(frames, bins=160)
+    assert np.all(result.over == 1)
+    assert np.all(result.under == 0)
+    assert np.all(result.counts.sum(axis=2) == 599)
+
+
+def test_under_and_over_are_exact_for_noise_of_full_range():
+    rng = np.random.default_rng(6)
+    frames = rng.integers(0, 65536, (900, 3, 3)).astype(np.uint16)
+    result = histogram_frames(frames, bins=512)
+    start, end = result.origin, result.origin + 512
+    np.testing.assert_array_equal(result.under, (frames < start).sum(axis=0))
+    np.testing.assert_array_equal(result.over, (frames >= end).sum(axis=0))
+    np.testing.assert_array_equal(result.counts.sum(axis=2) + result.under + result.over, 900)
+
+
+def test_densest_origin_holds_most_of_the_values():
+    values = np.array([5, 200, 201, 210, 400, 402, 403, 404, 4095], np.uint16)
+    origin = histogram_numba.densest_origin(values, 32)
+    assert origin <= 400
+    assert origin + 32 > 404
+
+
+def test_more_than_24_bits_are_refused():
+    frames = np.full((3, 2, 2), 1 << 24, np.uint32)
+    with pytest.raises(InputError, match="more than 24 bits"):
+        histogram_frames(frames, bins=32)
+
+
+def test_counts_are_wide_enough():
+    assert counts_dtype(65535) == np.uint16
+    assert counts_dtype(65536) == np.uint32
+    frames = np.zeros((70_000, 1, 1), np.uint8)
+    result = histogram_frames(frames, bins=32)
+    assert result.counts.max() == 70_000
+
+
+class TestChoiceOfBins:
+    @staticmethod
+    def pixels(ranges: dict[int, int], max_bins: int = 1024) -> NDArray[np.int64]:
+        out = np.zeros(max_bins + 2, np.int64)
+        for width, number in ranges.items():
+            out[min(width, max_bins + 1)] += number
+        return out
+
+    @pytest.mark.parametrize(
+        ("ranges", "expected"),
+        [
+            ({1: 100}, 32),
+            ({60: 100}, 144),
+            ({60: 100, 200: 1}, 416),  # a hot pixel gets its window
+            ({60: 100, 290: 1}, 144),  # its need of 608 is above 4 * 144 and 512: wild
+            ({100: 100, 290: 1}, 608),
+            ({60: 100, 5000: 3}, 144),  # hopeless pixels do not decide
+            ({5000: 100, 60: 3}, 1024),
+            ({700: 100}, 1024),
+        ],
+    )
+    def test_cases(self, ranges, expected):
+        assert choose_bins(self.pixels(ranges), 1024) == expected
+
+    def test_never_above_the_limit(self):
+        assert choose_bins(self.pixels({300: 5}, 64), 64) == 64
+
+    def test_single_glitches_are_left_out_but_hot_pixels_are_not(self):
+        frames = pcd_like(7, (256, 4, 4))
+        plain = RangeAccumulator((4, 4), frames.dtype, 256)
+        plain.add(frames)
+        frames[3, 1, 1], frames[90, 1, 1], frames[100, 2, 2] = 4000, 0, 65535
+        glitched = RangeAccumulator((4, 4), frames.dtype, 256)
+        glitched.add(frames[:100])
+        glitched.add(frames[100:])
+        assert choose_bins(glitched.finish(1024), 1024) == choose_bins(plain.finish(1024), 1024)
+        frames[::20, 3, 3] += 60
+        hot = RangeAccumulator((4, 4), frames.dtype, 256)
+        hot.add(frames)
+        assert choose_bins(hot.finish(1024), 1024) > choose_bins(plain.finish(1024), 1024)
+
+    def test_trimmed_range_is_that_of_the_sorted_samples(self):
+        frames = pcd_like(8, (256, 3, 5))
+        ranges = RangeAccumulator((3, 5), frames.dtype, 256)
+        ranges.add(frames)
+        ordered = np.sort(frames.astype(int), axis=0)
+        expected = np.bincount((ordered[-4] - ordered[3] + 1).ravel(), minlength=1026)
+        np.testing.assert_array_equal(ranges.finish(1024), expected)
+
+    def test_one_frame(self):
+        ranges = RangeAccumulator((2, 2), np.dtype(np.uint16), 1)
+        ranges.add(np.full((1, 2, 2), 9, np.uint16))
+        assert choose_bins(ranges.finish(1024), 1024) == 32
+
+    def test_typical_window_leaves_room_for_a_hundred_times_more_frames(self):
+        frames = pcd_like(9, (25_600, 3, 3))
+        result = histogram_frames(frames)
+        assert not result.over.any()
+        assert not result.under.any()
+        assert result.counts.shape[2] <= 256
+
+
+def test_empty_block_changes_nothing():
+    frames = pcd_like(10, (40, 2, 2))
+    one = HistogramAccumulator((2, 2), 128, 40)
+    one.add(frames[:0])
+    one.add(frames)
+    np.testing.assert_array_equal(one.finish().counts, histogram_frames(frames, bins=128).counts)
+
+
+class TestCompiledEqualsPlain:
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+    def test_whole_pass(self, monkeypatch, dtype):
+        frames = pcd_like(11, (60, 2, 3), dtype)
+        frames[3, 1, 1], frames[44, 0, 0], frames[45, 0, 2] = 0, 255, 1
+        frames[30:, 1, 2] += 20
+        compiled = histogram_frames(frames, bins=64, window_frames=20)
+        for name in ("count_frames", "place_windows", "recentre", "update_extremes", "update_range"):
+            monkeypatch.setattr(histogram, name, getattr(histogram_numba, name).py_func)
+        for name in ("shift_counts", "densest_origin", "_centred"):
+            monkeypatch.setattr(histogram_numba, name, getattr(histogram_numba, name).py_func)
+        plain = histogram_frames(frames, bins=64, window_frames=20)
+        assert (compiled.over + compiled.under).any()
+        for name, expected in vars(compiled).items():
+            np.testing.assert_array_equal(getattr(plain, name), expected, err_msg=name)
+
+    def test_extremes(self, monkeypatch):
+        frames = pcd_like(12, (70, 2, 3))
+        results = []
+        for _ in range(2):
+            ranges = RangeAccumulator((2, 3), frames.dtype, 300)
+            ranges.add(frames)
+            results.append(ranges.finish(1024))
+            monkeypatch.setattr(histogram, "update_extremes", histogram_numba.update_extremes.py_func)
+        np.testing.assert_array_equal(*results)
+
+    @pytest.mark.parametrize("shift", [-40, -32, -5, 0, 1, 31, 32, 40])
+    def test_shift(self, shift):
+        counts = np.arange(1, 33, dtype=np.uint16)
+        expected = np.zeros(32, np.uint16)
+        for k in range(32):
+            if 0 <= k + shift < 32:
+                expected[k] = counts[k + shift]
+        for function in (histogram_numba.shift_counts, histogram_numba.shift_counts.py_func):
+            moved = counts.copy()
+            function(moved, shift)
+            np.testing.assert_array_equal(moved, expected)
