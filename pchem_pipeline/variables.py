@@ -212,8 +212,15 @@ _ALL: list[Variable] = [
     Variable(
         "electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"
     ),
-    *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e")],
-    Variable("truth/electron_number", ("frame", "y", "x"), "uint16", "e-", "true electron number", "K"),
+    *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e", "analog_read_noise_e")],
+    Variable(
+        "truth/defect",
+        _MAP,
+        "uint8",
+        "1",
+        "what is special about the pixel: 0 nothing, 1 hot, 2 dead, 3 stuck",
+    ),
+    Variable("truth/electron_number", ("frame", "y", "x"), "uint32", "e-", "true electron number", "K"),
 ]
 
 VARIABLES: dict[str, Variable] = {variable.path: variable for variable in _ALL}

@@ -1,0 +1,243 @@
+"""Stage ``simulate``: camera files of an imagined sensor, and its truth.
+
+The frames go into ``simulate.output`` in the format asked for, with ``truth.npz`` (the parameter maps and the
+names of the files) beside them; maps and the first true electron numbers go into the store.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import math
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.frames.writing import WRITERS, write_frames
+from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
+from pchem_pipeline.simulate.maps import draw_truth
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.store.files import storage_error, write_atomic
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "frames_tile", "run"]
+
+NAME = "simulate"
+VERSION = 1
+UPSTREAM: tuple[str, ...] = ()
+SETTINGS: tuple[str, ...] = ("simulate",)
+READS: tuple[str, ...] = ()
+WRITES: tuple[str, ...] = ("truth",)
+
+TRUTH_FILE = "truth.npz"
+# memory for the frames in the making, over all workers
+_BUDGET = 256 << 20
+# true electron numbers are stored in chunks of about this size
+_CHUNK = 16 << 20
+_MOST_UNITS = 256
+
+
+@dataclass(frozen=True)
+class SimulateUnit:
+    """Frames ``start .. stop - 1``, to be written to files, or whose electrons go into the store.
+
+    Attributes:
+        kind: what becomes of them.
+        start: first frame.
+        stop: frame after the last.
+        files: name, first frame and frame after the last of each file.
+    """
+
+    kind: Literal["frames", "electrons"]
+    start: int
+    stop: int
+    files: tuple[tuple[str, int, int], ...] = ()
+
+    @property
+    def key(self) -> str:
+        """What messages call it."""
+        return f"{self.kind}-{self.start}-{self.stop}"
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its only marker."""
+        return (self.key,)
+
+
+def run(context: StageContext) -> None:
+    """Simulate the frames and the truth; files that are there already stay.
+
+    Raises:
+        ConfigError: the output folder holds something else.
+        StoreError: the disk is too small or refuses.
+    """
+    settings = context.config.simulate
+    if settings is None:
+        raise ConfigError("the configuration has no section simulate; add one, or run: pchem ingest")
+    folder = context.base_dir / settings.output
+    truth = draw_truth(settings)
+    files = _files(settings)
+    if context.fresh:
+        _prepare(folder, settings)
+        for name, values in truth.arrays().items():
+            context.store.write_array(f"truth/{name}", values)
+    _write_truth(folder / TRUTH_FILE, truth, settings, [name for name, _, _ in files])
+    electron_units = _electron_units(settings)
+    if electron_units:
+        step = electron_units[0].stop
+        context.create(
+            "truth/electron_number",
+            (electron_units[-1].stop, *settings.shape),
+            chunks=(step, *settings.shape),
+        )
+    units = [*_frame_units(files), *electron_units]
+    task = functools.partial(
+        _do,
+        settings=settings,
+        folder=folder,
+        store=context.store.path,
+        workers=context.executor.workers,
+        alone=len(_frame_units(files)) == 1,
+    )
+    # tiles and regions mean the sensor that is read, not the one that is made: frames are made whole
+    whole = replace(context, options=replace(context.options, tiles=None, roi=None))
+    whole.run_units(units, task, unit_name="part")
+    context.n_keys = whole.n_keys
+
+
+def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int]) -> NDArray[Any]:
+    """Return frames ``frames[0] .. frames[1] - 1`` of the whole sensor (frame, y, x), DN."""
+    return simulate_block(truth, settings, frames, electron_frames=0)[0]
+
+
+def _do(
+    unit: SimulateUnit, *, settings: SimulateSettings, folder: Path, store: Path, workers: int, alone: bool
+) -> dict[str, Any]:
+    truth = _truth(settings.model_dump_json())
+    if unit.kind == "electrons":
+        _, electrons = simulate_block(truth, settings, (unit.start, unit.stop))
+        region = (slice(unit.start, unit.stop), slice(None), slice(None))
+        open_store(store).write("truth/electron_number", region, electrons)
+        return {}
+    step = frames_per_block(settings, settings.shape[0], _BUDGET // workers)
+    for name, start, stop in unit.files:
+        blocks = [(first, min(first + step, stop)) for first in range(start, stop, step)]
+        write_frames(
+            settings.format,
+            folder / name,
+            # several files are shared out among the workers; a single one has them all to itself
+            _in_order(functools.partial(frames_tile, truth, settings), blocks, workers if alone else 1),
+            (stop - start, *settings.shape),
+            dn_dtype(settings.bit_depth),
+            integration_time=settings.integration_time,
+            bit_depth=settings.bit_depth,
+        )
+    return {"files": len(unit.files)}
+
+
+@functools.lru_cache(maxsize=2)
+def _truth(settings: str) -> TruthMaps:
+    """Return the maps, drawn once per process; drawing is cheaper than sending them."""
+    return draw_truth(SimulateSettings.model_validate_json(settings))
+
+
+def _in_order(
+    function: Callable[[tuple[int, int]], NDArray[Any]], blocks: list[tuple[int, int]], threads: int
+) -> Iterator[NDArray[Any]]:
+    """Yield the blocks in order while the next ones are computed (the kernels release the GIL)."""
+    with ThreadPoolExecutor(threads) as pool:
+        ahead: deque[Future[NDArray[Any]]] = deque()
+        for block in blocks:
+            ahead.append(pool.submit(function, block))
+            if len(ahead) > threads:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+
+
+def _files(settings: SimulateSettings) -> list[tuple[str, int, int]]:
+    """Return name, first frame and frame after the last of every file."""
+    n, per_file = settings.n_frames, settings.frames_per_file or settings.n_frames
+    suffix = WRITERS[settings.format][1]
+    if per_file >= n:
+        return [(f"frames{suffix}", 0, n)]
+    width = max(5, len(str(math.ceil(n / per_file))))
+    return [
+        (f"frames_{i:0{width}d}{suffix}", start, min(start + per_file, n))
+        for i, start in enumerate(range(0, n, per_file), 1)
+    ]
+
+
+def _frame_units(files: list[tuple[str, int, int]]) -> list[SimulateUnit]:
+    """Share the files out: some hundred units at most, so that markers cost nothing."""
+    step = math.ceil(len(files) / _MOST_UNITS)
+    groups = [tuple(files[i : i + step]) for i in range(0, len(files), step)]
+    return [SimulateUnit("frames", group[0][1], group[-1][2], group) for group in groups]
+
+
+def _electron_units(settings: SimulateSettings) -> list[SimulateUnit]:
+    n = min(settings.truth_frames, settings.n_frames)
+    step = max(1, min(n, _CHUNK // (4 * math.prod(settings.shape))))
+    return [SimulateUnit("electrons", start, min(start + step, n)) for start in range(0, n, step)]
+
+
+def _prepare(folder: Path, settings: SimulateSettings) -> None:
+    """Remove the files of an earlier simulation, and nothing else.
+
+    Raises:
+        ConfigError: the folder holds files that no simulation made.
+        StoreError: the disk is too small or refuses.
+    """
+    needed = settings.n_frames * math.prod(settings.shape) * dn_dtype(settings.bit_depth).itemsize
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            _remove_simulated(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise storage_error(error, folder) from error
+    if needed > free:
+        raise StoreError(
+            f"{folder}: the frames need {needed / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; "
+            "free some space, or lower simulate.n_frames or simulate.shape"
+        )
+
+
+def _remove_simulated(folder: Path) -> None:
+    try:
+        with np.load(folder / TRUTH_FILE, allow_pickle=False) as truth:
+            names = [str(name) for name in truth["files"]]
+    except (FileNotFoundError, KeyError, ValueError):
+        raise ConfigError(
+            f"simulate.output: {folder} holds other files (no {TRUTH_FILE} of an earlier simulation); "
+            "choose another folder"
+        ) from None
+    for name in names:
+        for path in (folder / Path(name).name, folder / f"{Path(name).name}.json"):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    (folder / TRUTH_FILE).unlink()
+
+
+def _write_truth(path: Path, truth: TruthMaps, settings: SimulateSettings, files: list[str]) -> None:
+    facts: dict[str, Any] = {
+        "files": np.array(files),
+        "integration_time": settings.integration_time,
+        "seed": settings.seed,
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **truth.arrays(), **facts)
+    write_atomic(path, buffer.getvalue())
