@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS
+
 __all__ = ["MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
 
 FloatArray = NDArray[np.float64]
@@ -33,8 +35,8 @@ class PixelFit:
         y, x: position on the sensor; for ready-made histograms ``y = 0`` and ``x`` is the channel.
         origin: DN of ``counts[0]``.
         counts: number of frames at each DN, shape (n_bins,).
-        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN), ``read_noise_dn`` (DN)
-            and ``read_noise_e`` (e-); NaN where the fit failed.
+        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN),
+            ``read_noise_dn`` (DN) and ``read_noise_e`` (e-); NaN where the fit failed.
         stderr: standard errors under the same names; may lack some.
         status: words of ``fit_status``; empty if all is well.
         goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
@@ -68,12 +70,17 @@ class ReportData:
         ensemble: arrays of group ``ensemble``.
         ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
         component_cases: name of each row of ``ensemble["component_variance"]``: the parameters held constant.
-        moments: rows ``{quantity, unit, predicted, observed, stderr}`` of Appendix A.
+        moments: rows ``{name, quantity, unit, predicted, observed, stderr}`` of Appendix A; the last two are
+            None for terms that data do not show.
         truth: true maps of simulated data.
+        percentiles: percentiles of the summaries, %.
+        outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
+        allowed_failed: fraction of pixels without a value that is accepted.
         config_yaml: the resolved configuration.
         run: identity of the run: name, started, host, versions, seed, ...
         inputs: one mapping per input file: name, size, hash, ...
-        stages: one mapping per stage: stage, state, seconds, peak_memory, ...
+        stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
+            ``peak_memory_bytes``, ``units``, ``notes``.
         missing: part (see ``PARTS``) to the reason why it is absent.
     """
 
@@ -83,14 +90,17 @@ class ReportData:
     integration_time: float | None = None
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
     fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    status_words: Mapping[int, str] = field(default_factory=dict)
-    failed_mask: int = 0
+    status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})
+    failed_mask: int = int(FAILED)
     pixels: Sequence[PixelFit] = ()
     ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     ensemble_facts: Mapping[str, Any] = field(default_factory=dict)
     component_cases: Sequence[str] = ()
     moments: Sequence[Mapping[str, Any]] = ()
     truth: Mapping[str, FloatArray] = field(default_factory=dict)
+    percentiles: tuple[float, ...] = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
+    outlier_sigmas: float = 6.0
+    allowed_failed: float = 0.1
     config_yaml: str = ""
     run: Mapping[str, Any] = field(default_factory=dict)
     inputs: Sequence[Mapping[str, Any]] = ()

@@ -16,16 +16,11 @@ PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 class ReportSettings(Section):
     """Settings of the stage ``report``."""
 
-    title: str = Field(
-        default="",
-        max_length=200,
-        description="title of the report; empty: the name of the run",
-    )
     pixels: tuple[PixelPosition, ...] = Field(
         default=(),
         max_length=16,
-        description="pixels whose fits are drawn, [[y, x], ...]; empty: four pixels at low and high read noise "
-        "and low and high quanta exposure",
+        description="pixels whose fits are drawn, [[y, x], ...]; empty: four pixels at low and high "
+        "read noise and low and high quanta exposure",
     )
     figure_formats: tuple[Literal["svg", "png", "pdf"], ...] = Field(
         default=("svg", "png"),
@@ -36,8 +31,8 @@ class ReportSettings(Section):
     )
     map_stretch: Literal["beta", "linear"] = Field(
         default="beta",
-        description="colours of the maps: 'beta' follows the rank of a pixel (Beta(2,2) transform), 'linear' its value "
-        "between the 1st and the 99th percentile",
+        description="colours of the maps: 'beta' follows the rank of a pixel (Beta(2,2) transform), "
+        "'linear' its value between the 1st and the 99th percentile",
     )
     histogram_bins: int = Field(
         default=128, ge=8, le=1024, description="largest number of bins in histograms of maps"

@@ -1,0 +1,270 @@
+"""The figures of a report with their titles, captions and alternative texts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pchem_pipeline.model.maps import summarise
+from pchem_pipeline.render import ensemble_figures, map_figures, pixel_figures
+from pchem_pipeline.render.captions import CAPTIONS, highlighted_cases
+from pchem_pipeline.render.data import MAP_NAMES, PixelFit, ReportData
+from pchem_pipeline.render.ranges import finite
+from pchem_pipeline.render.settings import ReportSettings
+from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM
+from pchem_pipeline.render.wording import count, measured, percent, short, symbol
+
+__all__ = ["Exhibit", "exhibits"]
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """One figure of the report.
+
+    Attributes:
+        name: name of its files.
+        section: id of the section that shows it.
+        title: heading in the report.
+        caption: what is drawn and how to read it.
+        alt: what a reader who does not see it should know, with the numbers.
+        draw: makes the figure at a width in mm.
+        width_mm: width at which it is saved.
+        raster: embed it as PNG (images of many pixels) instead of SVG.
+    """
+
+    name: str
+    section: str
+    title: str
+    caption: str
+    alt: str
+    draw: Callable[[float], Figure]
+    width_mm: float = COLUMN_MM
+    raster: bool = False
+
+
+def exhibits(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
+    """Return the figures that the data allow, in the order of the report."""
+    makers = (_cells, _pixels, _read_noise, _maps, _ensemble, _electrons, _components, _status)
+    return [exhibit for make in makers for exhibit in make(data, settings)]
+
+
+def _at(draw: Callable[..., Figure], *args: object, **kwargs: object) -> Callable[[float], Figure]:
+    """Return a drawing that waits only for its width."""
+    bound = partial(draw, *args, **kwargs)
+    return lambda width_mm: bound(width_mm=width_mm)
+
+
+def _edges_text(parameters: dict[str, float] | PixelFit) -> str:
+    values = parameters.parameters if isinstance(parameters, PixelFit) else parameters
+    exposure, gain, bias, sigma = (values[name] for name in pixel_figures.PAPER_EXAMPLE)
+    edges = pixel_figures.thresholds(exposure, gain, bias, sigma, 4)
+    return ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
+
+
+def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    example = dict(pixel_figures.PAPER_EXAMPLE)
+    found = [
+        Exhibit(
+            "cluster_edges_example",
+            "cells",
+            "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
+            CAPTIONS["cluster_edges_example"],
+            f"Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at {_edges_text(example)} e⁻.",
+            _at(pixel_figures.cluster_edges, example),
+        )
+    ]
+    fitted = [pixel for pixel in data.pixels if pixel_figures.has_fit(pixel.parameters)]
+    if fitted:
+        pixel = fitted[0]
+        found.append(
+            Exhibit(
+                "cluster_edges_pixel",
+                "cells",
+                f"Pixel y = {pixel.y}, x = {pixel.x} of this run",
+                CAPTIONS["cluster_edges_pixel"],
+                f"Histogram and density of pixel ({pixel.y}, {pixel.x}); first cell edges at {_edges_text(pixel)} DN.",
+                _at(
+                    pixel_figures.cluster_edges,
+                    dict(pixel.parameters),
+                    counts=pixel.counts,
+                    origin=pixel.origin,
+                ),
+            )
+        )
+    return found
+
+
+def _pixels(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    if not data.pixels:
+        return []
+    words = []
+    for pixel in data.pixels:
+        numbers = ", ".join(
+            f"{symbol(name)[1]} {measured(pixel.parameters.get(name, float('nan')), pixel.stderr.get(name, float('nan')), symbol(name)[2])}"
+            for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+        )
+        state = f" ({pixel.status})" if pixel.status else ""
+        words.append(f"{pixel.label or 'pixel'} at ({pixel.y}, {pixel.x}): {numbers}{state}")
+    return [
+        Exhibit(
+            "pixel_fits",
+            "pixels",
+            "Histograms of single pixels with their fits",
+            CAPTIONS["pixel_fits"],
+            "Histograms with fitted densities. " + "; ".join(words) + ".",
+            _at(pixel_figures.pixel_fits, data.pixels),
+            PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
+        )
+    ]
+
+
+def _map_alt(data: ReportData, name: str, what: str) -> str:
+    _, words, unit = symbol(name)
+    summary = summarise(data.maps[name], percentiles=(5.0, 95.0), outlier_sigmas=data.outlier_sigmas)
+    if summary.n_valid == 0:
+        return f"{what} of the {words}: no pixel has a value."
+    low, high = summary.percentiles[5.0], summary.percentiles[95.0]
+    return (
+        f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
+        f"5 to 95 % of the pixels from {short(low)} to {short(high)} {unit}, extremes {short(summary.minimum)} and "
+        f"{short(summary.maximum)} {unit}; {count(summary.n_missing, 'pixel')} without a value."
+    )
+
+
+def _read_noise(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
+    if "read_noise_e" not in data.maps:
+        return []
+    known = finite(data.maps["read_noise_e"])
+    below = percent(float((known < 0.4).sum()), known.size)
+    return [
+        Exhibit(
+            "read_noise_histogram",
+            "read-noise",
+            "Read noise of the pixels",
+            CAPTIONS["read_noise_histogram"].format(below=below),
+            _map_alt(data, "read_noise_e", "Histogram")
+            + f" {below} of the pixels with a value lie below 0.4 e⁻.",
+            _at(map_figures.read_noise_histogram, data.maps["read_noise_e"], bins=settings.histogram_bins),
+        )
+    ]
+
+
+def _maps(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
+    found = []
+    for name in MAP_NAMES:
+        if name not in data.maps:
+            continue
+        strip = map_figures.is_strip(data.maps[name].shape)
+        found.append(
+            Exhibit(
+                f"map_{name}",
+                "maps",
+                symbol(name)[1].capitalize(),
+                CAPTIONS["channels" if strip else f"map_{settings.map_stretch}"],
+                _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
+                _at(
+                    map_figures.map_and_histogram,
+                    data.maps[name],
+                    name,
+                    stderr=data.maps.get(f"{name}_stderr"),
+                    stretch=settings.map_stretch,
+                    bins=settings.histogram_bins,
+                ),
+                raster=not strip,
+            )
+        )
+    return found
+
+
+def _ensemble(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    if "density" not in data.ensemble and "nuced_density" not in data.ensemble:
+        return []
+    rmse = dict(data.ensemble_facts.get("rmse", {}))
+    numbers = ", ".join(f"{name.replace('_', ' ')} {short(value, 2)}" for name, value in rmse.items())
+    return [
+        Exhibit(
+            "ensemble",
+            "ensemble",
+            "Ensemble histogram and its prediction",
+            CAPTIONS["ensemble"],
+            f"Ensemble histogram before and after non-uniformity correction with predictions. RMSE: {numbers}.",
+            _at(ensemble_figures.ensemble, data.ensemble, rmse, n_frames=data.ensemble_facts.get("n_frames")),
+            PAGE_MM,
+        )
+    ]
+
+
+def _electrons(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    arrays = data.ensemble
+    if "electron_mass" not in arrays:
+        return []
+    mass, pmf = arrays["electron_mass"], arrays["electron_pmf"]
+    first = ", ".join(f"k = {k}: {mass[k]:.4f} against {pmf[k]:.4f}" for k in range(min(5, mass.size)))
+    return [
+        Exhibit(
+            "electron_numbers",
+            "electrons",
+            "Estimated electron numbers",
+            CAPTIONS["electron_numbers"],
+            f"Share of each electron number among the estimates against the prediction; {first}.",
+            _at(
+                ensemble_figures.electron_numbers,
+                arrays["k"],
+                mass,
+                pmf,
+                pmf_map=arrays.get("electron_pmf_map"),
+                counts=arrays.get("electron_counts"),
+            ),
+        )
+    ]
+
+
+def _components(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    variance = data.ensemble.get("component_variance")
+    if variance is None or variance.size == 0:
+        return []
+    cases: Sequence[str] = data.component_cases or [f"case {i}" for i in range(variance.shape[0])]
+    width = np.sqrt(np.maximum(variance[0], 0.0))
+    return [
+        Exhibit(
+            "component_widths",
+            "components",
+            "Width of the components of the ensemble",
+            CAPTIONS["component_widths"],
+            f"Standard deviation of the ensemble's component k, nothing held constant: {short(float(width[0]))} DN at k = 0, "
+            f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
+            _at(
+                ensemble_figures.component_widths,
+                np.arange(variance.shape[1]),
+                variance,
+                cases,
+                nuced_variance=data.ensemble.get("nuced_component_variance"),
+                highlight=highlighted_cases(cases),
+            ),
+            PAGE_MM,
+        )
+    ]
+
+
+def _status(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    status = data.fit.get("fit_status")
+    if status is None:
+        return []
+    rows = map_figures.status_counts(status, data.status_words)
+    parts = [f"{count(int((status == 0).sum()), 'pixel')} with a good fit"]
+    parts += [f"{count(n, 'pixel')}: {text}" for _, text, n in rows]
+    return [
+        Exhibit(
+            "fit_status",
+            "status",
+            "Fit status of the pixels",
+            CAPTIONS["fit_status"],
+            "Map of the fit status. " + "; ".join(parts) + ".",
+            _at(map_figures.fit_status_map, status, data.status_words),
+            raster=not map_figures.is_strip(status.shape),
+        )
+    ]

@@ -1,0 +1,235 @@
+"""Figures of single pixels: the cells of the electron number, and histograms with their fits."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.electrons import thresholds
+from pchem_pipeline.model.pcd import pcd
+from pchem_pipeline.render.data import PixelFit
+from pchem_pipeline.render.style import (
+    BLACK,
+    BLUE,
+    COLUMN_MM,
+    GRAY,
+    PAGE_MM,
+    VERMILION,
+    new_figure,
+    note,
+    styled,
+)
+from pchem_pipeline.render.wording import measured, symbol
+
+__all__ = ["PAPER_EXAMPLE", "cluster_edges", "has_fit", "pixel_fits", "shown_bins"]
+
+FloatArray = NDArray[np.float64]
+
+#: The example of the paper, PCD(1.8, 1, 0, 0.33^2), in units of e- (fig:optimal_quantization).
+PAPER_EXAMPLE: Mapping[str, float] = {
+    "quanta_exposure": 1.8,
+    "conversion_gain": 1.0,
+    "bias": 0.0,
+    "read_noise_dn": 0.33,
+}
+
+_LETTERS = "abcdefghijklmnop"
+_TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+
+
+def has_fit(parameters: Mapping[str, float]) -> bool:
+    """Tell whether the four parameters of the PCD are all known and describe a density."""
+    values = [parameters.get(name, float("nan")) for name in PAPER_EXAMPLE]
+    return bool(np.all(np.isfinite(values))) and values[1] > 0 and values[3] > 0 and values[0] >= 0
+
+
+def _theta(parameters: Mapping[str, float]) -> tuple[float, float, float, float]:
+    return (
+        parameters["quanta_exposure"],
+        parameters["conversion_gain"],
+        parameters["bias"],
+        parameters["read_noise_dn"],
+    )
+
+
+@styled
+def cluster_edges(
+    parameters: Mapping[str, float],
+    *,
+    counts: NDArray[Any] | None = None,
+    origin: int = 0,
+    width_mm: float = COLUMN_MM,
+) -> Figure:
+    """Draw a PCD with the optimal edges between electron numbers (Hendrickson et al. 2023, eq. demarg_K_eqn).
+
+    Args:
+        parameters: the four parameters of the PCD, e.g. ``PAPER_EXAMPLE``.
+        counts: histogram of the pixel drawn behind, shape (n_bins,); None for an example without data.
+        origin: DN of ``counts[0]``.
+        width_mm: width of the figure.
+    """
+    figure = new_figure(width_mm, 0.62 * min(width_mm, 1.3 * COLUMN_MM))
+    axes = figure.add_subplot()
+    if not has_fit(parameters):
+        return _empty(figure, axes, "no fitted pixel to show")
+    exposure, gain, bias, sigma = _theta(parameters)
+    in_electrons = gain == 1.0 and bias == 0.0
+    unit = "e⁻" if in_electrons else "DN"
+    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
+    low, high = bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma
+    if counts is not None and counts.sum() > 0:
+        _bars(axes, counts, origin)
+    x = np.linspace(low, high, 1200)
+    axes.plot(
+        x,
+        pcd(x, exposure, gain, bias, sigma),
+        color=BLACK,
+        label="fitted density" if counts is not None else "PCD",
+    )
+    top = 1.22 * axes.get_ylim()[1]
+    edges = thresholds(exposure, gain, bias, sigma, last + 1)
+    edges = edges[edges < high]
+    axes.vlines(edges, 0.0, 0.86 * top, color=BLUE, linestyle="--", linewidth=0.9, label="edge of a cell")
+    cells = np.concatenate([[low], edges, [high]])
+    every = max(1, int(np.ceil(len(cells) / (18 if width_mm <= COLUMN_MM else 30))))
+    for k in range(0, len(cells) - 1, every):
+        axes.text(
+            (cells[k] + cells[k + 1]) / 2,
+            0.87 * top,
+            str(k),
+            ha="center",
+            va="bottom",
+            color=BLUE,
+            fontsize=7,
+        )
+    axes.set(xlim=(low, high), ylim=(0.0, top), xlabel=f"signal ({unit})", ylabel=f"density (1/{unit})")
+    figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def _bars(axes: Axes, counts: NDArray[Any], origin: int, label: str = "frames") -> None:
+    """Draw a normalised histogram of DN as gray bars of 1 DN."""
+    edges = origin + np.arange(counts.size + 1) - 0.5
+    axes.stairs(counts / counts.sum(), edges, fill=True, color=GRAY, label=label)
+
+
+def _empty(figure: Figure, axes: Axes, text: str) -> Figure:
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, wrap=True)
+    axes.set_axis_off()
+    return figure
+
+
+def shown_bins(counts: NDArray[Any], *, tail: float = 2e-4) -> slice:
+    """Return the bins to draw: all between the quantiles ``tail`` and ``1 - tail``, and a margin of a tenth.
+
+    Raises:
+        ValueError: if there is no count at all.
+    """
+    total = int(counts.sum())
+    if total == 0:
+        raise ValueError("the histogram is empty; there is nothing to show")
+    cumulative = np.cumsum(counts) / total
+    first = int(np.searchsorted(cumulative, tail))
+    last = int(np.searchsorted(cumulative, 1.0 - tail))
+    margin = max(2, (last - first) // 10)
+    occupied = np.flatnonzero(counts)
+    return slice(
+        max(first - margin, int(occupied[0]) - 2, 0),
+        min(last + margin, int(occupied[-1]) + 2, counts.size) + 1,
+    )
+
+
+@styled
+def pixel_fits(pixels: Sequence[PixelFit], *, width_mm: float = PAGE_MM) -> Figure:
+    """Draw histograms of pixels with the fitted density and the residuals (fig:plot_per_pixel_fits).
+
+    Gray bars are the share of frames at each DN, the black line is the fitted density. The strip below
+    shows ``(count - expected) / sqrt(expected)`` where at least one frame is expected.
+
+    Args:
+        pixels: any number; two in a row on a page, one in a row on a column.
+        width_mm: width of the figure.
+    """
+    columns = 2 if width_mm > 1.5 * COLUMN_MM and len(pixels) > 1 else 1
+    rows = max(1, -(-len(pixels) // columns))
+    figure = new_figure(width_mm, 72.0 * rows)
+    if not pixels:
+        return _empty(figure, figure.add_subplot(), "no pixel to show")
+    parts = figure.subfigures(rows, columns, squeeze=False)
+    for i, pixel in enumerate(pixels):
+        _one_pixel(parts[i // columns, i % columns], pixel, _LETTERS[i % len(_LETTERS)], width_mm / columns)
+    return figure
+
+
+def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -> None:
+    top, strip = part.subplots(2, 1, sharex=True, height_ratios=(3.4, 1.0))
+    top.set_title(_title(pixel, letter, width_mm), fontsize=7.0, linespacing=1.35)
+    strip.set(xlabel="signal (DN)", ylabel="residual (σ)")
+    top.set_ylabel("share of frames (1/DN)")
+    total = int(pixel.counts.sum())
+    if total == 0:
+        note(top, "no frames")
+        return
+    where = shown_bins(pixel.counts)
+    _bars(top, pixel.counts, pixel.origin)
+    dn = pixel.origin + np.arange(pixel.counts.size)
+    low, high = dn[where][0] - 0.5, dn[where][-1] + 0.5
+    top.set_xlim(low, high)
+    remarks = [f"{total:,} frames"]
+    outside = total - int(pixel.counts[where].sum())
+    if outside:
+        remarks.append(f"{outside:,} outside the axis")
+    if has_fit(pixel.parameters):
+        x = np.linspace(low, high, int(np.clip(8 * (high - low), 400, 3000)))
+        top.plot(x, pcd(x, *_theta(pixel.parameters)), color=BLACK)
+        if np.isfinite(pixel.goodness_p):
+            remarks.append(f"goodness of fit p = {pixel.goodness_p:.2g}")
+        _residual_strip(strip, pixel, dn.astype(np.float64), where)
+    else:
+        remarks.append("no fit")
+    top.set_ylim(0.0, 1.25 * max(top.get_ylim()[1], 1e-12))
+    note(top, "\n".join(remarks))
+
+
+def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) -> None:
+    expected = pixel.counts.sum() * pcd(dn[where], *_theta(pixel.parameters))
+    enough = expected >= 1.0
+    residual = (pixel.counts[where] - expected)[enough] / np.sqrt(expected[enough])
+    limit = float(np.clip(1.15 * np.max(np.abs(residual), initial=0.0), 3.5, 12.0))
+    strip.axhspan(-2.0, 2.0, color="#EDEDED", linewidth=0)
+    strip.axhline(0.0, color=BLACK, linewidth=0.6)
+    strip.vlines(dn[where][enough], 0.0, np.clip(residual, -limit, limit), color=BLUE, linewidth=0.7)
+    beyond = np.abs(residual) > limit
+    if beyond.any():
+        strip.plot(
+            dn[where][enough][beyond],
+            np.sign(residual[beyond]) * 0.93 * limit,
+            "x",
+            color=VERMILION,
+            markersize=3,
+        )
+        note(strip, f"× {int(beyond.sum())} beyond {limit:.0f} σ")
+    strip.set_ylim(-limit, limit)
+
+
+def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
+    head = f"({letter}) {pixel.label}" if pixel.label else f"({letter})"
+    lines = [f"{head}: pixel y = {pixel.y}, x = {pixel.x}"]
+    if has_fit(pixel.parameters):
+        words = []
+        for name in _TITLE_NAMES:
+            sign, _, unit = symbol(name)
+            if name in pixel.parameters:
+                words.append(
+                    f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
+                )
+        lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
+    if pixel.status:
+        lines += textwrap.wrap(f"status: {pixel.status}", max(20, int(width_mm * 0.72)))[:2]
+    return "\n".join(lines)

@@ -1,0 +1,116 @@
+"""Ranges, bins and scales of axes that a handful of odd pixels cannot wreck."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["DisplayRange", "finite", "histogram_edges", "robust_range"]
+
+FloatArray = NDArray[np.float64]
+
+#: A positive range that spans more than this factor is drawn on a logarithmic axis.
+_DECADES = 30.0
+
+
+@dataclass(frozen=True)
+class DisplayRange:
+    """What part of the values is drawn, and how.
+
+    Attributes:
+        low, high: ends of the axis.
+        n_below, n_above: finite values beyond the ends.
+        n_missing: values that are NaN or infinite.
+        logarithmic: whether the drawn part spans decades.
+    """
+
+    low: float
+    high: float
+    n_below: int
+    n_above: int
+    n_missing: int
+    logarithmic: bool
+
+    @property
+    def n_outside(self) -> int:
+        """Number of finite values that are not drawn."""
+        return self.n_below + self.n_above
+
+    def words(self) -> str:
+        """Return a note on what is not drawn, e.g. ``3 pixels outside the axis; 5 without a value``."""
+        parts = []
+        if self.n_outside:
+            noun = "pixel" if self.n_outside == 1 else "pixels"
+            parts.append(f"{self.n_outside:,} {noun} outside the axis")
+        if self.n_missing:
+            parts.append(f"{self.n_missing:,} without a value")
+        return "; ".join(parts)
+
+
+def finite(values: NDArray[Any]) -> FloatArray:
+    """Return the finite values as a flat float64 array."""
+    flat = np.asarray(values, dtype=np.float64).ravel()
+    return flat[np.isfinite(flat)]
+
+
+def robust_range(values: NDArray[Any], *, tail: float = 0.005, allow_log: bool = True) -> DisplayRange:
+    """Choose the range of an axis from the bulk of the values.
+
+    The range between the quantiles ``tail`` and ``1 - tail``, widened by a quarter on each side (on a
+    logarithmic axis by a quarter of its decades), and cut to the values that occur. Where that leaves out
+    only a thin margin, all values are drawn.
+
+    Args:
+        values: any shape; NaN and infinities are counted, not drawn.
+        tail: quantile at which each tail begins.
+        allow_log: whether a logarithmic axis may be chosen.
+    """
+    known = finite(values)
+    n_missing = int(np.size(values) - known.size)
+    if known.size == 0:
+        return DisplayRange(0.0, 1.0, 0, 0, n_missing, False)
+    smallest, largest = float(known.min()), float(known.max())
+    bulk_low, bulk_high = (float(q) for q in np.quantile(known, [tail, 1.0 - tail]))
+    logarithmic = allow_log and bulk_low > 0 and bulk_high / bulk_low > _DECADES
+    if logarithmic:
+        low, high = np.exp(_widened(np.log(bulk_low), np.log(bulk_high)))
+        smallest = max(smallest, float(np.finfo(np.float64).tiny))
+    else:
+        low, high = _widened(bulk_low, bulk_high)
+    low, high = max(float(low), smallest), min(float(high), largest)
+    if not high > low:
+        pad = max(abs(low) * 0.05, 1e-9)
+        low, high = low - pad, high + pad
+    return DisplayRange(
+        low, high, int((known < low).sum()), int((known > high).sum()), n_missing, bool(logarithmic)
+    )
+
+
+def _widened(low: float, high: float) -> tuple[float, float]:
+    margin = 0.25 * (high - low)
+    return low - margin, high + margin
+
+
+def histogram_edges(values: NDArray[Any], shown: DisplayRange, *, most: int = 128) -> FloatArray:
+    """Return 6 to ``most`` bins over the drawn range, by the rule of Freedman and Diaconis.
+
+    Args:
+        values: any shape.
+        shown: range from :func:`robust_range`.
+        most: largest number of bins.
+    """
+    known = finite(values)
+    known = known[(known >= shown.low) & (known <= shown.high)]
+    low, high = shown.low, shown.high
+    if shown.logarithmic:
+        known, low, high = np.log(known), float(np.log(low)), float(np.log(high))
+    bins = 6
+    if known.size > 1:
+        q25, q75 = np.quantile(known, [0.25, 0.75])
+        width = 2.0 * float(q75 - q25) / known.size ** (1.0 / 3.0)
+        bins = int(np.clip(np.ceil((high - low) / width), 6, most)) if width > 0 else 6
+    edges = np.linspace(low, high, bins + 1)
+    return np.exp(edges) if shown.logarithmic else edges

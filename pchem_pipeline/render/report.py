@@ -1,0 +1,149 @@
+"""The report: one HTML file without network access, ``report.json`` and the files of the figures."""
+
+from __future__ import annotations
+
+import base64
+import importlib.resources
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import jinja2
+
+from pchem_pipeline.render.captions import SECTIONS
+from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.exhibits import Exhibit, exhibits
+from pchem_pipeline.render.report_json import report_json
+from pchem_pipeline.render.settings import ReportSettings
+from pchem_pipeline.render.style import COLUMN_MM, figure_bytes
+from pchem_pipeline.render.tables import Table, provenance_tables, result_tables
+from pchem_pipeline.render.verdict import flags, key_numbers, sentence
+
+__all__ = ["RenderedReport", "render_report"]
+
+#: SVG files beyond this size are embedded as PNG.
+_LARGEST_SVG = 300_000
+
+_FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
+_FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
+
+#: Where each table of results is shown: the id of a section with figures, or ``tables``.
+_TABLE_PLACE = {
+    "rmse": "ensemble",
+    "moments": "ensemble",
+    "electron-table": "electrons",
+    "failures": "status",
+}
+
+
+@dataclass(frozen=True)
+class RenderedReport:
+    """The files of a report.
+
+    Attributes:
+        html: the page.
+        json: the numbers.
+        figures: file name to content, for the folder ``figures``.
+    """
+
+    html: str
+    json: str
+    figures: dict[str, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A figure as the page shows it; ``narrow`` is the drawing for small screens."""
+
+    exhibit: Exhibit
+    source: str
+    narrow: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class _Section:
+    id: str
+    title: str
+    intro: str
+    missing: tuple[str, ...]
+    pictures: list[_Picture]
+    tables: list[Table]
+
+
+def render_report(data: ReportData, settings: ReportSettings | None = None) -> RenderedReport:
+    """Draw everything and return the files of the report; nothing is written.
+
+    Args:
+        data: what the run found.
+        settings: section ``report``; None for the defaults.
+    """
+    settings = settings or ReportSettings()
+    figures: dict[str, bytes] = {}
+    pictures = [_picture(exhibit, settings, figures) for exhibit in exhibits(data, settings)]
+    tables = result_tables(data)
+    page = _template().render(
+        title=data.title,
+        data=data,
+        sentence=sentence(data),
+        numbers=key_numbers(data),
+        flags=flags(data),
+        flag_words=_FLAG_WORDS,
+        flag_signs=_FLAG_SIGNS,
+        sections=_sections(data, pictures, tables),
+        tables=[table for table in tables if table.id not in _TABLE_PLACE],
+        provenance=provenance_tables(data),
+    )
+    return RenderedReport(page, report_json(data), figures)
+
+
+def _template() -> jinja2.Template:
+    folder = importlib.resources.files("pchem_pipeline.render") / "templates"
+    text = (folder / "report.html.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(text)
+
+
+def _picture(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> _Picture:
+    """Draw a figure, add its files, and return it as data URLs."""
+    figure = exhibit.draw(exhibit.width_mm)
+    for kind in settings.figure_formats:
+        figures[f"{exhibit.name}.{kind}"] = figure_bytes(figure, kind, dpi=settings.dpi, title=exhibit.title)
+    have = {kind: figures.get(f"{exhibit.name}.{kind}") for kind in ("svg", "png")}
+    if exhibit.raster:
+        source = _data_url(have["png"] or figure_bytes(figure, "png", dpi=settings.dpi), "png")
+    else:
+        source = _line_drawing(
+            have["svg"] or figure_bytes(figure, "svg"), lambda: figure_bytes(figure, "png", dpi=200)
+        )
+    narrow = ""
+    if exhibit.width_mm > COLUMN_MM:
+        small = exhibit.draw(COLUMN_MM)
+        narrow = _line_drawing(figure_bytes(small, "svg"), lambda: figure_bytes(small, "png", dpi=250))
+    width, height = figure.get_size_inches() * 96.0
+    return _Picture(exhibit, source, narrow, round(width), round(height))
+
+
+def _line_drawing(svg: bytes, png: Callable[[], bytes]) -> str:
+    return _data_url(svg, "svg") if len(svg) <= _LARGEST_SVG else _data_url(png(), "png")
+
+
+def _data_url(content: bytes, kind: str) -> str:
+    media = "image/svg+xml" if kind == "svg" else "image/png"
+    return f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _sections(data: ReportData, pictures: Iterable[_Picture], tables: Iterable[Table]) -> list[_Section]:
+    """Put figures and tables into their sections; one without any says why."""
+    pictures, tables = list(pictures), list(tables)
+    found = []
+    for id_, title, intro, parts in SECTIONS:
+        shown = [picture for picture in pictures if picture.exhibit.section == id_]
+        rows = [table for table in tables if _TABLE_PLACE.get(table.id) == id_]
+        why = [data.missing[part] for part in parts if part in data.missing]
+        if not shown and not rows and not why:
+            why = ["This run has no data for it."]
+        found.append(_Section(id_, title, intro, tuple(why), shown, rows))
+    return found

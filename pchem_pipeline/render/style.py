@@ -1,0 +1,154 @@
+"""One look for all figures: print sizes, colours safe for the colour-blind, files that repeat to the byte.
+
+Figures are made with matplotlib's objects alone (no ``pyplot``), so that drawing leaves no state behind.
+Colours of lines are those of Okabe and Ito (2008); maps use ``viridis``, whose lightness rises evenly.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Callable
+from typing import Any, ParamSpec
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+__all__ = [
+    "BLACK",
+    "BLUE",
+    "COLUMN_MM",
+    "GRAY",
+    "GREEN",
+    "MAP_COLOURS",
+    "NO_VALUE",
+    "ORANGE",
+    "PAGE_MM",
+    "PALETTE",
+    "PURPLE",
+    "SKY",
+    "VERMILION",
+    "figure_bytes",
+    "inches",
+    "new_figure",
+    "note",
+    "styled",
+]
+
+#: Widths of one column and of a page of a journal, mm.
+COLUMN_MM = 88.0
+PAGE_MM = 180.0
+
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+YELLOW = "#F0E442"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
+GRAY = "#B8B8B8"
+#: Colour of pixels without a value in maps: outside the range of ``MAP_COLOURS`` in hue and saturation.
+NO_VALUE = "#D9D9D9"
+PALETTE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW, BLACK)
+MAP_COLOURS = "viridis"
+
+_STYLE: dict[str, Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#333333",
+    "axes.grid": False,
+    "axes.labelsize": 8.0,
+    "axes.linewidth": 0.6,
+    "axes.prop_cycle": mpl.cycler(color=PALETTE),
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 8.0,
+    "figure.constrained_layout.h_pad": 0.03,
+    "figure.constrained_layout.w_pad": 0.03,
+    "figure.facecolor": "white",
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "image.cmap": MAP_COLOURS,
+    "legend.fontsize": 7.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "lines.linewidth": 1.1,
+    "mathtext.fontset": "dejavusans",
+    "patch.linewidth": 0.5,
+    "pdf.fonttype": 42,
+    "savefig.facecolor": "white",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "pchem",
+    "xtick.labelsize": 7.0,
+    "xtick.major.width": 0.6,
+    "ytick.labelsize": 7.0,
+    "ytick.major.width": 0.6,
+}
+
+_METADATA: dict[str, dict[str, Any]] = {
+    "svg": {"Date": None, "Creator": "pchem-pipeline"},
+    "png": {"Software": "pchem-pipeline"},
+    "pdf": {"CreationDate": None, "ModDate": None, "Creator": "pchem-pipeline", "Producer": None},
+}
+
+P = ParamSpec("P")
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Decorate a drawing function: it draws in the style of this package, whatever the user's settings."""
+
+    @functools.wraps(draw)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with mpl.rc_context():
+            mpl.rcdefaults()
+            mpl.rcParams.update(_STYLE)
+            return draw(*args, **kwargs)
+
+    return wrapper
+
+
+def inches(millimetres: float) -> float:
+    """Return a length in inches."""
+    return millimetres / 25.4
+
+
+def new_figure(width_mm: float, height_mm: float) -> Figure:
+    """Return an empty figure of that size with a canvas of its own."""
+    figure = Figure(figsize=(inches(width_mm), inches(height_mm)), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def note(axes: Axes, text: str, *, where: str = "upper right") -> None:
+    """Write a small note into a corner of the axes."""
+    vertical, horizontal = where.split()
+    axes.text(
+        0.985 if horizontal == "right" else 0.015,
+        0.975 if vertical == "upper" else 0.03,
+        text,
+        transform=axes.transAxes,
+        ha="right" if horizontal == "right" else "left",
+        va="top" if vertical == "upper" else "bottom",
+        fontsize=6.5,
+        color="#444444",
+        bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
+    )
+
+
+def figure_bytes(figure: Figure, kind: str, *, dpi: int = 300, title: str = "") -> bytes:
+    """Return a figure as a file of kind ``svg``, ``png`` or ``pdf``; the same figure gives the same bytes.
+
+    Fonts are embedded: as outlines in SVG, as TrueType in PDF.
+    """
+    metadata = dict(_METADATA[kind])
+    if title:
+        metadata["Title"] = title
+    buffer = io.BytesIO()
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata)
+    return buffer.getvalue()

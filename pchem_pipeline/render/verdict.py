@@ -1,0 +1,240 @@
+"""The first screen of a report: one sentence, the key numbers, and what to be careful about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pchem_pipeline.model.maps import MapSummary, summarise
+from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.map_figures import status_counts
+from pchem_pipeline.render.ranges import finite
+from pchem_pipeline.render.wording import count, measured, percent, short, symbol
+
+__all__ = [
+    "Flag",
+    "KeyNumber",
+    "PixelCounts",
+    "flags",
+    "key_numbers",
+    "pixel_counts",
+    "sentence",
+    "summaries",
+]
+
+Level = Literal["good", "note", "caution", "serious"]
+
+_KEY_MAPS = ("read_noise_e", "conversion_gain", "dark_current", "quanta_exposure", "bias")
+
+#: Ratio of an RMSE to that of sampling noise alone up to which the model explains the data, and from which
+#: it clearly does not.
+_RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
+#: Share of pixels with one reason for caution from which the first screen says so.
+_CAUTION_SHARE = 0.01
+#: A pixel's fit is poor below this probability.
+_POOR_P = 1e-3
+
+
+@dataclass(frozen=True)
+class KeyNumber:
+    """A number of the first screen: the median over the pixels and the spread between them."""
+
+    name: str
+    words: str
+    value: str
+    spread: str
+    per_pixel: str
+
+
+@dataclass(frozen=True)
+class Flag:
+    """One remark on whether the results can be believed."""
+
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class PixelCounts:
+    """How many pixels have a value, and how many of those deserve caution."""
+
+    total: int
+    failed: int
+    caution: int
+
+    @property
+    def fitted(self) -> int:
+        """Pixels with a value."""
+        return self.total - self.failed
+
+
+def pixel_counts(data: ReportData) -> PixelCounts:
+    """Count the pixels by outcome of their fit."""
+    status = data.fit.get("fit_status")
+    if status is None:
+        total = int(np.prod(data.shape))
+        return PixelCounts(total, total, 0)
+    failed = (status & data.failed_mask) != 0
+    return PixelCounts(int(status.size), int(failed.sum()), int(((status != 0) & ~failed).sum()))
+
+
+def summaries(data: ReportData) -> dict[str, MapSummary]:
+    """Describe every map by order statistics."""
+    return {
+        name: summarise(values, percentiles=data.percentiles, outlier_sigmas=data.outlier_sigmas)
+        for name, values in data.maps.items()
+        if not name.endswith("_stderr")
+    }
+
+
+def key_numbers(data: ReportData) -> list[KeyNumber]:
+    """Return the numbers of the first screen."""
+    found = []
+    for name in _KEY_MAPS:
+        if name not in data.maps:
+            continue
+        _, words, unit = symbol(name)
+        summary = summarise(data.maps[name], percentiles=(5.0, 95.0))
+        low, high = summary.percentiles[5.0], summary.percentiles[95.0]
+        errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
+        found.append(
+            KeyNumber(
+                name,
+                words,
+                measured(summary.median, summary.median_stderr, unit),
+                f"5–95 % of the pixels: {short(low)} to {short(high)} {unit}" if summary.n_valid else "",
+                f"one pixel is known to ± {short(float(np.median(errors)), 2)} {unit}" if errors.size else "",
+            )
+        )
+    return found
+
+
+def sentence(data: ReportData) -> str:
+    """Return the report in one sentence or two."""
+    pixels = pixel_counts(data)
+    if pixels.fitted == 0:
+        return (
+            f"None of the {count(pixels.total, 'pixel')} could be fitted; the table of fit status says why."
+        )
+    parts = []
+    for name, lead in (
+        ("read_noise_e", "read noise"),
+        ("conversion_gain", "conversion gain"),
+        ("dark_current", "dark current"),
+    ):
+        if name in data.maps:
+            summary = summarise(data.maps[name])
+            parts.append(f"{lead} {measured(summary.median, summary.median_stderr, symbol(name)[2])}")
+    frames = f" from {count(data.n_frames, 'frame')}" if data.n_frames else ""
+    text = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, 'pixel')} were fitted{frames}. "
+    text += "Medians over the pixels: " + ", ".join(parts) + "."
+    rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
+    if "epcd_exact" in rmse and rmse.get("noise_floor"):
+        text += (
+            f" The fitted pixels predict the raw ensemble histogram with an RMSE of {short(rmse['epcd_exact'], 2)}; "
+            f"sampling noise alone gives {short(rmse['noise_floor'], 2)}."
+        )
+    return text
+
+
+def flags(data: ReportData) -> list[Flag]:
+    """Return what speaks for and against the results, the gravest first."""
+    found = [*_failed_pixels(data), *_cautions(data), *_goodness(data), *_agreement(data), *_conditions(data)]
+    order = ("serious", "caution", "note", "good")
+    return sorted(found, key=lambda flag: order.index(flag.level))
+
+
+def _failed_pixels(data: ReportData) -> list[Flag]:
+    pixels = pixel_counts(data)
+    share = pixels.failed / max(pixels.total, 1)
+    text = f"{count(pixels.failed, 'pixel')} ({percent(pixels.failed, pixels.total)}) without a value"
+    if share > data.allowed_failed:
+        allowed = percent(data.allowed_failed, 1.0)
+        return [Flag("serious", f"{text}, more than the {allowed} that is allowed.")]
+    if pixels.failed:
+        return [Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}.")]
+    return [Flag("good", "Every pixel has a value.")]
+
+
+def _cautions(data: ReportData) -> list[Flag]:
+    status = data.fit.get("fit_status")
+    if status is None:
+        return []
+    kept = [row for row in status_counts(status, data.status_words) if not row[0] & data.failed_mask]
+    return [
+        Flag("caution", f"{percent(n, status.size)} of the pixels: {text}.")
+        for _, text, n in kept
+        if n > _CAUTION_SHARE * status.size
+    ]
+
+
+def _goodness(data: ReportData) -> list[Flag]:
+    p = finite(data.fit.get("goodness_p", np.empty(0)))
+    if p.size == 0:
+        return []
+    poor = int((p < _POOR_P).sum())
+    expected = _POOR_P * p.size
+    text = (
+        f"Goodness of fit: {percent(poor, p.size)} of the fitted pixels have p < {_POOR_P:g}, "
+        f"where the model alone leads to {percent(expected, p.size)}"
+    )
+    if poor > 0.05 * p.size:
+        return [
+            Flag(
+                "serious",
+                f"{text}. The PCD does not describe this sensor; see the residuals of single pixels.",
+            )
+        ]
+    if poor > 2.0 * expected + 5.0 * np.sqrt(expected):
+        return [Flag("caution", f"{text}. Some pixels are not described by the PCD.")]
+    return [Flag("good", f"{text}.")]
+
+
+def _agreement(data: ReportData) -> list[Flag]:
+    rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
+    found = []
+    for name, floor, words in (
+        ("epcd_exact", "noise_floor", "raw ensemble"),
+        ("nuced_exact", "nuced_noise_floor", "NUCed ensemble"),
+    ):
+        if name not in rmse or not rmse.get(floor):
+            continue
+        ratio = rmse[name] / rmse[floor]
+        text = f"The prediction of the {words} misses the data by {short(ratio, 2)} times the sampling noise"
+        if ratio <= _RMSE_GOOD:
+            found.append(Flag("good", f"{text}: the model explains it."))
+        elif ratio <= _RMSE_BAD:
+            found.append(Flag("caution", f"{text}: small differences are left."))
+        else:
+            found.append(Flag("serious", f"{text}: the model does not explain it."))
+    return found
+
+
+def _conditions(data: ReportData) -> list[Flag]:
+    found = [Flag("note", f"{text.rstrip('.')}.") for text in data.missing.values()]
+    read_noise = finite(data.maps.get("read_noise_e", np.empty(0)))
+    if read_noise.size and float(np.median(read_noise)) > 0.5:
+        found.append(
+            Flag("caution", "Read noise above 0.5 e⁻: one exposure tells little; take several exposures.")
+        )
+    gain = finite(data.maps.get("conversion_gain", np.empty(0)))
+    if gain.size and float(np.median(gain)) > 0.4:
+        found.append(
+            Flag(
+                "caution",
+                "Conversion gain above 0.4 e⁻/DN: rounding to whole DN biases the read noise upwards.",
+            )
+        )
+    for stage in data.stages:
+        if stage.get("state") not in (None, "complete"):
+            found.append(
+                Flag(
+                    "serious",
+                    f"Stage {stage.get('stage')} is {stage['state']}: the report shows a part only.",
+                )
+            )
+        found += [Flag("note", f"{stage.get('stage')}: {remark}") for remark in stage.get("notes", ())]
+    return list(dict.fromkeys(found))

@@ -1,0 +1,103 @@
+"""Numbers in words: a value with its uncertainty and unit, rounded to what is known."""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["count", "measured", "percent", "short", "stored_unit", "symbol", "unit_text"]
+
+_UNITS = {
+    "e-": "e⁻",
+    "e-2": "e⁻²",
+    "e-/DN": "e⁻/DN",
+    "e-/px/s": "e⁻/px/s",
+    "1/e-": "1/e⁻",
+    "DN2": "DN²",
+    "1": "",
+}
+
+#: Symbol (mathtext), words and stored unit of each map.
+_SYMBOLS = {
+    "quanta_exposure": (r"$H$", "quanta exposure", "e-"),
+    "conversion_gain": (r"$g$", "conversion gain", "e-/DN"),
+    "bias": (r"$\mu$", "bias", "DN"),
+    "read_noise_dn": (r"$\sigma$", "read noise", "DN"),
+    "read_noise_e": (r"$\sigma_{\mathrm{e}^-}$", "read noise", "e-"),
+    "analog_read_noise_e": (r"$\sigma_R$", "analog read noise", "e-"),
+    "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
+}
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def unit_text(unit: str) -> str:
+    """Return a stored unit as people write it, e.g. ``e-/DN`` as ``e⁻/DN``; ``1`` as nothing."""
+    return _UNITS.get(unit, unit)
+
+
+def symbol(name: str) -> tuple[str, str, str]:
+    """Return ``(symbol in mathtext, words, unit as people write it)`` of a map.
+
+    Raises:
+        KeyError: if no such map exists.
+    """
+    math_symbol, words, unit = _SYMBOLS[name]
+    return math_symbol, words, unit_text(unit)
+
+
+def stored_unit(name: str) -> str:
+    """Return the unit of a map as the store writes it."""
+    return _SYMBOLS[name][2]
+
+
+def short(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, as ``1.9×10⁻⁴`` where decimals would be long."""
+    if not math.isfinite(value):
+        return "not known"
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    if -4 < exponent < max(digits, 5):
+        return f"{value:.{max(digits - 1 - exponent, 0)}f}".replace("-", "−")
+    mantissa = value / 10.0**exponent
+    return f"{mantissa:.{digits - 1}f}×10{str(exponent).translate(_SUPERSCRIPT)}".replace("-", "−")
+
+
+def measured(value: float, error: float, unit: str = "") -> str:
+    """Return ``value ± error unit``, rounded to two digits of the error.
+
+    Args:
+        value: estimate; NaN gives ``not known``.
+        error: its standard error; NaN or 0 leaves the error out.
+        unit: unit as people write it.
+    """
+    tail = f" {unit}" if unit else ""
+    if not math.isfinite(value):
+        return "not known"
+    if not math.isfinite(error) or error <= 0:
+        return short(value, 4) + tail
+    exponent = math.floor(math.log10(float(f"{error:.1e}")))
+    if exponent < -6 or exponent > 5:
+        return f"{short(value, 6)} ± {short(error, 2)}{tail}"
+    decimals = max(1 - exponent, 0)
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}{tail}".replace("-", "−")
+
+
+def count(number: int, noun: str) -> str:
+    """Return ``1 pixel``, ``2 pixels``, ``17,750 frames``."""
+    plural = "" if number == 1 else "s"
+    return f"{number:,} {noun}{plural}"
+
+
+def percent(part: float, whole: float) -> str:
+    """Return a share as ``12 %``, ``0.4 %`` or ``< 0.01 %``; ``0 %`` only for none."""
+    if whole <= 0:
+        return "0 %"
+    share = 100.0 * part / whole
+    if share == 0:
+        return "0 %"
+    if share < 0.01:
+        return "< 0.01 %"
+    if 99.99 < share < 100:
+        return "> 99.99 %"
+    return f"{share:.{2 if share < 1 else 1 if share < 10 or share > 99 else 0}f} %".replace(".0 %", " %")

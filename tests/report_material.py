@@ -1,0 +1,173 @@
+"""Synthetic reports: a sensor drawn from distributions, its fits as the truth plus noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.render.captions import case_name
+from pchem_pipeline.render.data import PixelFit, ReportData
+
+PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+
+
+def true_maps(shape: tuple[int, int], seed: int = 1) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    ny, nx = shape
+    y, x = np.mgrid[:ny, :nx] / max(ny, nx, 2)
+    exposure = np.exp(rng.normal(np.log(2.0), 0.25, shape) + 0.2 * np.sin(5 * x))
+    hot = rng.random(shape) < 0.004
+    exposure[hot] *= rng.uniform(3, 25, int(hot.sum()))
+    read_noise_e = 0.3 * np.exp(rng.normal(0, 0.1, shape)) + (rng.random(shape) < 0.02) * rng.exponential(0.06, shape)
+    gain = 0.095 * (1 + 0.02 * rng.standard_normal(shape) + 0.01 * y)
+    bias = 100 + 1.5 * rng.standard_normal(shape) + 2 * rng.standard_normal(nx)[None, :]
+    return {
+        "quanta_exposure": exposure,
+        "conversion_gain": gain,
+        "bias": bias,
+        "read_noise_dn": read_noise_e / gain,
+        "read_noise_e": read_noise_e,
+    }
+
+
+def draw_dn(maps: dict[str, np.ndarray], n: int, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    h, g, mu, sigma = (maps[name] for name in PARAMETERS)
+    k = rng.poisson(h, (n, *h.shape))
+    analog = np.sqrt(np.maximum(sigma**2 - 1 / 12, 0.01))
+    return np.rint(k / g + mu + analog * rng.standard_normal(k.shape)).astype(np.int64), k
+
+
+def pixel_fit(maps: dict[str, np.ndarray], y: int, x: int, label: str, n: int = 17_750, seed: int = 3) -> PixelFit:
+    one = {name: values[y : y + 1, x : x + 1] for name, values in maps.items()}
+    dn = draw_dn(one, n, seed + 1000 * y + x)[0].ravel()
+    origin = int(dn.min())
+    values = {name: float(v[0, 0]) for name, v in one.items()}
+    errors = {"quanta_exposure": 0.012, "conversion_gain": 0.0003, "bias": 0.06, "read_noise_dn": 0.03}
+    errors["read_noise_e"] = 0.0025
+    return PixelFit(label, y, x, origin, np.bincount(dn - origin), values, errors, goodness_p=0.31)
+
+
+def gaussian_mixture(x: np.ndarray, maps: dict[str, np.ndarray], n_k: int = 80) -> np.ndarray:
+    """Mean over the pixels of the PCD, by plain sums."""
+    total = np.zeros(x.size)
+    columns = [maps[name].ravel() for name in PARAMETERS]
+    for h, g, mu, s in list(zip(*columns, strict=True))[:400]:
+        weight = np.exp(-h)
+        for k in range(min(n_k, int(h + 8 * np.sqrt(h) + 8))):
+            if k:
+                weight *= h / k
+            total += weight * np.exp(-0.5 * ((x - mu - k / g) / s) ** 2) / (s * np.sqrt(2 * np.pi))
+    return total / min(columns[0].size, 400)
+
+
+def ensemble_arrays(maps: dict[str, np.ndarray], n: int = 50) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    dn, _ = draw_dn(maps, n)
+    axis = np.arange(dn.min(), dn.max() + 1)
+    counts = np.bincount((dn - dn.min()).ravel(), minlength=axis.size)
+    density = counts / counts.sum()
+    exact = gaussian_mixture(axis.astype(float), maps)
+    electrons = (dn - maps["bias"]) * maps["conversion_gain"]
+    step = float(np.median(maps["conversion_gain"]))
+    edges = np.arange(electrons.min() - step / 2, electrons.max() + 1.5 * step, step)
+    nuced_counts = np.histogram(electrons, edges)[0]
+    centre = edges[:-1] + step / 2
+    nuced = {**maps, "conversion_gain": np.ones_like(maps["bias"]), "bias": np.zeros_like(maps["bias"])}
+    nuced["read_noise_dn"] = maps["read_noise_e"]
+    nuced_exact = gaussian_mixture(centre, nuced)
+    k_hat = np.clip(np.rint(electrons), 0, None).astype(int)
+    k = np.arange(k_hat.max() + 1)
+    k_counts = np.bincount(k_hat.ravel(), minlength=k.size)
+    h = maps["quanta_exposure"].ravel()
+    from scipy.stats import poisson
+
+    pmf = poisson.pmf(k[:, None], h[None, :]).mean(axis=1)
+    base = np.sqrt(np.mean(maps["read_noise_dn"] ** 2))
+    ks = np.arange(13)
+    variance = np.stack([base**2 + (16 - i) / 16 * (0.05 * ks) ** 2 * 4 for i in range(16)])
+    arrays = {
+        "dn": axis,
+        "counts": counts,
+        "density": density,
+        "epcd_exact": exact,
+        "epcd_dependent": exact * 1.01,
+        "epcd_independent": np.convolve(exact, np.ones(5) / 5, "same"),
+        "electrons": centre,
+        "nuced_counts": nuced_counts,
+        "nuced_density": nuced_counts / nuced_counts.sum() / step,
+        "nuced_exact": nuced_exact,
+        "nuced_dependent": nuced_exact * 1.01,
+        "nuced_independent": nuced_exact * 0.98,
+        "k": k,
+        "electron_counts": k_counts,
+        "electron_mass": k_counts / k_counts.sum(),
+        "electron_pmf": pmf,
+        "electron_pmf_map": pmf * 1.005,
+        "component_variance": variance,
+        "nuced_component_variance": np.full(13, np.mean(maps["read_noise_e"] ** 2)),
+    }
+    rmse = {"epcd_exact": 1.3e-4, "epcd_dependent": 1.5e-4, "epcd_independent": 8.3e-4, "noise_floor": 1.2e-4}
+    rmse |= {"nuced_exact": 2.1e-4, "nuced_dependent": 2.3e-4, "nuced_independent": 2.7e-4, "nuced_noise_floor": 2e-4}
+    return arrays, {"rmse": rmse, "n_frames": n, "error_rate": 0.107}
+
+
+CASES = tuple(
+    case_name([s for bit, s in ((1, "H"), (2, "g"), (4, "mu"), (8, "sigma2")) if i & bit]) for i in range(16)
+)
+
+
+def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed: int = 1) -> ReportData:
+    """A whole report of a sensor of which a share of the pixels failed."""
+    rng = np.random.default_rng(seed + 10)
+    truth = true_maps(shape, seed)
+    bad = rng.random(shape) < failed
+    maps: dict[str, np.ndarray] = {}
+    relative = {"quanta_exposure": 0.006, "conversion_gain": 0.003, "bias": 6e-4, "read_noise_dn": 0.008, "read_noise_e": 0.008}
+    for name, values in truth.items():
+        error = relative[name] * np.abs(values)
+        maps[name] = np.where(bad, np.nan, values + error * rng.standard_normal(shape))
+        maps[f"{name}_stderr"] = np.where(bad, np.nan, error)
+    maps["dark_current"] = maps["quanta_exposure"] / 4.87
+    maps["dark_current_stderr"] = maps["quanta_exposure_stderr"] / 4.87
+    status = np.where(bad, int(FitStatus.TOO_FEW_BINS), 0).astype(np.uint16)
+    status[bad & (rng.random(shape) < 0.5)] = int(FitStatus.GAIN_NOT_IDENTIFIED)
+    status[~bad & (rng.random(shape) < 0.01)] |= int(FitStatus.POOR_FIT)
+    status[~bad & (rng.random(shape) < 0.006)] |= int(FitStatus.BIAS_AMBIGUOUS)
+    arrays, facts = ensemble_arrays(truth)
+    labels = [f"{n} read noise, {e} exposure" for n in ("low", "high") for e in ("low", "high")]
+    places = rng.integers(0, shape, (4, 2))
+    pixels = [pixel_fit(truth, int(y), int(x), label) for (y, x), label in zip(places, labels, strict=True)]
+    return ReportData(
+        title="demo sensor",
+        shape=shape,
+        n_frames=17_750,
+        integration_time=4.87,
+        maps=maps,
+        fit={"fit_status": status, "goodness_p": np.where(bad, np.nan, rng.random(shape)),
+             "likelihood_gap": np.where(bad, np.nan, 300.0)},  # fmt: skip
+        status_words={int(bit): text for bit, text in MEANINGS.items()},
+        failed_mask=int(FAILED),
+        pixels=pixels,
+        ensemble=arrays,
+        ensemble_facts=facts,
+        component_cases=CASES,
+        moments=[
+            {"quantity": "mean, raw", "unit": "DN", "predicted": 121.34, "observed": 121.32, "stderr": 0.02},
+            {"quantity": "variance, raw", "unit": "DN2", "predicted": 251.3, "observed": 250.9, "stderr": 0.4},
+        ],
+        truth=truth,
+        config_yaml="input:\n  files: [frames/*.tif]\nfit:\n  algorithm: newton\n",
+        run={"name": "demo.zarr", "started": "2026-01-02T03:04:05Z", "seed": 1, "versions": {"numpy": np.__version__}},
+        inputs=[{"name": "frame_0001.tif", "size": 524_288, "hash": "xxh3_128:0123456789abcdef"}],
+        stages=[
+            {"stage": "histogram", "state": "complete", "seconds": 12.3, "peak_memory_bytes": 512_000_000},
+            {"stage": "fit", "state": "complete", "seconds": 45.6, "peak_memory_bytes": 256_000_000},
+        ],
+    )
+
+
+def without(data: ReportData, **changes: object) -> ReportData:
+    """The same report with fields replaced."""
+    return replace(data, **changes)  # type: ignore[arg-type]
