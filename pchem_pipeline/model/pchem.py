@@ -7,9 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scipy.special import chdtrc
+
+from pchem_pipeline.model import pchem_numba, polish_numba
+from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.start_numba import regression_basis
 
 __all__ = ["FitResult", "fit_histograms"]
+
+WARM_UP = 2  # EM steps before the first Newton step
 
 
 @dataclass(frozen=True)
@@ -55,4 +62,50 @@ def fit_histograms(
     adc_limits: tuple[int, int] | None = None,
 ) -> FitResult:
     """Estimate (H, g, mu, sigma) of every pixel from its histogram."""
-    raise NotImplementedError
+    settings = settings or FitSettings()
+    counts = np.ascontiguousarray(counts)
+    n = counts.shape[0]
+    parameters, covariance = np.empty((n, 4)), np.empty((n, 4, 4))
+    out, words = np.empty((n, pchem_numba.N_OUT)), np.empty((n, 5), np.int64)
+    pchem_numba.fit_tile(
+        counts, np.asarray(origin, np.int64), regression_basis(), _limits(settings), parameters, covariance, out, words
+    )
+    dof = words[:, 2]
+    probability = chdtrc(np.where(dof > 0, dof, np.nan), out[:, pchem_numba.CHI2])
+    status = words[:, 0]
+    status[probability < settings.goodness_limit] |= FitStatus.POOR_FIT
+    for outside in (under, over):
+        if outside is not None:
+            status[np.asarray(outside) > 0] |= FitStatus.OUTSIDE_WINDOW
+    if adc_limits is not None:
+        status[(words[:, 3] <= adc_limits[0]) | (words[:, 4] >= adc_limits[1])] |= FitStatus.ADC_LIMIT
+    failed = (status & FAILED) != 0
+    parameters[failed] = np.nan
+    covariance[failed] = np.nan
+    return FitResult(
+        quanta_exposure=parameters[:, 0].copy(),
+        conversion_gain=parameters[:, 1].copy(),
+        bias=parameters[:, 2].copy(),
+        read_noise_dn=parameters[:, 3].copy(),
+        covariance=covariance,
+        log_likelihood=out[:, pchem_numba.LOG_LIKELIHOOD].copy(),
+        likelihood_gap=out[:, pchem_numba.GAP].copy(),
+        fit_status=status.astype(np.uint16),
+        n_iterations=words[:, 1].astype(np.int32),
+        goodness_chi2=out[:, pchem_numba.CHI2].copy(),
+        goodness_dof=dof.astype(np.int32),
+        goodness_p=probability,
+    )
+
+
+def _limits(settings: FitSettings) -> NDArray[np.float64]:
+    em = settings.algorithm == "em"
+    limits = np.zeros(pchem_numba.N_LIMITS)
+    limits[polish_numba.MIN_LOG_EXPOSURE] = np.log(settings.minimum_quanta_exposure)
+    limits[polish_numba.TOLERANCE] = settings.tolerance
+    limits[polish_numba.WARM_UP] = WARM_UP
+    limits[polish_numba.MAX_EVALUATIONS] = settings.em_max_iterations if em else settings.max_iterations
+    limits[pchem_numba.GAP_THRESHOLD] = settings.gap_threshold
+    limits[pchem_numba.NOISE_LIMIT] = settings.read_noise_limit
+    limits[pchem_numba.ONLY_EM] = em
+    return limits

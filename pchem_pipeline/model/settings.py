@@ -40,7 +40,9 @@ class FitSettings(Section):
         description="nats: the bias counts as ambiguous when a runner-up (one electron more or fewer) is closer",
     )
     read_noise_limit: float = Field(
-        default=0.5, gt=0, description="e-: above it one sample does not determine the parameters well; flagged"
+        default=0.5,
+        gt=0,
+        description="e-: above it one sample does not determine the parameters well; flagged",
     )
     goodness_limit: float = Field(
         default=1e-6, ge=0, lt=1, description="a goodness-of-fit probability below it is flagged"

@@ -1,0 +1,221 @@
+"""From a starting point to the nearest maximum of the likelihood: EM steps and a safeguarded Newton finish.
+
+Parameters, weights and scratch as in :mod:`pchem_pipeline.model.estep_numba`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.estep_numba import LOGLIK, SUM_E, SUM_EE, SUM_K, SUM_KE, SUM_KK, evaluate
+from pchem_pipeline.model.fisher_numba import back_substitute, cholesky
+
+# outcomes of `polish`
+CONVERGED = 0
+NOT_CONVERGED = 1
+DEGENERATE = 2  # ran towards one Gaussian: g to infinity, or an empty second peak
+FAR_BELOW = 3  # given up: too far below the likelihood to beat
+
+# places in `limits`
+MIN_LOG_EXPOSURE, MAX_STEP, TOLERANCE, WARM_UP, MAX_EVALUATIONS = range(5)
+
+MIN_LOG_VARIANCE = math.log(1.0 / 12.0)  # rounding alone
+MIN_ELECTRON_NOISE = 0.03  # below it the polynomials of the E-step overflow
+MAX_ELECTRON_NOISE = 3.0  # above it there is one Gaussian to all intents
+_MIN_STEP = 1.2  # DN per electron: a comb with a tooth at each DN would fit any whole numbers
+MAX_LOG_EXPOSURE = math.log(1e5)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def min_log_variance(a: float) -> float:
+    """Return the lower bound of log sigma^2 for a step a: rounding, and a floor in e-."""
+    return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def em_step(
+    n: float, theta: NDArray[np.float64], total: NDArray[np.float64], bound: float, out: NDArray[np.float64]
+) -> bool:
+    """One EM update, eq. (update_eqns), from the E-step sums at ``theta``; False where it is not defined.
+
+    Written in the residuals e = x - mu - k/g of the present parameters, which is the same update without
+    cancellation.
+    """
+    exposure = total[SUM_K] / n
+    spread = total[SUM_KK] / n - exposure * exposure
+    if not (exposure > 0.0 and spread > 0.0):
+        return False
+    mean_e = total[SUM_E] / n
+    # C - xbar A = a (B - A^2) + (sum of k e - A sum of e) / N
+    change = (total[SUM_KE] / n - exposure * mean_e) / spread
+    a = theta[1] + change
+    residual = total[SUM_EE] / n - mean_e * mean_e - change * change * spread
+    if not (a > 0.0 and math.isfinite(a)):
+        return False
+    out[0] = max(bound, math.log(exposure))
+    out[1] = a
+    out[2] = theta[2] + mean_e - change * exposure
+    out[3] = max(min_log_variance(a), math.log(max(residual, 1e-3)))
+    return True
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def add_complete(
+    n: float, theta: NDArray[np.float64], total: NDArray[np.float64], share: float, matrix: NDArray[np.float64]
+) -> None:
+    """Add a share of the complete-data information, positive definite everywhere, to the lower triangle."""
+    s2 = math.exp(theta[3])
+    matrix[0, 0] += share * n * math.exp(theta[0])
+    matrix[1, 1] += share * total[SUM_KK] / s2
+    matrix[2, 1] += share * total[SUM_K] / s2
+    matrix[2, 2] += share * n / s2
+    matrix[3, 1] += share * total[SUM_KE] / s2
+    matrix[3, 2] += share * total[SUM_E] / s2
+    matrix[3, 3] += share * 0.5 * total[SUM_EE] / s2
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def newton_step(
+    n: float,
+    theta: NDArray[np.float64],
+    total: NDArray[np.float64],
+    score: NDArray[np.float64],
+    information: NDArray[np.float64],
+    bound: float,
+    step: NDArray[np.float64],
+) -> float:
+    """Solve for the Newton step; parameters held by a bound stay.
+
+    Where the observed information is not positive definite, a growing share of the complete-data information
+    is added: the step turns from Newton's into that of EM.
+
+    Returns:
+        Half the squared Newton decrement, the expected rise of the log-likelihood; -1 where the
+        information is not positive definite, so that nothing can be said of the rise.
+    """
+    held = np.zeros(4, np.bool_)
+    held[0] = theta[0] <= bound + 1e-12 and score[0] <= 0.0
+    held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-12 and score[3] <= 0.0
+    lower = np.empty((4, 4))
+    matrix = information.copy()
+    share = 0.0
+    while not cholesky(matrix, held, lower):
+        more = 0.01 if share == 0.0 else 2.0 * share
+        add_complete(n, theta, total, more, matrix)
+        share += more
+        if share > 3.0:
+            step[:] = 0.0
+            return -1.0
+    for i in range(4):
+        step[i] = 0.0 if held[i] else score[i]
+    rise = 0.5 * back_substitute(lower, step)
+    return rise if share == 0.0 else -1.0
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _bounded(
+    theta: NDArray[np.float64], step: NDArray[np.float64], bound: float, out: NDArray[np.float64]
+) -> float:
+    """Take a Newton step, shortened to stay where the quadratic can be trusted; return the factor."""
+    a = theta[1]
+    longest = max(abs(step[0]) / 0.5, abs(step[1]) / (0.1 * a), abs(step[2]) / (0.4 * a), abs(step[3]) / 0.5)
+    factor = 1.0 if longest <= 1.0 else 1.0 / longest
+    for i in range(4):
+        out[i] = theta[i] + factor * step[i]
+    out[0] = max(bound, out[0])
+    out[3] = max(min_log_variance(out[1]), out[3])
+    return factor
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _degenerate(theta: NDArray[np.float64], longest_step: float) -> bool:
+    noise = math.exp(0.5 * theta[3]) / theta[1]
+    return not (
+        noise < MAX_ELECTRON_NOISE and _MIN_STEP < theta[1] < longest_step and theta[0] < MAX_LOG_EXPOSURE
+    )
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def polish(
+    weights: NDArray[np.float64],
+    cumulative: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    theta: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    only_em: bool,
+    to_beat: float,
+    work: NDArray[np.float64],
+    total: NDArray[np.float64],
+    score: NDArray[np.float64],
+    information: NDArray[np.float64],
+) -> tuple[int, float, int]:
+    """Climb to the maximum near ``theta``, which is updated in place.
+
+    Args:
+        weights: counts of successive DN.
+        cumulative: running sums of the weights, one longer.
+        n_bins: number of DN in use.
+        first: first DN minus the centre.
+        theta: start; out: the maximum.
+        limits: bounds and limits, see the names at the top of this module.
+        only_em: take EM steps only.
+        to_beat: give up once the log-likelihood cannot rise to this value, judged by twice the expected rise.
+        work: scratch of `evaluate`.
+        total: scratch.
+        score: scratch.
+        information: scratch.
+
+    Returns:
+        Outcome, log-likelihood at the last theta (the rise expected from a last Newton step included),
+        number of evaluations.
+    """
+    bound, tolerance = limits[MIN_LOG_EXPOSURE], limits[TOLERANCE]
+    n = cumulative[n_bins]
+    trial, safe, step = np.empty(4), np.empty(4), np.empty(4)
+    theta[0] = max(bound, theta[0])
+    theta[3] = max(min_log_variance(theta[1]), theta[3])
+    if _degenerate(theta, limits[MAX_STEP]):
+        return DEGENERATE, -math.inf, 0
+    loglik = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, False)
+    used = 1
+    for count in range(int(limits[MAX_EVALUATIONS])):
+        rise = newton_step(n, theta, total, score, information, bound, step)
+        has_em = em_step(n, theta, total, bound, safe)
+        if 0.0 <= rise < tolerance:
+            if only_em:
+                return CONVERGED, loglik, used
+            if _bounded(theta, step, bound, trial) == 1.0:
+                theta[:] = trial
+                return CONVERGED, loglik + rise, used
+        if rise >= 0.0 and loglik + 2.0 * rise + 1.0 < to_beat:
+            return FAR_BELOW, loglik, used
+        newton = not only_em and count >= limits[WARM_UP]
+        if newton:
+            _bounded(theta, step, bound, trial)
+        elif has_em:
+            trial[:] = safe
+        else:
+            return NOT_CONVERGED, loglik, used
+        if _degenerate(trial, limits[MAX_STEP]):
+            if not newton or not has_em or _degenerate(safe, limits[MAX_STEP]):
+                return DEGENERATE, loglik, used
+            newton = False
+            trial[:] = safe
+        risen = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+        used += 1
+        if newton and not risen >= loglik - 1e-11 * abs(loglik) and has_em:
+            trial[:] = safe
+            risen = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+            used += 1
+        if not math.isfinite(risen):
+            return NOT_CONVERGED, loglik, used
+        theta[:] = trial
+        loglik = risen
+        if used >= limits[MAX_EVALUATIONS]:
+            break
+    return NOT_CONVERGED, total[LOGLIK], used

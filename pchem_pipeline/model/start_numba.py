@@ -1,0 +1,261 @@
+"""Starting points in closed form, from the empirical characteristic function (ECF) and from cumulants.
+
+``phi(f) = mean exp(2 pi i f y)`` of a PCD has ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f a)`` and the
+phase ``2 pi f m + H sin 2 pi f a`` (f in cycles/DN, ``a = 1/g``). Frequencies and steps are counted in units of
+1/sd and sd of the pixel: the side lobes then always have a width near 0.16.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+_REORDER = {"reassoc", "nsz", "contract", "arcp"}
+
+FREQUENCY_STEP = 0.075  # 1/sd: half the width of a lobe
+N_FREQUENCIES = 64  # up to 4.8/sd, the lobe of H = 22
+N_FREQUENCIES_WIDE = 192  # up to 14.4/sd, the lobe of H = 200
+LOBE_STEP = 0.05
+LOBE_FIRST = 0.25  # lowest lobe frequency tried, 1/sd: the step a is at most 4 sd
+N_LOBES = 90
+
+_TWO_PI = 2.0 * math.pi
+_MIN_VARIANCE = 1.0 / 12.0
+
+
+def regression_basis() -> NDArray[np.float64]:
+    """Return ``1 - cos(2 pi f a)`` for every trial step a (rows) and every frequency f (columns)."""
+    frequency = FREQUENCY_STEP * np.arange(1, N_FREQUENCIES + 1)
+    lobe = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
+    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[None, :] / lobe[:, None]))
+
+
+@nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
+def ecf(
+    weights: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    step: float,
+    n_frequencies: int,
+    work: NDArray[np.float64],
+) -> None:
+    """Leave the real and imaginary part of the unnormalised ECF at ``step * (1 ... n)`` in ``work[0:2]``.
+
+    ``work`` has six rows; successive DN differ by a rotation, so no sine is taken per DN.
+    """
+    real, imag, cosine, sine = work[0], work[1], work[2], work[3]
+    turn_c, turn_s = work[4], work[5]
+    for m in range(n_frequencies):
+        angle = _TWO_PI * step * (m + 1)
+        turn_c[m] = math.cos(angle)
+        turn_s[m] = math.sin(angle)
+        cosine[m] = math.cos(angle * first)
+        sine[m] = math.sin(angle * first)
+        real[m] = 0.0
+        imag[m] = 0.0
+    for i in range(n_bins):
+        c = weights[i]
+        for m in range(n_frequencies):
+            co = cosine[m]
+            si = sine[m]
+            real[m] += c * co
+            imag[m] += c * si
+            cosine[m] = co * turn_c[m] - si * turn_s[m]
+            sine[m] = co * turn_s[m] + si * turn_c[m]
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def ecf_at(weights: NDArray[np.float64], n_bins: int, first: float, frequency: float) -> tuple[float, float]:
+    """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
+    angle = _TWO_PI * frequency
+    co, si = math.cos(angle * first), math.sin(angle * first)
+    turn_c, turn_s = math.cos(angle), math.sin(angle)
+    real = imag = 0.0
+    for i in range(n_bins):
+        real += weights[i] * co
+        imag += weights[i] * si
+        co, si = co * turn_c - si * turn_s, co * turn_s + si * turn_c
+    return math.hypot(real, imag), math.atan2(imag, real)
+
+
+@nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
+def _regress(
+    basis: NDArray[np.float64], weight: NDArray[np.float64], quadratic: NDArray[np.float64], target: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Return (lobe frequency in 1/sd, H) of the best weighted regression over all trial steps."""
+    n = weight.size
+    qq = qy = 0.0
+    for m in range(n):
+        qq += weight[m] * quadratic[m] * quadratic[m]
+        qy += weight[m] * quadratic[m] * target[m]
+    best, place = 0.0, -1
+    best_exposure = 1.0
+    before = after = last = 0.0
+    for p in range(basis.shape[0]):
+        bb = bq = by = 0.0
+        for m in range(n):
+            b = basis[p, m]
+            wb = weight[m] * b
+            bb += wb * b
+            bq += wb * quadratic[m]
+            by += wb * target[m]
+        determinant = qq * bb - bq * bq
+        gain = 0.0
+        exposure = 0.0
+        if determinant > 1e-9 * qq * bb:
+            exposure = (qq * by - bq * qy) / determinant
+            noise = (bb * qy - bq * by) / determinant
+            if exposure > 0.0 and noise > 0.0:
+                gain = exposure * by + noise * qy
+        if place == p - 1:
+            after = gain
+        if gain > best:
+            best, place, before, best_exposure = gain, p, last, exposure
+        last = gain
+    if place < 0:
+        return 0.0, 0.0
+    lobe = LOBE_FIRST + LOBE_STEP * place
+    bend = before - 2.0 * best + after
+    if before > 0.0 and after > 0.0 and bend < 0.0:  # vertex of the parabola through the three best
+        lobe += LOBE_STEP * 0.5 * (before - after) / bend
+    return lobe, best_exposure
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _assemble(
+    weights: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    n: float,
+    mean: float,
+    variance: float,
+    a: float,
+    exposure: float,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Turn a step and a rough H into a start: noise from the lobe's height, bias from its phase."""
+    if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
+        return False
+    modulus, phase = ecf_at(weights, n_bins, first, 1.0 / a)
+    modulus /= n
+    s2 = max(variance - exposure * a * a, 0.16 * a * a)
+    bias = mean - exposure * a
+    if modulus > 3.0 / math.sqrt(n):
+        s2 = -math.log(min(modulus, 0.999)) * a * a / (2.0 * math.pi * math.pi)
+        from_variance = (variance - s2) / (a * a)
+        if from_variance > 0.0:
+            exposure = from_variance
+        anchor = phase * a / _TWO_PI
+        bias = anchor + a * math.floor((mean - exposure * a - anchor) / a + 0.5)
+        if bias > mean - 0.01 * a:
+            bias -= a * math.ceil((bias - mean + 0.01 * a) / a)
+        # a lobe that leans on the centre, H < 1, has a phase of its own: trust it only to a few tenths
+        if exposure < 0.5 and abs(mean - bias - exposure * a) > 0.2 * a:
+            bias = mean - exposure * a
+        exposure = (mean - bias) / a
+    theta[0] = math.log(exposure)
+    theta[1] = a
+    theta[2] = bias
+    theta[3] = math.log(min(max(s2, _MIN_VARIANCE, 0.0025 * a * a), max(variance, _MIN_VARIANCE)))
+    return True
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def start_regression(
+    weights: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    n: float,
+    mean: float,
+    variance: float,
+    basis: NDArray[np.float64],
+    work: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> bool:
+    """Start from the regression on log|phi|; False where there is none. ``work`` has nine rows."""
+    sd = math.sqrt(variance)
+    ecf(weights, n_bins, first, FREQUENCY_STEP / sd, N_FREQUENCIES, work)
+    weight, quadratic, target = work[6, :N_FREQUENCIES], work[7, :N_FREQUENCIES], work[8, :N_FREQUENCIES]
+    floor = 9.0 / n
+    for m in range(N_FREQUENCIES):
+        f = FREQUENCY_STEP * (m + 1)
+        power = (work[0, m] * work[0, m] + work[1, m] * work[1, m]) / (n * n)
+        quadratic[m] = 0.5 * _TWO_PI * _TWO_PI * f * f
+        if power > floor:
+            weight[m] = power
+            target[m] = -0.5 * math.log(min(power, 1.0))
+        else:
+            weight[m] = 0.0
+            target[m] = 0.0
+    lobe, exposure = _regress(basis, weight, quadratic, target)
+    if lobe <= 0.0:
+        return False
+    return _assemble(weights, n_bins, first, n, mean, variance, sd / lobe, exposure, theta)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def start_peak(
+    weights: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    n: float,
+    mean: float,
+    variance: float,
+    work: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> bool:
+    """Start from the highest side lobe of the ECF; False where none stands out of the noise."""
+    sd = math.sqrt(variance)
+    ecf(weights, n_bins, first, FREQUENCY_STEP / sd, N_FREQUENCIES_WIDE, work)
+    modulus = work[6]
+    for m in range(N_FREQUENCIES_WIDE):
+        modulus[m] = math.hypot(work[0, m], work[1, m]) / n
+    best, place = 3.0 / math.sqrt(n), -1
+    for m in range(1, N_FREQUENCIES_WIDE - 1):
+        if modulus[m] > best and modulus[m] >= modulus[m - 1] and modulus[m] >= modulus[m + 1]:
+            best, place = modulus[m], m
+    if place < 0:
+        return False
+    left, right = modulus[place - 1], modulus[place + 1]
+    bend = left - 2.0 * best + right
+    vertex = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
+    electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
+    exposure = max(0.05, variance / (a * a) - electron_noise)
+    return _assemble(weights, n_bins, first, n, mean, variance, a, exposure, theta)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def start_cumulants(
+    weights: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    n: float,
+    mean: float,
+    variance: float,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Start from the third and fourth cumulants, ``a = k4/k3`` and ``H = k3/a^3``; good below H = 1."""
+    third = fourth = 0.0
+    for i in range(n_bins):
+        d = first + i - mean
+        third += weights[i] * d * d * d
+        fourth += weights[i] * d * d * d * d
+    third /= n
+    fourth = fourth / n - 3.0 * variance * variance
+    if third <= 0.0 or fourth <= 0.0:
+        return False
+    a = fourth / third
+    exposure = third / (a * a * a)
+    s2 = variance - exposure * a * a
+    if s2 <= _MIN_VARIANCE:
+        s2 = max(_MIN_VARIANCE, 0.05 * a * a)
+        exposure = max(1e-3, (variance - s2) / (a * a))
+    theta[0] = math.log(max(exposure, 1e-3))
+    theta[1] = a
+    theta[2] = mean - exposure * a
+    theta[3] = math.log(s2)
+    return math.isfinite(theta[1])
