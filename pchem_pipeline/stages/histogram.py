@@ -1,0 +1,349 @@
+"""Stage ``histogram``: per-pixel histograms, and summaries of what they lose, in one pass over the frames.
+
+The unit of work is a band of rows over the full width: its frames are read once, by blocks, the next block
+being read while one is counted. How high the bands are depends on the memory allowed, the result does not.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.histogram import (
+    HistogramAccumulator,
+    RangeAccumulator,
+    RowHistograms,
+    choose_bins,
+    counts_dtype,
+)
+from pchem_pipeline.model.summaries import (
+    ROW_GROUP,
+    CovarianceMaps,
+    SummaryAccumulator,
+    block_starts,
+    frame_statistics,
+    line_sums,
+)
+from pchem_pipeline.stages.bands import (
+    CHUNK_BLOCKS,
+    COLUMN_FRAMES,
+    Band,
+    bytes_per_row,
+    plan_bands,
+    row_frames,
+)
+from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.frame_source import FrameSource, open_source, read_ahead
+
+if TYPE_CHECKING:
+    from pchem_pipeline.compute.executor import Outcome
+    from pchem_pipeline.frames.histograms import HistogramInput
+    from pchem_pipeline.model.histogram_settings import HistogramSettings
+    from pchem_pipeline.store.tiles import Tile
+
+__all__ = [
+    "NAME",
+    "READS",
+    "SETTINGS",
+    "UPSTREAM",
+    "VERSION",
+    "WRITES",
+    "histogram_tile",
+    "run",
+]
+
+NAME = "histogram"
+VERSION = 1
+UPSTREAM: tuple[str, ...] = ("ingest",)
+#: band_memory is not among them: it changes no result
+SETTINGS: tuple[str, ...] = (
+    "histogram.block_frames",
+    "histogram.window_frames",
+    "histogram.max_bins",
+    "histogram.summaries",
+    "run.tile",
+)
+READS: tuple[str, ...] = ("frames",)
+WRITES: tuple[str, ...] = ("histogram", "summary")
+
+_MAPS = ("origin", "under", "over", "minimum", "maximum")
+_COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
+Emit = Callable[[str, NDArray[Any]], None]
+
+
+def histogram_tile(
+    blocks: Iterable[NDArray[Any]],
+    shape: tuple[int, int],
+    bins: int,
+    n_frames: int,
+    settings: HistogramSettings,
+    emit: Emit | None = None,
+) -> tuple[RowHistograms, CovarianceMaps | None]:
+    """Return histograms and covariances of the pixels of some rows.
+
+    Args:
+        blocks: all frames, (frame, y, x) each; the first of ``window_frames``, further ones of any length.
+        shape: rows (from the top of a group of rows) and columns.
+        bins: bins of a pixel.
+        n_frames: number of frames.
+        settings: the section ``histogram``.
+        emit: told of each piece of the arrays along time as it comes: the variable's name in the group
+            ``summary``, and its next rows (first axis: frame or block).
+
+    Returns:
+        The histograms, and the covariances, or None without summaries.
+
+    Raises:
+        InputError: DN of more than 24 bits.
+    """
+    tell: Emit = emit or (lambda name, part: None)
+    histograms = HistogramAccumulator(shape, bins, n_frames)
+    summaries = SummaryAccumulator(shape, settings.block_frames) if settings.summaries else None
+    for frames in blocks:
+        histograms.add(frames)
+        if summaries is not None:
+            for sums in summaries.add(frames):
+                _tell_all(tell, {name: part[None] for name, part in vars(sums).items()})
+            _tell_all(tell, vars(line_sums(frames)))
+    if summaries is None:
+        return histograms.finish(), None
+    rest, covariances = summaries.finish()
+    for sums in rest:
+        _tell_all(tell, {name: part[None] for name, part in vars(sums).items()})
+    return histograms.finish(), covariances
+
+
+def _tell_all(emit: Emit, parts: dict[str, NDArray[Any]]) -> None:
+    for name, part in parts.items():
+        emit(name, part)
+
+
+# -- the stage ----------------------------------------------------------------------------------
+
+
+def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
+    """Return the bands; say so where even the lowest possible ones need more memory than allowed."""
+    settings, tiles = context.config.histogram, context.tiles()
+    n_frames, _, columns = source.shape
+    row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
+    most = (settings.band_memory << 20) // row
+    pending = {tile.key for tile in context.pending(tiles)}
+    together = int(getattr(source, "rows_per_read", 1))
+    bands = plan_bands(tiles, pending, most, context.executor.workers, together)
+    highest = max(band.y1 - band.y0 for band in bands)
+    if highest > most:
+        context.note(
+            f"{highest} rows of {columns} pixels, the least that a worker can take, need "
+            f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory; "
+            "lower histogram.window_frames, or --workers"
+        )
+    return bands
+
+
+def run(context: StageContext) -> None:
+    """Make histograms and summaries of all chosen tiles.
+
+    Raises:
+        InputError: the camera files vanished or changed.
+        StoreError: the input is not complete, or the store refuses.
+    """
+    if context.sensor.kind == "histograms":
+        _copy_histograms(context)
+        return
+    source = open_source(context)
+    settings = context.config.histogram
+    if context.fresh or not context.store.has("histogram/counts"):
+        bins = _decide_bins(context, source)
+    else:
+        bins = context.store.array("histogram/counts").shape[2]
+    _create_arrays(context, source, bins)
+    bands = _bands(context, source, bins)
+    task = functools.partial(
+        _do_band,
+        store=context.store.path,
+        source=source,
+        bins=bins,
+        settings=settings,
+        threads=max(1, context.executor.workers // len(bands)),
+    )
+    done = context.run_units(bands, task, unit_name="band")
+    if len(done) < context.n_keys:
+        return
+    outside = {each["rows"]: each["pixels_outside"] for each in done.values()}
+    if number := sum(outside.values()):
+        context.note(
+            f"{number} pixels have DN outside of their {bins} bins; they are counted as under or over"
+        )
+    if settings.summaries:
+        _write_frame_statistics(context, source.shape)
+
+
+def _decide_bins(context: StageContext, source: FrameSource) -> int:
+    """Return the number of bins of the sensor, from its first frames."""
+    limit = min(context.config.histogram.max_bins, 1 << (8 * source.dtype.itemsize))
+    settings = context.config.histogram
+    task = functools.partial(_ranges_of_band, source=source, frames=settings.window_frames, max_bins=limit)
+    outcomes: list[Outcome] = []
+    n_frames, _, columns = source.shape
+    row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
+    tiles = context.tiles()
+    most = (settings.band_memory << 20) // row
+    bands = plan_bands(tiles, {tile.key for tile in tiles}, most, context.executor.workers)
+    context.stop.check()
+    context.executor.map(task, bands, lambda band, outcome: outcomes.append(outcome))
+    for outcome in outcomes:
+        if outcome.error is not None:
+            raise outcome.error
+    return choose_bins(np.sum([outcome.value for outcome in outcomes], axis=0), limit)
+
+
+def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: int) -> NDArray[np.int64]:
+    n_frames, _, columns = source.shape
+    frames = min(frames, n_frames)
+    block = np.empty((frames, band.y1 - band.y0, columns), source.dtype)
+    source.read_into(block, 0, frames, band.y0, band.y1)
+    ranges = RangeAccumulator(block.shape[1:], source.dtype, frames)
+    ranges.add(block)
+    return ranges.finish(max_bins)
+
+
+def _create_arrays(context: StageContext, source: FrameSource, bins: int) -> None:
+    n_frames, ny, nx = source.shape
+    settings, tile = context.config.histogram, context.config.run.tile
+    context.create(
+        "histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
+    )
+    context.create_maps([f"histogram/{name}" for name in _MAPS])
+    if not settings.summaries:
+        context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
+        return
+    context.create_maps([f"summary/{name}" for name in _COVARIANCES])
+    starts = block_starts(n_frames, settings.block_frames)
+    rows = max(tile, ROW_GROUP)
+    for name in ("block_sum", "block_sum_square"):
+        context.create(f"summary/{name}", (starts.size, ny, nx), chunks=(CHUNK_BLOCKS, rows, nx))
+    for name in ("row_sum", "row_sum_square"):
+        context.create(f"summary/{name}", (n_frames, ny), chunks=(row_frames(ny), rows))
+    context.create(
+        "summary/column_sum",
+        (n_frames, -(-ny // ROW_GROUP), nx),
+        chunks=(COLUMN_FRAMES, rows // ROW_GROUP, nx),
+        rows=ROW_GROUP,
+    )
+    if context.fresh:
+        context.store.write_array("summary/block_start", starts, {"frames": n_frames})
+
+
+class _AlongTime:
+    """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
+
+    def __init__(self, store: Path, name: str, rows: slice) -> None:
+        self._store, self._name, self._rows = open_store(store), name, rows
+        self._length = self._store.array(name).chunks[0]
+        self._parts: list[NDArray[Any]] = []
+        self._held = self._written = 0
+
+    def add(self, part: NDArray[Any]) -> None:
+        """Take the next piece."""
+        while part.shape[0]:
+            piece = part[: self._length - self._held]
+            self._parts.append(piece)
+            self._held += piece.shape[0]
+            part = part[piece.shape[0] :]
+            if self._held == self._length:
+                self.flush()
+
+    def flush(self) -> None:
+        """Write what is held."""
+        if self._held:
+            data = np.concatenate(self._parts)
+            end = self._written + self._held
+            rest = (slice(None),) * (data.ndim - 2)
+            self._store.write(self._name, (slice(self._written, end), self._rows, *rest), data)
+            self._parts, self._held, self._written = [], 0, end
+
+
+def _do_band(
+    band: Band, *, store: Path, source: FrameSource, bins: int, settings: HistogramSettings, threads: int
+) -> dict[str, Any]:
+    """Count a band and write its chunks."""
+    n_frames, _, columns = source.shape
+    rows = slice(band.y0, band.y1)
+    groups = slice(band.y0 // ROW_GROUP, -(-band.y1 // ROW_GROUP))
+    series: dict[str, _AlongTime] = {}
+
+    def emit(name: str, part: NDArray[Any]) -> None:
+        if name not in series:
+            series[name] = _AlongTime(store, f"summary/{name}", groups if name == "column_sum" else rows)
+        series[name].add(part)
+
+    blocks = read_ahead(source, (band.y0, band.y1), settings.window_frames, threads)
+    histograms, covariances = histogram_tile(
+        blocks, (band.y1 - band.y0, columns), bins, n_frames, settings, emit
+    )
+    for each in series.values():
+        each.flush()
+    opened = open_store(store)
+    for name, values in vars(histograms).items():
+        opened.write(f"histogram/{name}", (rows, *(slice(None),) * (values.ndim - 1)), values)
+    if covariances is not None:
+        for name, values in vars(covariances).items():
+            opened.write(f"summary/{name}", (rows, slice(None)), values)
+    outside = np.count_nonzero(histograms.under | histograms.over)
+    return {"rows": band.key, "pixels_outside": int(outside)}
+
+
+def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
+    """Derive the statistics of whole frames from the row sums, when all bands are there."""
+    n_frames, ny, nx = shape
+    mean, variance = np.empty(n_frames), np.empty(n_frames)
+    step = row_frames(ny)
+    for t in range(0, n_frames, step):
+        part = slice(t, min(t + step, n_frames))
+        sums, squares = (
+            context.store.read(f"summary/{name}", (part, slice(None)))
+            for name in ("row_sum", "row_sum_square")
+        )
+        mean[part], variance[part] = frame_statistics(sums, squares, nx)
+    context.store.write_array("summary/frame_mean", mean)
+    context.store.write_array("summary/frame_variance", variance)
+
+
+# -- ready-made histograms ----------------------------------------------------------------------
+
+
+def _copy_histograms(context: StageContext) -> None:
+    """Take ready-made histograms as they are; order in time and neighbours are not known."""
+    from pchem_pipeline.frames.histograms import read_histograms
+
+    given = read_histograms(context.config.input, context.base_dir)
+    ny, nx, bins = given.counts.shape
+    tile = context.config.run.tile
+    context.create("histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=given.counts.dtype)
+    context.create_maps([f"histogram/{name}" for name in _MAPS])
+    context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
+    task = functools.partial(_copy_tile, store=context.store.path, given=given)
+    context.run_units(context.tiles(), task)
+
+
+def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> dict[str, Any]:
+    counts, origin = given.counts[tile.region], given.origin[tile.region]
+    occupied = counts > 0
+    last = counts.shape[2] - 1
+    values = RowHistograms(
+        counts=counts,
+        origin=origin,
+        under=np.zeros(origin.shape, np.uint32),
+        over=np.zeros(origin.shape, np.uint32),
+        minimum=(origin + occupied.argmax(axis=2)).astype(np.int32),
+        maximum=(origin + last - occupied[:, :, ::-1].argmax(axis=2)).astype(np.int32),
+    )
+    for name, part in vars(values).items():
+        open_store(store).write(f"histogram/{name}", tile.region, part)
+    return {}

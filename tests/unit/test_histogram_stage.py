@@ -1,0 +1,245 @@
+"""The histogram stage on a store: exact arrays, whatever the tiles, the memory and the workers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.errors import InputError, StoreError
+from pchem_pipeline.model.histogram import histogram_frames
+from pchem_pipeline.model.summaries import SummaryAccumulator
+from pchem_pipeline.stages import histogram
+from pchem_pipeline.stages.base import Options, StageContext, open_store
+from pchem_pipeline.stages.interrupt import StopRequest
+from pchem_pipeline.stages.pipeline import execute
+from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.store.records import StageRecord
+from pchem_pipeline.store.run_store import RunStore
+
+FRAMES, NY, NX = 300, 150, 40
+
+
+@pytest.fixture(scope="module")
+def frames() -> NDArray[np.uint16]:
+    rng = np.random.default_rng(30)
+    bias = rng.normal(100, 6, (NY, NX))
+    shape = (FRAMES, NY, NX)
+    dn = np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(np.uint16)
+    dn[250, 3, 4] = 60000  # glitches
+    dn[100, 140, 39] = 4000
+    return dn
+
+
+def ingest(store: RunStore, info: SensorInfo, frames: NDArray[np.uint16] | None) -> None:
+    """What the ingest stage leaves behind."""
+    info.write(store)
+    if frames is not None:
+        store.create_array("frames/dn", frames.shape, chunks=(64, 128, 128), dtype=frames.dtype)
+        store.write("frames/dn", (slice(None),) * 3, frames)
+    store.records.write(StageRecord("ingest", 1, "abc", {}, keys=1))
+    store.records.mark("ingest", "abc", "all", {})
+
+
+def make_context(
+    folder: Path,
+    frames: NDArray[np.uint16],
+    *,
+    mode: str = "reference",
+    executor: Executor | None = None,
+    options: Options | None = None,
+    tile: int = 64,
+    **settings: object,
+) -> StageContext:
+    folder.mkdir(exist_ok=True)
+    source = folder / "frames.npy"
+    if not source.exists():
+        np.save(source, frames)
+    store = RunStore.create(folder / "run.zarr")
+    config = RunConfig.model_validate(
+        {
+            "run": {"tile": tile},
+            "input": {"files": ["frames.npy"], "mode": mode},
+            "histogram": {"block_frames": 128, "window_frames": 64, **settings},
+        }
+    )
+    if not store.records.read("ingest"):
+        info = SensorInfo("frames", *frames.shape, str(frames.dtype), None, None, mode, {})
+        ingest(store, info, frames if mode == "copy" else None)
+    return StageContext(
+        config,
+        folder,
+        store,
+        executor or SerialExecutor(),
+        Reporter("off", quiet=True),
+        StopRequest(),
+        options=options or Options(),
+    )
+
+
+def contents(store: RunStore) -> dict[str, NDArray]:
+    names = [
+        *(f"histogram/{name}" for name in ("counts", *histogram._MAPS)),
+        *(f"summary/{name}" for name in histogram._COVARIANCES),
+        *(f"summary/{name}" for name in ("block_start", "block_sum", "block_sum_square", "column_sum")),
+        *(f"summary/{name}" for name in ("row_sum", "row_sum_square", "frame_mean", "frame_variance")),
+    ]
+    return {name: store.read(name) for name in names}
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory, frames: NDArray[np.uint16]) -> dict[str, NDArray]:
+    context = make_context(tmp_path_factory.mktemp("expected"), frames)
+    assert execute("histogram", context).state == "complete"
+    return contents(context.store)
+
+
+def assert_equal(found: dict[str, NDArray], expected: dict[str, NDArray]) -> None:
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_arrays_are_right(frames, expected):
+    direct = histogram_frames(frames, bins=expected["histogram/counts"].shape[2], window_frames=64)
+    for name, values in vars(direct).items():
+        np.testing.assert_array_equal(expected[f"histogram/{name}"], values, err_msg=name)
+    assert direct.over.sum() == 2
+    exact = frames.astype(np.int64)
+    starts = [0, 128, 256]
+    np.testing.assert_array_equal(expected["summary/block_start"], starts)
+    np.testing.assert_array_equal(expected["summary/block_sum"], np.add.reduceat(exact, starts))
+    np.testing.assert_array_equal(expected["summary/block_sum_square"], np.add.reduceat(exact**2, starts))
+    np.testing.assert_array_equal(expected["summary/row_sum"], exact.sum(axis=2))
+    np.testing.assert_array_equal(expected["summary/row_sum_square"], (exact**2).sum(axis=2))
+    groups = np.add.reduceat(exact, [0, 64, 128], axis=1)
+    np.testing.assert_array_equal(expected["summary/column_sum"], groups)
+    np.testing.assert_allclose(expected["summary/frame_mean"], exact.mean(axis=(1, 2)), rtol=1e-14)
+    np.testing.assert_allclose(expected["summary/frame_variance"], exact.var(axis=(1, 2)), rtol=1e-11)
+    summaries = SummaryAccumulator((NY, NX), 128)
+    summaries.add(frames)
+    for name, values in vars(summaries.finish()[1]).items():
+        np.testing.assert_array_equal(expected[f"summary/{name}"], values, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("mode", "tile", "memory"), [("copy", 64, 384), ("copy", 256, 16), ("reference", 8, 16), ("copy", 32, 16)]
+)
+def test_result_depends_on_neither_tile_nor_memory_nor_mode(tmp_path, frames, expected, mode, tile, memory):
+    context = make_context(tmp_path, frames, mode=mode, tile=tile, band_memory=memory)
+    assert execute("histogram", context).state == "complete"
+    assert_equal(contents(context.store), expected)
+
+
+def test_result_does_not_depend_on_threads(tmp_path, frames, expected):
+    executor = make_executor(ComputeSettings(backend="threads", workers=3))
+    context = make_context(tmp_path, frames, executor=executor)
+    assert execute("histogram", context).state == "complete"
+    assert_equal(contents(context.store), expected)
+
+
+def test_tiles_then_the_rest(tmp_path, frames, expected):
+    part = make_context(tmp_path, frames, options=Options(tiles="1.0"))
+    state = execute("histogram", part)
+    assert (state.state, state.done, state.total) == ("partial", 1, 3)
+    assert not part.store.has("summary/frame_mean")
+    np.testing.assert_array_equal(
+        part.store.read("histogram/counts")[64:128], expected["histogram/counts"][64:128]
+    )
+    rest = make_context(tmp_path, frames)
+    assert execute("histogram", rest).state == "complete"
+    assert_equal(contents(rest.store), expected)
+
+
+def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected, monkeypatch):
+    context = make_context(tmp_path, frames, band_memory=16)
+    real = histogram.read_ahead
+
+    def breaks(source, rows, step, threads=1):
+        if rows[0] == 64:
+            raise InputError("frames.npy vanished")
+        return real(source, rows, step, threads)
+
+    monkeypatch.setattr(histogram, "read_ahead", breaks)
+    monkeypatch.setattr(histogram, "plan_bands", lambda *a: [*_single_bands(context)])
+    state = execute("histogram", context)
+    assert state.state == "failed"
+    assert "vanished" in state.why
+    monkeypatch.undo()
+    again = make_context(tmp_path, frames)
+    assert execute("histogram", again).state == "complete"
+    assert_equal(contents(again.store), expected)
+    assert any("2 pixels have DN outside" in note for note in again.notes)
+
+
+def _single_bands(context: StageContext) -> list[histogram.Band]:
+    from pchem_pipeline.stages.bands import plan_bands
+
+    return plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
+
+
+def test_band_memory_does_not_make_it_stale(tmp_path, frames):
+    assert execute("histogram", make_context(tmp_path, frames)).state == "complete"
+    again = make_context(tmp_path, frames, band_memory=99)
+    before = again.store.records.read("histogram")
+    execute("histogram", again)
+    assert again.store.records.read("histogram") == before
+
+
+def test_without_summaries(tmp_path, frames, expected):
+    context = make_context(tmp_path, frames, summaries=False)
+    assert execute("histogram", context).state == "complete"
+    np.testing.assert_array_equal(context.store.read("histogram/counts"), expected["histogram/counts"])
+    assert not context.store.has("summary/row_sum")
+    assert "summaries" in context.store.attributes("summary")["missing"]
+
+
+def test_too_little_memory_is_said(tmp_path, frames):
+    wide = np.zeros((70, 3, 12000), np.uint8)
+    context = make_context(tmp_path, wide, band_memory=16, window_frames=70)
+    assert execute("histogram", context).state == "complete"
+    assert any("more than histogram.band_memory" in note for note in context.notes)
+
+
+def test_changed_camera_files_are_refused(tmp_path, frames):
+    context = make_context(tmp_path, frames)
+    np.save(tmp_path / "frames.npy", frames[:200])
+    with pytest.raises(InputError, match="changed since they were ingested"):
+        execute("histogram", context)
+
+
+def test_incomplete_input_is_refused(tmp_path, frames):
+    context = make_context(tmp_path, frames)
+    context.store.records.write(StageRecord("ingest", 1, "abc", {}, keys=2))
+    with pytest.raises(StoreError, match="not complete"):
+        execute("histogram", context)
+
+
+def test_ready_made_histograms_are_copied(tmp_path):
+    (tmp_path / "a.csv").write_text("DN,count\n10,5\n11,0\n12,7\n")
+    (tmp_path / "b.csv").write_text("DN,count\n-3,1\n5,70000\n")
+    store = RunStore.create(tmp_path / "run.zarr")
+    config = RunConfig.model_validate({"input": {"files": ["a.csv", "b.csv"], "format": "histogram"}})
+    ingest(store, SensorInfo("histograms", 70001, 1, 2, "uint32", None, None, "copy", {}), None)
+    context = StageContext(
+        config, tmp_path, store, SerialExecutor(), Reporter("off", quiet=True), StopRequest()
+    )
+    assert execute("histogram", context).state == "complete"
+    counts = store.read("histogram/counts")
+    assert counts.dtype == np.uint32
+    np.testing.assert_array_equal(counts.sum(axis=2), [[12, 70001]])
+    np.testing.assert_array_equal(store.read("histogram/origin"), [[10, -3]])
+    np.testing.assert_array_equal(store.read("histogram/minimum"), [[10, -3]])
+    np.testing.assert_array_equal(store.read("histogram/maximum"), [[12, 5]])
+    assert "order in time" in store.attributes("summary")["missing"]
+
+
+@pytest.fixture(autouse=True)
+def _forget_stores():
+    yield
+    open_store.cache_clear()
