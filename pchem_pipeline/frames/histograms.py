@@ -68,7 +68,7 @@ class _Channel:
 
 
 def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
-    """Tell whether the input is ready-made histograms: ``input.format`` says so, or auto and CSV or npz files.
+    """Tell whether the input is ready-made histograms: by ``input.format``, or CSV and npz with auto.
 
     Raises:
         InputError: a path is missing, or frames and histograms are mixed.

@@ -42,15 +42,15 @@ class _Segments:
         offsets: byte offset of each segment, (pages of the file, segments); 0 where there is none.
         counts: bytes of each segment, likewise.
         model: for each page, the number of a page that is coded alike.
-        per_row: segments side by side in a row of segments.
-        height: rows of a segment.
+        per_row: for each page, segments side by side.
+        height: for each page, rows of a segment.
     """
 
     offsets: NDArray[np.int64]
     counts: NDArray[np.int64]
     model: NDArray[np.int64]
-    per_row: int
-    height: int
+    per_row: NDArray[np.int64]
+    height: NDArray[np.int64]
 
 
 class TiffReader(ContiguousReader):
@@ -132,7 +132,8 @@ class TiffReader(ContiguousReader):
             )
         first = pages[0]
         rows, columns = first.shape
-        height, width = first.chunks[:2]
+        height = np.array([page.chunks[0] for page in pages], np.int64)
+        width = np.array([page.chunks[1] for page in pages], np.int64)
         self.paths = (path,)
         self.shape = (len(pages), rows, columns)
         self.dtype = unsigned_type(np.dtype(first.dtype))
@@ -159,8 +160,9 @@ class TiffReader(ContiguousReader):
         table = self._segments
         assert table is not None
         page = self._page(int(table.model[t]))
-        for row in range(y0 // table.height, (y1 - 1) // table.height + 1):
-            for number in range(row * table.per_row, (row + 1) * table.per_row):
+        per_row, rows = int(table.per_row[t]), int(table.height[t])
+        for row in range(y0 // rows, (y1 - 1) // rows + 1):
+            for number in range(row * per_row, (row + 1) * per_row):
                 count = int(table.counts[t, number])
                 data = file.read_bytes(int(table.offsets[t, number]), count) if count else None
                 try:

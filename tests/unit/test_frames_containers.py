@@ -1,0 +1,186 @@
+"""HDF5, NeXus, zarr and OME-Zarr, written by their libraries, read back exactly."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+import zarr
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+from pchem_pipeline.frames.hdf5 import Hdf5Reader
+from pchem_pipeline.frames.omezarr import ZarrReader
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+
+STACK = np.random.default_rng(13).integers(0, 65536, (7, 19, 22)).astype(np.uint16)
+WINDOWS = [(0, 1, 0, 19), (1, 6, 5, 6), (6, 7, 18, 19), (2, 7, 3, 11), (0, 7, 0, 19)]
+
+FILTERS: dict[str, dict[str, Any]] = {
+    "contiguous": {},
+    "chunked": {"chunks": (2, 8, 8)},
+    "gzip_shuffle": {"chunks": (1, 19, 22), "compression": "gzip", "shuffle": True},
+    "bitshuffle": {"chunks": (3, 10, 22), **hdf5plugin.Bitshuffle()},
+    "blosc2": {"chunks": (3, 10, 22), **hdf5plugin.Blosc2(cname="zstd")},
+    "zstd": {"chunks": (3, 10, 22), **hdf5plugin.Zstd()},
+}
+
+
+def read(path: Path, **settings: Any) -> NDArray[Any]:
+    with open_frames(InputSettings(files=(str(path),), **settings), path.parent) as reader:
+        return reader.read()
+
+
+def check_windows(path: Path, stack: NDArray[Any], **settings: Any) -> None:
+    reader = open_frames(InputSettings(files=(str(path),), **settings), path.parent)
+    assert reader.shape == stack.shape
+    assert reader.dtype == stack.dtype.newbyteorder("=")
+    again = pickle.loads(pickle.dumps(reader))
+    for t0, t1, y0, y1 in WINDOWS:
+        np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+        np.testing.assert_array_equal(again.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+
+
+@pytest.mark.parametrize("filters", FILTERS)
+def test_hdf5_filters(tmp_path: Path, filters: str) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("frames", data=STACK, **FILTERS[filters])
+    check_windows(path, STACK)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "<u2", ">u2", "<u4", ">u4"])
+def test_hdf5_types(tmp_path: Path, dtype: str) -> None:
+    path = tmp_path / "a.hdf5"
+    stack = np.random.default_rng(2).integers(0, 256 ** np.dtype(dtype).itemsize, STACK.shape).astype(dtype)
+    with h5py.File(path, "w") as file:
+        file["frames"] = stack
+    check_windows(path, stack)
+
+
+def test_nexus(tmp_path: Path) -> None:
+    path = tmp_path / "scan.nxs"
+    with h5py.File(path, "w") as file:
+        data = file.create_group("entry/instrument/detector")
+        data["data"] = STACK
+        data["count_time"] = 4870.0
+        data["count_time"].attrs["units"] = "ms"
+        data["bit_depth_readout"] = 16
+        file["entry/instrument/detector/mask"] = np.zeros(STACK.shape[1:], np.uint8)
+        file["entry/title"] = "dark frames"
+    check_windows(path, STACK)
+    reader = Hdf5Reader.open(path, InputSettings())
+    assert reader.integration_time == pytest.approx(4.87)
+    assert reader.bit_depth == 16
+
+
+def test_hdf5_single_frames(tmp_path: Path) -> None:
+    for i, frame in enumerate(STACK):
+        with h5py.File(tmp_path / f"f{i + 7}.h5", "w") as file:
+            file["image"] = frame
+    np.testing.assert_array_equal(read(tmp_path), STACK)
+
+
+def test_hdf5_candidates_are_listed(tmp_path: Path) -> None:
+    path = tmp_path / "two.h5"
+    with h5py.File(path, "w") as file:
+        file["dark/frames"] = STACK
+        file["light/frames"] = STACK + 1
+    with pytest.raises(
+        InputError, match=r"several datasets: dark/frames \(7, 19, 22\), light/frames .*input.dataset"
+    ):
+        read(path)
+    check_windows(path, STACK, dataset="/dark/frames")
+    with pytest.raises(InputError, match=r"no dataset 'flat'; there are: dark/frames"):
+        read(path, dataset="flat")
+    with h5py.File(path, "w") as file:
+        file["temperature"] = np.arange(4)
+    with pytest.raises(InputError, match="holds no dataset of frames"):
+        read(path)
+
+
+@pytest.mark.parametrize("kept", [0.05, 0.5, 0.95])
+def test_hdf5_truncated(tmp_path: Path, kept: float) -> None:
+    path = tmp_path / "cut.h5"
+    with h5py.File(path, "w") as file:
+        file["frames"] = STACK
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(InputError, match=r"cut\.h5: not a sound HDF5 file, or truncated"):
+        read(path)
+
+
+def test_hdf5_bad_types(tmp_path: Path) -> None:
+    path = tmp_path / "t.h5"
+    for data, words in [(STACK.astype(float), "floating-point"), (STACK.astype(np.int32), "signed samples")]:
+        with h5py.File(path, "w") as file:
+            file["frames"] = data
+        with pytest.raises(InputError, match=words):
+            read(path)
+    np.testing.assert_array_equal(read(path, dtype="uint32"), STACK)
+    with h5py.File(path, "w") as file:
+        file["frames"] = -STACK.astype(np.int32)
+    with pytest.raises(InputError, match="negative values"):
+        read(path, dtype="uint32")
+    with h5py.File(path, "w") as file:
+        file["frames"] = np.zeros((2, 5, 6, 3), np.uint8)
+    with pytest.raises(InputError, match="axes before rows and columns"):
+        read(path)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("grouped", [False, True])
+def test_zarr_array(tmp_path: Path, version: int, grouped: bool) -> None:
+    path = tmp_path / "a.zarr"
+    if grouped:
+        group = zarr.open_group(path, mode="w", zarr_format=version)
+        group.create_array("cam/frames", data=STACK, chunks=(2, 8, 8))
+        group.create_array("cam/time", data=np.arange(7.0))
+    else:
+        zarr.create_array(path, data=STACK, chunks=(3, 19, 5), zarr_format=version)
+    check_windows(path, STACK)
+
+
+def test_zarr_facts_and_suffixless_name(tmp_path: Path) -> None:
+    path = tmp_path / "capture"
+    zarr.create_array(path, data=STACK, attributes={"integration_time": 0.5, "bit_depth": 16})
+    reader = ZarrReader.open(path, InputSettings())
+    assert reader.integration_time == 0.5
+    assert reader.bit_depth == 16
+    check_windows(path, STACK)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_ome_zarr(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "image.ome.zarr"
+    group = zarr.open_group(path, mode="w", zarr_format=version)
+    group.create_array("full", data=STACK[:, None, None], chunks=(1, 1, 1, 19, 22))
+    group.create_array("half", data=STACK[:, None, None, ::2, ::2], chunks=(1, 1, 1, 10, 11))
+    scales = [{"datasets": [{"path": "full"}, {"path": "half"}]}]
+    group.attrs.update(
+        {"multiscales": scales} if version == 2 else {"ome": {"version": "0.5", "multiscales": scales}}
+    )
+    check_windows(path, STACK)
+    group.attrs.update({"multiscales": scales, "ome": {"multiscales": [{"datasets": [{"path": "two"}]}]}})
+    group.create_array("two", data=np.zeros((4, 2, 1, 8, 9), np.uint16))
+    with pytest.raises(InputError, match="2 axes before rows and columns"):
+        read(path)
+
+
+def test_zarr_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=STACK, chunks=(3, 19, 22))
+    reader = open_frames(InputSettings(files=("a.zarr",)), tmp_path)
+    chunk = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")[0]
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(InputError, match=r"a\.zarr: .*damaged chunk"):
+        reader.read()
+    (path / "zarr.json").write_text("{")
+    with pytest.raises(InputError, match="not a sound zarr store"):
+        read(path)

@@ -1,0 +1,264 @@
+"""TIFF in every layout, written by tifffile, read back exactly."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.tiff import TiffReader
+
+STACK = np.random.default_rng(11).integers(0, 4096, (6, 21, 34)).astype(np.uint16)
+
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "bigtiff": {"bigtiff": True},
+    "big_endian": {"byteorder": ">"},
+    "big_endian_bigtiff": {"byteorder": ">", "bigtiff": True},
+    "no_metadata": {"metadata": None},
+    "strips": {"rowsperstrip": 5},
+    "tiles": {"tile": (16, 16)},
+    "tiles_big_endian": {"tile": (16, 16), "byteorder": ">"},
+    "zlib": {"compression": "zlib"},
+    "zlib_strips_predictor": {"compression": "zlib", "predictor": True, "rowsperstrip": 4},
+    "zlib_tiles_predictor": {"compression": "zlib", "predictor": True, "tile": (16, 32)},
+    "zlib_big_endian": {"compression": "zlib", "byteorder": ">", "rowsperstrip": 4},
+    "lzw": {"compression": "lzw"},
+    "packbits": {"compression": "packbits"},
+    "imagej": {"imagej": True},
+    "imagej_time": {"imagej": True, "metadata": {"axes": "TYX"}},
+    "ome": {"ome": True, "metadata": {"axes": "TYX"}},
+    "ome_depth": {"ome": True, "metadata": {"axes": "ZYX"}},
+    "ome_bigtiff_zlib": {"ome": True, "bigtiff": True, "compression": "zlib", "metadata": {"axes": "TYX"}},
+    "one_directory": {"truncate": True},
+    "separate_planes": {"planarconfig": "separate", "photometric": "minisblack"},
+    "white_is_zero": {"photometric": "miniswhite"},
+}
+
+
+def read(path: Path, **settings: Any) -> NDArray[Any]:
+    with open_frames(InputSettings(files=(str(path),), **settings), path.parent) as reader:
+        return reader.read()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layout_is_read_exactly(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "stack.tif"
+    options = {"photometric": "minisblack"} | LAYOUTS[layout]
+    tifffile.imwrite(path, STACK, **options)
+    reader = open_frames(InputSettings(files=("stack.tif",)), tmp_path)
+    assert reader.shape == STACK.shape
+    assert reader.dtype == np.uint16
+    np.testing.assert_array_equal(reader.read(), STACK)
+    for t0, t1, y0, y1 in [
+        (0, 1, 0, 21),
+        (2, 5, 3, 4),
+        (1, 6, 15, 21),
+        (5, 6, 20, 21),
+        (0, 6, 4, 17),
+        (3, 3, 0, 2),
+    ]:
+        np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), STACK[t0:t1, y0:y1])
+    again = pickle.loads(pickle.dumps(reader))
+    np.testing.assert_array_equal(again.read(1, 4, 2, 19), STACK[1:4, 2:19])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_sample_types(tmp_path: Path, dtype: type, byteorder: str, compression: str | None) -> None:
+    top = np.iinfo(dtype).max
+    stack = np.random.default_rng(3).integers(0, top, (3, 5, 7), dtype=dtype, endpoint=True)
+    stack[0, 0, :2] = 0, top
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, stack, byteorder=byteorder, compression=compression, photometric="minisblack")
+    back = read(path)
+    assert back.dtype == dtype
+    np.testing.assert_array_equal(back, stack)
+
+
+def test_twelve_bits_packed(tmp_path: Path) -> None:
+    """Bits packed without gaps, as machine-vision recorders write them: two samples in three bytes."""
+    path = tmp_path / "packed.tif"
+    columns = 34
+    with tifffile.TiffWriter(path) as writer:
+        writer.write(STACK[0].astype(np.uint16), photometric="minisblack", metadata=None)
+    packed = bytearray()
+    for row in STACK[0]:
+        bits = "".join(f"{int(value):012b}" for value in row)
+        packed += int(bits, 2).to_bytes(len(bits) // 8, "big")
+    raw = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[0]
+        bits_at, counts_at = (page.tags[name].valueoffset for name in ("BitsPerSample", "StripByteCounts"))
+        start = page.dataoffsets[0]
+    raw[bits_at : bits_at + 2] = (12).to_bytes(2, "little")
+    raw[counts_at : counts_at + 4] = len(packed).to_bytes(4, "little")
+    raw[start : start + len(packed)] = packed
+    path.write_bytes(raw)
+    reader = TiffReader.open(path, InputSettings())
+    assert reader.bit_depth == 12
+    assert columns * 12 % 8 == 0
+    np.testing.assert_array_equal(reader.read(), STACK[:1])
+    np.testing.assert_array_equal(reader.read(0, 1, 5, 9), STACK[:1, 5:9])
+
+
+def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
+    """ImageJ writes stacks above 4 GB with a single directory and says the number of images in the description."""
+    path = tmp_path / "big_imagej.tif"
+    description = f"ImageJ=1.53t\nimages={len(STACK)}\nframes={len(STACK)}\nhyperstack=true\n"
+    tifffile.imwrite(
+        path, STACK[0], byteorder=">", description=description, metadata=None, photometric="minisblack"
+    )
+    with path.open("ab") as stream, tifffile.TiffFile(path) as file:
+        assert file.is_imagej
+        assert len(file.pages) == 1
+        assert path.stat().st_size == file.pages[0].dataoffsets[0] + STACK[0].nbytes
+        stream.write(STACK[1:].astype(">u2").tobytes())
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) -> None:
+    path = tmp_path / "series.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for block in (STACK[:2], STACK[2:3], STACK[3:]):
+            writer.write(block, photometric="minisblack")
+    with tifffile.TiffFile(path) as file:
+        assert file.series[0].shape != STACK.shape
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_pages_coded_differently(tmp_path: Path) -> None:
+    path = tmp_path / "mixed.tif"
+    codings: list[dict[str, Any]] = [
+        {"compression": "zlib", "rowsperstrip": 4},
+        {},
+        {"compression": "lzw"},
+        {"tile": (16, 16)},
+    ]
+    with tifffile.TiffWriter(path) as writer:
+        for i, frame in enumerate(STACK):
+            writer.write(frame, photometric="minisblack", metadata=None, **codings[i % len(codings)])
+    reader = open_frames(InputSettings(files=("mixed.tif",)), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    np.testing.assert_array_equal(reader.read(0, 6, 7, 18), STACK[:, 7:18])
+
+
+def test_previews_are_left_out_and_reported(tmp_path: Path) -> None:
+    path = tmp_path / "preview.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for frame in STACK:
+            writer.write(frame, photometric="minisblack", metadata=None)
+        writer.write(STACK[0, ::2, ::2], photometric="minisblack", metadata=None, subfiletype=1)
+    reader = open_frames(InputSettings(files=("preview.tif",)), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert "1 reduced page" in reader.report.message()
+
+
+def test_sequence_in_natural_order(tmp_path: Path) -> None:
+    for i, frame in enumerate(STACK):
+        tifffile.imwrite(tmp_path / f"frame{2 * i + 1}.tif", frame, photometric="minisblack")
+    np.testing.assert_array_equal(read(tmp_path), STACK)
+
+
+def test_facts_are_taken_from_the_file(tmp_path: Path) -> None:
+    exif = tmp_path / "exif.tif"
+    tifffile.imwrite(exif, STACK, photometric="minisblack", extratags=[(33434, "2I", 1, (487, 100), True)])
+    assert TiffReader.open(exif, InputSettings()).integration_time == pytest.approx(4.87)
+    ome = tmp_path / "a.ome.tif"
+    plane = {"ExposureTime": [4870.0] * 6, "ExposureTimeUnit": ["ms"] * 6}
+    tifffile.imwrite(ome, STACK, metadata={"axes": "TYX", "Plane": plane, "SignificantBits": 12})
+    reader = TiffReader.open(ome, InputSettings())
+    assert reader.integration_time == pytest.approx(4.87)
+    assert reader.bit_depth == 12
+    manager = tmp_path / "mm.tif"
+    record = json.dumps({"Exposure-ms": 12.5}).encode()
+    tifffile.imwrite(
+        manager, STACK, photometric="minisblack", extratags=[(51123, "s", len(record) + 1, record, True)]
+    )
+    assert TiffReader.open(manager, InputSettings()).integration_time == pytest.approx(0.0125)
+    plain = tmp_path / "plain.tif"
+    tifffile.imwrite(plain, STACK, photometric="minisblack")
+    assert TiffReader.open(plain, InputSettings()).integration_time is None
+    assert TiffReader.open(plain, InputSettings()).bit_depth is None
+
+
+def test_colour_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rgb.tif"
+    rgb = np.zeros((2, 8, 9, 3), np.uint8)
+    tifffile.imwrite(path, rgb, photometric="rgb")
+    with pytest.raises(
+        InputError, match=r"rgb\.tif: colour or multi-channel images \(RGB, 3 samples a pixel\)"
+    ):
+        read(path)
+    tifffile.imwrite(path, np.moveaxis(rgb, -1, 1), photometric="rgb", planarconfig="separate")
+    with pytest.raises(InputError, match="colour"):
+        read(path)
+    tifffile.imwrite(path, rgb[..., 0], photometric="palette", colormap=np.zeros((3, 256), np.uint16))
+    with pytest.raises(InputError, match="PALETTE"):
+        read(path)
+
+
+@pytest.mark.parametrize("kind", ["plain", "strips", "zlib", "big_endian_bigtiff", "no_metadata", "tiles"])
+@pytest.mark.parametrize("kept", [0.15, 0.5, 0.9, 0.99])
+def test_truncated(tmp_path: Path, kind: str, kept: float) -> None:
+    path = tmp_path / "cut.tif"
+    with tifffile.TiffWriter(
+        path, **{k: v for k, v in LAYOUTS[kind].items() if k in ("bigtiff", "byteorder")}
+    ) as writer:
+        options = {k: v for k, v in LAYOUTS[kind].items() if k not in ("bigtiff", "byteorder", "metadata")}
+        for frame in STACK:
+            writer.write(frame, photometric="minisblack", metadata=None, **options)
+    data = path.read_bytes()
+    np.testing.assert_array_equal(read(path), STACK)
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(InputError, match=r"cut\.tif: .*truncated"):
+        read(path)
+
+
+def test_pages_of_another_shape_or_type(tmp_path: Path) -> None:
+    path = tmp_path / "odd.tif"
+    for odd in (STACK[0, :5], STACK[0].astype(np.uint8)):
+        with tifffile.TiffWriter(path) as writer:
+            for frame in (STACK[0], STACK[1], odd):
+                writer.write(frame, photometric="minisblack", metadata=None)
+        with pytest.raises(InputError, match=r"odd\.tif: page 2 is .* page 0 is 21 x 34 uint16"):
+            read(path)
+
+
+def test_signed_and_float(tmp_path: Path) -> None:
+    path = tmp_path / "s.tif"
+    for compression in (None, "zlib"):
+        tifffile.imwrite(path, STACK.astype(np.int16), photometric="minisblack", compression=compression)
+        with pytest.raises(InputError, match=r"signed samples \(int16\).*input.dtype: uint16"):
+            read(path)
+        np.testing.assert_array_equal(read(path, dtype="uint16"), STACK)
+        negative = STACK.astype(np.int16)
+        negative[3, 4, 5] = -1
+        tifffile.imwrite(path, negative, photometric="minisblack", compression=compression)
+        with pytest.raises(InputError, match="negative values"):
+            read(path, dtype="uint16")
+    tifffile.imwrite(path, STACK.astype(np.float32), photometric="minisblack")
+    with pytest.raises(InputError, match="floating-point samples"):
+        read(path)
+
+
+def test_damaged_strip_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "broken.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
+    with tifffile.TiffFile(path) as file:
+        start = file.pages[2].dataoffsets[0]
+    data = bytearray(path.read_bytes())
+    data[start : start + 40] = bytes(40)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"broken\.tif: page 2 cannot be decoded"):
+        read(path)
