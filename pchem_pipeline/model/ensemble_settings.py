@@ -44,17 +44,16 @@ class EnsembleSettings(Section):
     )
     first_frame: int = Field(default=0, ge=0, description="first of the frames in the ensemble histogram")
     parameter_bins: int = Field(
-        default=48,
+        default=64,
         ge=2,
-        le=1000,
+        le=200,
         description="bins of each parameter in the 4-D, 2-D and 1-D histograms of the parameter maps",
     )
-    parameter_coverage: float = Field(
-        default=0.998,
-        gt=0,
-        le=1,
-        description="the equal-width bins span this central part of each map, one more bin at each end holds "
-        "the rest; 1 spans minimum to maximum, which a single hot pixel can stretch",
+    parameter_range: Literal["central", "full"] = Field(
+        default="central",
+        description="what the equal-width bins span: the 1st to 99th percentile of each map and half of that "
+        "beyond on either side, with one more bin at each end for the rest; or minimum to maximum, "
+        "which a single hot pixel can stretch",
     )
     cell_representative: Literal["mean", "centre"] = Field(
         default="mean",
@@ -70,7 +69,7 @@ class EnsembleSettings(Section):
         default=1, ge=1, le=100, description="DN per bin of the NUCed histogram when nuced_bin_width is null"
     )
     rmse_coverage: float = Field(
-        default=0.9999,
+        default=0.999,
         gt=0,
         le=1,
         description="RMSE and its noise floor are taken over the DN that hold this central part of the data",

@@ -1,0 +1,290 @@
+"""Compiled loops of the ensemble: sums of PCDs over pixels and tallies of the data.
+
+A component is a Gaussian of weight ``P(K = k)``; it is added only where it counts, within ``REACH`` standard
+deviations, outside of which it is below 2e-16 of its peak.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = [
+    "add_density",
+    "add_mass",
+    "poisson_weights",
+    "sum_nuced_cells",
+    "sum_nuced_product",
+    "sum_pcd_cells",
+    "sum_pcd_pixels",
+    "sum_poisson",
+    "tally_counts",
+]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+REACH = 8.5
+#: Poisson weights below this part of the largest are left out.
+SMALLEST = 1e-18
+#: Below this read noise (DN) the density at the centre of a DN cell is no longer its mass.
+NARROW = 1.0
+
+
+@njit(nogil=True, cache=True)
+def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
+    """Fill ``weights[k] = P(K = k)`` for the k that matter and return the first and the last of them.
+
+    Entries outside are left as they were; a last k beyond the array is cut to its end.
+    """
+    top = weights.size - 1
+    mode = min(int(mean), top)
+    log_peak = -mean if mode == 0 else mode * math.log(mean) - mean - math.lgamma(mode + 1.0)
+    peak = math.exp(log_peak)
+    if peak == 0.0:  # the mean lies far beyond the array
+        weights[top] = 0.0
+        return top, top
+    weights[mode] = peak
+    low = mode
+    while low > 0 and weights[low] > SMALLEST * peak:
+        weights[low - 1] = weights[low] * low / mean
+        low -= 1
+    high = mode
+    while high < top and weights[high] > SMALLEST * peak:
+        weights[high + 1] = weights[high] * mean / (high + 1.0)
+        high += 1
+    return low, high
+
+
+@njit(nogil=True, cache=True)
+def add_density(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
+    """Add ``weight * phi(base + i; centre, sigma^2)`` to ``out[i]``, by two multiplications a point."""
+    first = max(0, math.ceil(centre - REACH * sigma - base))
+    last = min(out.size - 1, math.floor(centre + REACH * sigma - base))
+    if first > last:
+        return
+    nearest = min(max(math.floor(centre - base + 0.5), first), last)
+    precision = 1.0 / (sigma * sigma)
+    distance = base + nearest - centre
+    peak = weight * 0.3989422804014327 / sigma * math.exp(-0.5 * distance * distance * precision)
+    out[nearest] += peak
+    shrink = math.exp(-precision)
+    value, ratio = peak, math.exp(-(distance + 0.5) * precision)
+    for i in range(nearest + 1, last + 1):
+        value *= ratio
+        ratio *= shrink
+        out[i] += value
+    value, ratio = peak, math.exp((distance - 0.5) * precision)
+    for i in range(nearest - 1, first - 1, -1):
+        value *= ratio
+        ratio *= shrink
+        out[i] += value
+
+
+@njit(nogil=True, cache=True)
+def add_mass(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
+    """Add ``weight`` times the mass of N(centre, sigma^2) between ``base + i -+ 1/2`` to ``out[i]``."""
+    first = max(0, math.floor(centre - REACH * sigma - base + 0.5))
+    last = min(out.size - 1, math.floor(centre + REACH * sigma - base + 0.5))
+    scale = 1.0 / (sigma * math.sqrt(2.0))
+    below = math.erf((base + first - 0.5 - centre) * scale)
+    for i in range(first, last + 1):
+        above = math.erf((base + i + 0.5 - centre) * scale)
+        out[i] += 0.5 * weight * (above - below)
+        below = above
+
+
+@njit(nogil=True, cache=True)
+def add_component(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
+    """Add a component of the PCD at the integers ``base + i``: its density, or its mass if narrow."""
+    if sigma >= NARROW:
+        add_density(out, base, weight, centre, sigma)
+    else:  # sigma holds the 1/12 DN^2 of rounding, which the integration over the cell puts back
+        add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - 1.0 / 12.0, 1e-12)))
+
+
+@njit(nogil=True, cache=True)
+def _capacity(exposure: FloatArray) -> int:
+    largest = 0.0
+    for p in range(exposure.size):
+        largest = max(largest, exposure[p])
+    return int(largest + 12.0 * math.sqrt(largest) + 40.0)
+
+
+@njit(nogil=True, cache=True)
+def sum_pcd_pixels(
+    exposure: FloatArray,
+    gain: FloatArray,
+    bias: FloatArray,
+    sigma: FloatArray,
+    dn_start: int,
+    total: FloatArray,
+    total_square: FloatArray,
+    width: float,
+    nuced_start: int,
+    nuced: FloatArray,
+    nuced_square: FloatArray,
+) -> None:
+    """Add every pixel's PCD, and its square, at the integers; and the same PCD sorted into NUCed bins.
+
+    The NUCed value of DN ``x`` is ``(x - mu) g``, so each DN falls into one bin as a whole, exactly as the
+    data do. ``width <= 0`` leaves the NUCed sums out.
+    """
+    weights = np.zeros(_capacity(exposure))
+    row = np.zeros(total.size)
+    for p in range(exposure.size):
+        low, high = poisson_weights(exposure[p], weights)
+        step = 1.0 / gain[p]
+        reach = (REACH + 1.0) * sigma[p] + 1.0
+        first = max(0, math.floor(bias[p] + low * step - reach) - dn_start)
+        last = min(total.size - 1, math.ceil(bias[p] + high * step + reach) - dn_start)
+        if first > last:
+            continue
+        part = row[first : last + 1]
+        part[:] = 0.0
+        base = float(dn_start + first)
+        for k in range(low, high + 1):
+            add_component(part, base, weights[k], bias[p] + k * step, sigma[p])
+        for i in range(part.size):
+            total[first + i] += part[i]
+            total_square[first + i] += part[i] * part[i]
+        if width > 0.0:
+            _add_nuced(part, base, gain[p], bias[p], width, nuced_start, nuced, nuced_square)
+
+
+@njit(nogil=True, cache=True)
+def _add_nuced(
+    part: FloatArray,
+    base: float,
+    gain: float,
+    bias: float,
+    width: float,
+    nuced_start: int,
+    nuced: FloatArray,
+    nuced_square: FloatArray,
+) -> None:
+    """Add one pixel's masses to the NUCed bins; bins fill in increasing order, so one at a time is open."""
+    bin_open = 0
+    held = 0.0
+    for i in range(part.size):
+        b = math.floor((base + i - bias) * gain / width + 0.5) - nuced_start
+        if b != bin_open:
+            if 0 <= bin_open < nuced.size:
+                nuced[bin_open] += held
+                nuced_square[bin_open] += held * held
+            bin_open, held = b, 0.0
+        held += part[i]
+    if 0 <= bin_open < nuced.size:
+        nuced[bin_open] += held
+        nuced_square[bin_open] += held * held
+
+
+@njit(nogil=True, cache=True)
+def sum_pcd_cells(
+    share: FloatArray,
+    exposure: FloatArray,
+    gain: FloatArray,
+    bias: FloatArray,
+    sigma: FloatArray,
+    dn_start: int,
+    out: FloatArray,
+) -> None:
+    """Add ``share`` times the PCD of each cell of a 4-D histogram at the integers."""
+    weights = np.zeros(_capacity(exposure))
+    for c in range(exposure.size):
+        low, high = poisson_weights(exposure[c], weights)
+        for k in range(low, high + 1):
+            add_component(out, float(dn_start), share[c] * weights[k], bias[c] + k / gain[c], sigma[c])
+
+
+@njit(nogil=True, cache=True)
+def sum_nuced_cells(
+    share: FloatArray,
+    exposure: FloatArray,
+    sigma_e: FloatArray,
+    width: float,
+    nuced_start: int,
+    out: FloatArray,
+) -> None:
+    """Add the mass of ``share`` PCD(H, 1, 0, sigma_e^2) in each bin of the NUCed axis."""
+    weights = np.zeros(_capacity(exposure))
+    for c in range(exposure.size):
+        low, high = poisson_weights(exposure[c], weights)
+        for k in range(low, high + 1):
+            add_mass(out, float(nuced_start), share[c] * weights[k], k / width, sigma_e[c] / width)
+
+
+@njit(nogil=True, cache=True)
+def sum_nuced_product(
+    electron_mass: FloatArray,
+    sigma_share: FloatArray,
+    sigma_e: FloatArray,
+    width: float,
+    nuced_start: int,
+    out: FloatArray,
+) -> None:
+    """Add the mass of the NUCed EPCD of independent H and sigma_e in each bin."""
+    base = float(nuced_start)
+    for m in range(sigma_e.size):
+        for k in range(electron_mass.size):
+            if electron_mass[k] > SMALLEST:
+                add_mass(out, base, sigma_share[m] * electron_mass[k], k / width, sigma_e[m] / width)
+
+
+@njit(nogil=True, cache=True)
+def sum_poisson(share: FloatArray, exposure: FloatArray, out: FloatArray) -> None:
+    """Add ``share`` times the Poisson mass of each exposure at k = 0, 1, ... up to the end of ``out``."""
+    weights = np.zeros(max(out.size, _capacity(exposure)))
+    for c in range(exposure.size):
+        low, high = poisson_weights(exposure[c], weights)
+        for k in range(low, min(high, out.size - 1) + 1):
+            out[k] += share[c] * weights[k]
+
+
+@njit(nogil=True, cache=True)
+def tally_counts(
+    counts: NDArray[Any],
+    origin: IntArray,
+    gain: FloatArray,
+    bias: FloatArray,
+    dn_start: int,
+    raw: IntArray,
+    width: float,
+    nuced_start: int,
+    nuced: IntArray,
+    nuced_sums: FloatArray,
+) -> tuple[np.int64, np.int64]:
+    """Sort per-pixel histograms onto the DN axis and onto the NUCed axis.
+
+    ``nuced_sums[p]`` receives the sums of the NUCed value and of its square over the pixel's samples, exact
+    before any binning.
+
+    Returns:
+        How many samples fell outside of the DN axis, and outside of the NUCed axis.
+    """
+    outside = np.int64(0)
+    nuced_outside = np.int64(0)
+    for p in range(counts.shape[0]):
+        for b in range(counts.shape[1]):
+            c = np.int64(counts[p, b])
+            if c == 0:
+                continue
+            dn = origin[p] + b
+            i = dn - dn_start
+            if 0 <= i < raw.size:
+                raw[i] += c
+            else:
+                outside += c
+            value = (dn - bias[p]) * gain[p]
+            nuced_sums[p, 0] += c * value
+            nuced_sums[p, 1] += c * value * value
+            j = math.floor(value / width + 0.5) - nuced_start
+            if 0 <= j < nuced.size:
+                nuced[j] += c
+            else:
+                nuced_outside += c
+    return outside, nuced_outside

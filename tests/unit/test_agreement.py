@@ -1,0 +1,54 @@
+"""Residuals, RMSE, the noise floor and chi-square."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.model.agreement import (
+    central_window,
+    chi_square,
+    counting_variance,
+    noise_floor,
+    normalised_residuals,
+    rmse,
+)
+
+
+def test_window_ignores_far_outliers() -> None:
+    counts = np.zeros(5000, dtype=np.int64)
+    counts[100:200] = 1000
+    counts[4999] = 20
+    assert central_window(counts, 0.999) == slice(100, 200)
+    assert central_window(counts, 1.0) == slice(100, 5000)
+    single = np.array([0, 7, 0])
+    assert central_window(single, 0.999) == slice(1, 2)
+
+
+def test_rmse_and_floor_use_the_window() -> None:
+    data, model = np.array([9.0, 1.0, 2.0]), np.array([0.0, 1.0, 4.0])
+    assert rmse(data, model, slice(1, 3)) == pytest.approx(np.sqrt(2.0))
+    assert noise_floor(np.array([100.0, 1.0, 3.0]), slice(1, 3)) == pytest.approx(np.sqrt(2.0))
+
+
+def test_counting_variance_of_two_pixels() -> None:
+    p = np.array([[0.2, 0.8], [0.5, 0.5]])
+    variance = counting_variance(p.sum(axis=0), (p**2).sum(axis=0), 2, 10, width=0.5)
+    expected = [10 * (0.2 * 0.8 + 0.25) / (10 * 2 * 0.5) ** 2] * 2
+    np.testing.assert_allclose(variance, expected)
+    # a pixel that always gives the same DN adds no noise
+    np.testing.assert_allclose(counting_variance(np.ones(1), np.ones(1), 1, 10), [0.0])
+
+
+def test_normalised_residuals() -> None:
+    found = normalised_residuals(np.array([1.0, 2.0]), np.array([0.0, 2.0]), np.array([0.25, 0.0]))
+    assert found[0] == pytest.approx(2.0)
+    assert np.isnan(found[1])
+
+
+def test_chi_square_leaves_out_bins_with_few_samples() -> None:
+    counts = np.array([110, 3, 90])
+    expected, squares = np.array([100.0, 2.0, 100.0]), np.array([20.0, 0.1, 0.0])
+    found = chi_square(counts, expected, squares)
+    assert found.dof == 2
+    assert found.value == pytest.approx(100 / 80 + 100 / 100)

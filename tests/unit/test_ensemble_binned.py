@@ -1,0 +1,181 @@
+"""The ensemble from histograms of the parameter maps, checked cell by cell."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import norm, poisson
+
+from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, epcd_exact
+from pchem_pipeline.model.ensemble_binned import (
+    HistogramChoice,
+    electron_pmf_binned,
+    epcd_dependent,
+    epcd_independent,
+    joint_cells,
+    nuced_dependent,
+    nuced_independent,
+)
+from pchem_pipeline.model.pixels import PixelParameters
+
+K = np.arange(150)
+
+
+def make_pixels(n: int, seed: int = 1) -> PixelParameters:
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal(n)
+    g = 0.1 * np.exp(0.05 * z)
+    s_e = 0.3 * np.exp(0.08 * z + 0.08 * rng.standard_normal(n))
+    return PixelParameters(
+        2.0 * np.exp(0.4 * rng.standard_normal(n)), g, 100.0 + 3.0 * rng.standard_normal(n), s_e / g
+    )
+
+
+def pcd(dn: np.ndarray, h: float, g: float, mu: float, variance: float) -> np.ndarray:
+    return np.asarray(poisson.pmf(K, h) @ norm.pdf(dn[None, :], mu + K[:, None] / g, np.sqrt(variance)))
+
+
+def test_cells_are_those_of_numpy() -> None:
+    pixels = make_pixels(400)
+    columns = (pixels.quanta_exposure, pixels.conversion_gain, pixels.bias)
+    cells = joint_cells(columns, HistogramChoice(5, "full", "centre"))
+    counts, edges = np.histogramdd(np.stack(columns, axis=1), bins=5)
+    occupied = np.argwhere(counts > 0)
+    expected = {
+        tuple(round(0.5 * (edges[d][i] + edges[d][i + 1]), 9) for d, i in enumerate(place)): counts[
+            tuple(place)
+        ]
+        for place in occupied
+    }
+    found = {
+        tuple(round(v, 9) for v in value): share * 400
+        for value, share in zip(cells.values.T, cells.share, strict=True)
+    }
+    assert found.keys() == expected.keys()
+    for key, count in expected.items():
+        assert found[key] == pytest.approx(count)
+
+
+def test_mean_representative_keeps_the_mean_of_the_map() -> None:
+    pixels = make_pixels(400)
+    hot = pixels.quanta_exposure.copy()
+    hot[:3] = 500.0
+    for span in ("central", "full"):
+        cells = joint_cells((hot, pixels.bias), HistogramChoice(6, span, "mean"))  # type: ignore[arg-type]
+        np.testing.assert_allclose(cells.values @ cells.share, [hot.mean(), pixels.bias.mean()], rtol=1e-12)
+        assert cells.share.sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_hot_pixels_do_not_widen_the_bins() -> None:
+    pixels = make_pixels(1000)
+    hot = pixels.quanta_exposure.copy()
+    hot[:3] = 5000.0
+    central = joint_cells((hot,), HistogramChoice(20, "central", "centre"))
+    full = joint_cells((hot,), HistogramChoice(20, "full", "centre"))
+    assert central.share.size > 12
+    assert full.share.size == 2
+    assert central.values.max() == pytest.approx(5000.0)  # beyond the bins: mean of the occupants
+
+
+def test_a_constant_map_is_one_cell() -> None:
+    cells = joint_cells((np.full(9, 2.5),), HistogramChoice(4, "central", "centre"))
+    np.testing.assert_allclose(cells.values, [[2.5]])
+    np.testing.assert_allclose(cells.share, [1.0])
+
+
+@pytest.mark.parametrize("representative", ["mean", "centre"])
+def test_dependent_is_the_sum_over_cells(representative: str) -> None:
+    pixels, dn = make_pixels(60), DnAxis(50, 250)
+    choice = HistogramChoice(3, "central", representative)  # type: ignore[arg-type]
+    h, g, mu, sigma = pixels.columns()
+    cells = joint_cells((h, g, mu, sigma**2), choice)
+    expected = sum(w * pcd(dn.dn, *v) for w, v in zip(cells.share, cells.values.T, strict=True))
+    np.testing.assert_allclose(epcd_dependent(pixels, dn, choice), expected, rtol=1e-10, atol=1e-15)
+
+
+@pytest.mark.parametrize("representative", ["mean", "centre"])
+def test_independent_is_the_sum_over_all_products(representative: str) -> None:
+    pixels, dn = make_pixels(60), DnAxis(50, 250)
+    choice = HistogramChoice(3, "central", representative)  # type: ignore[arg-type]
+    h, g, mu, sigma = pixels.columns()
+    marginals = [joint_cells((column,), choice) for column in (h, g, mu, sigma**2)]
+    expected = np.zeros(dn.size)
+    for places in itertools.product(*(range(m.share.size) for m in marginals)):
+        share = np.prod([m.share[i] for m, i in zip(marginals, places, strict=True)])
+        expected += share * pcd(dn.dn, *(m.values[0, i] for m, i in zip(marginals, places, strict=True)))
+    np.testing.assert_allclose(epcd_independent(pixels, dn, choice), expected, rtol=1e-9, atol=2e-15)
+
+
+def test_independent_integrates_narrow_noise_over_the_cell() -> None:
+    pixels = PixelParameters(np.array([2.0]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
+    dn = DnAxis(0, 60)
+    density = epcd_independent(pixels, dn, HistogramChoice(2))
+    np.testing.assert_allclose(density, epcd_exact(pixels, dn), atol=1e-14)
+    assert density.sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_independent_on_a_short_axis_is_a_cut_of_the_long_one() -> None:
+    pixels = make_pixels(60)
+    long, short = DnAxis(0, 500), DnAxis(110, 20)
+    choice = HistogramChoice(8)
+    np.testing.assert_allclose(
+        epcd_independent(pixels, short, choice), epcd_independent(pixels, long, choice)[110:130], atol=1e-15
+    )
+
+
+def test_a_map_of_equal_pixels_gives_the_pcd_in_every_way() -> None:
+    ones = np.ones(16)
+    pixels, dn = PixelParameters(3.0 * ones, 0.1 * ones, 90.0 * ones, 3.0 * ones), DnAxis(40, 300)
+    expected = pcd(dn.dn, 3.0, 0.1, 90.0, 9.0)
+    for result in (
+        epcd_exact(pixels, dn),
+        epcd_dependent(pixels, dn, HistogramChoice()),
+        epcd_independent(pixels, dn, HistogramChoice()),
+    ):
+        np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_more_bins_lead_to_the_exact_mean() -> None:
+    pixels, dn = make_pixels(3000), DnAxis(50, 250)
+    exact = epcd_exact(pixels, dn)
+    errors = [np.abs(epcd_dependent(pixels, dn, HistogramChoice(b)) - exact).max() for b in (4, 16, 64, 200)]
+    assert errors[0] > 5 * errors[1]
+    assert errors[1] > 5 * errors[2]
+    assert errors[3] < 2e-4 * exact.max()
+    # the correlation of gain and read noise is what the independent form loses, at any number of bins
+    independent = epcd_independent(pixels, dn, HistogramChoice(200))
+    assert np.abs(independent - exact).max() > 50 * errors[3]
+
+
+def test_nuced_is_the_sum_of_bin_means() -> None:
+    pixels, axis = make_pixels(60), NucedAxis(0.25, -8, 60)
+    choice = HistogramChoice(3)
+    low, high = (np.arange(60) - 8.5) * 0.25, (np.arange(60) - 7.5) * 0.25
+
+    def bin_mean(h: float, variance: float) -> np.ndarray:
+        sd = np.sqrt(variance)
+        cells = norm.cdf(high, K[:, None], sd) - norm.cdf(low, K[:, None], sd)
+        return np.asarray(poisson.pmf(K, h) @ cells / 0.25)
+
+    h, variance = pixels.quanta_exposure, pixels.read_noise_e**2
+    joint = joint_cells((h, variance), choice)
+    expected = sum(w * bin_mean(*v) for w, v in zip(joint.share, joint.values.T, strict=True))
+    np.testing.assert_allclose(nuced_dependent(pixels, axis, choice), expected, rtol=1e-9, atol=1e-13)
+    one, two = joint_cells((h,), choice), joint_cells((variance,), choice)
+    expected = sum(
+        a * b * bin_mean(u, v)
+        for a, u in zip(one.share, one.values[0], strict=True)
+        for b, v in zip(two.share, two.values[0], strict=True)
+    )
+    np.testing.assert_allclose(nuced_independent(pixels, axis, choice), expected, rtol=1e-9, atol=1e-13)
+
+
+def test_binned_electron_mass() -> None:
+    exposure = make_pixels(500).quanta_exposure
+    choice = HistogramChoice(10, "full", "centre")
+    counts, edges = np.histogram(exposure, bins=10)
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    expected = counts / 500 @ poisson.pmf(np.arange(20), centres[:, None])
+    np.testing.assert_allclose(electron_pmf_binned(exposure, 20, choice), expected, rtol=1e-10)

@@ -1,0 +1,121 @@
+"""Appendices A and B: moments of the ensemble and widths of its components."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import poisson
+
+from pchem_pipeline.model.components import (
+    COMPONENT_CASES,
+    component_widths,
+    moment_errors,
+    predicted_moments,
+    sample_moments,
+)
+from pchem_pipeline.model.pixels import PixelParameters
+
+
+def make_pixels(n: int, seed: int = 2) -> PixelParameters:
+    """All four parameters vary and depend on one another."""
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((4, n))
+    g = 0.1 * np.exp(0.1 * z[0])
+    return PixelParameters(
+        2.0 * np.exp(0.4 * z[1] + 0.2 * z[0]),
+        g,
+        100.0 + 4.0 * z[2] + 2.0 * z[0],
+        3.0 * np.exp(0.1 * z[3] - 0.1 * z[1]),
+    )
+
+
+def brute_width(h: np.ndarray, g: np.ndarray, mu: np.ndarray, s2: np.ndarray, k: int) -> tuple[float, float]:
+    """E and Var of E | K_e = k as the appendix writes them."""
+    weight = np.exp(-h) * h**k
+    first = np.mean(weight * (mu + k / g)) / np.mean(weight)
+    second = np.mean(weight * (s2 + (mu + k / g) ** 2)) / np.mean(weight)
+    return float(first), float(second - first**2)
+
+
+def test_there_are_sixteen_cases() -> None:
+    assert len(set(COMPONENT_CASES)) == 16
+    assert COMPONENT_CASES[0] == ()
+    assert COMPONENT_CASES[-1] == ("H", "g", "mu", "sigma2")
+
+
+def test_every_case_is_that_of_maps_held_constant() -> None:
+    pixels = make_pixels(500)
+    result = component_widths(pixels, 12)
+    h, g, mu, sigma = pixels.columns()
+    for row, case in enumerate(COMPONENT_CASES):
+        maps = {"H": h, "g": g, "mu": mu, "sigma2": sigma**2}
+        held = {name: np.full(500, v.mean()) if name in case else v for name, v in maps.items()}
+        for k in range(12):
+            _, expected = brute_width(held["H"], held["g"], held["mu"], held["sigma2"], k)
+            assert result.variance[row, k] == pytest.approx(expected, rel=1e-8), (case, k)
+    for k in range(12):
+        assert result.mean[k] == pytest.approx(brute_width(h, g, mu, sigma**2, k)[0], rel=1e-12)
+        weight = poisson.pmf(k, h)
+        expected = np.sum(weight * pixels.read_noise_e**2) / np.sum(weight)
+        assert result.nuced_variance[k] == pytest.approx(expected, rel=1e-11)
+
+
+def test_only_the_paper_s_five_cases_do_not_depend_on_k() -> None:
+    variance = component_widths(make_pixels(2000), 10).variance
+    constant = {
+        case for case, row in zip(COMPONENT_CASES, variance, strict=True) if np.ptp(row) < 1e-9 * row[0]
+    }
+    assert constant == {
+        ("H", "g"),
+        ("H", "g", "mu"),
+        ("H", "g", "sigma2"),
+        ("g", "mu", "sigma2"),
+        ("H", "g", "mu", "sigma2"),
+    }
+
+
+def test_widths_survive_hot_pixels_and_many_electrons() -> None:
+    pixels = PixelParameters(
+        np.array([0.0, 2.0, 900.0]), np.array([0.1, 0.2, 0.1]), np.array([90.0, 100.0, 110.0]), np.ones(3)
+    )
+    result = component_widths(pixels, 1500)
+    assert np.isfinite(result.variance).all()
+    assert result.mean[0] == pytest.approx((90 + np.exp(-2) * 100) / (1 + np.exp(-2)))
+    assert result.mean[1400] == pytest.approx(110 + 1400 / 0.1)
+
+
+def test_moments_are_those_of_the_mixture() -> None:
+    pixels = make_pixels(300)
+    h, g, mu, sigma = pixels.columns()
+    k = np.arange(120)
+    weight = poisson.pmf(k, h[:, None]) / 300
+    centre = mu[:, None] + k / g[:, None]
+    mean = np.sum(weight * centre)
+    variance = np.sum(weight * (centre**2 + sigma[:, None] ** 2)) - mean**2
+    nuced_mean = np.sum(weight * k)
+    nuced_variance = np.sum(weight * (k**2 + pixels.read_noise_e[:, None] ** 2)) - nuced_mean**2
+    found = predicted_moments(pixels)
+    assert found.mean == pytest.approx(mean, rel=1e-11)
+    assert found.variance == pytest.approx(variance, rel=1e-9)
+    assert found.nuced_mean == pytest.approx(nuced_mean, rel=1e-11)
+    assert found.nuced_variance == pytest.approx(nuced_variance, rel=1e-10)
+    terms = found.variance_of_bias + found.variance_of_signal + found.mean_read_variance
+    terms += found.mean_shot_variance + 2 * found.bias_signal_covariance
+    assert found.variance == pytest.approx(terms)
+
+
+def test_sample_moments_at_a_large_bias() -> None:
+    samples = np.random.default_rng(1).integers(60_000, 60_050, size=5000)
+    mean, variance = sample_moments(np.bincount(samples - 59_990), 59_990 + np.arange(60))
+    assert mean == pytest.approx(samples.mean(), rel=1e-14)
+    assert variance == pytest.approx(samples.var(), rel=1e-12)
+
+
+def test_moment_errors_of_equal_poisson_pixels() -> None:
+    # g = 1 and hardly any noise: mean and variance of n Poisson(H) counts, known in closed form
+    ones = np.ones(50)
+    errors = moment_errors(PixelParameters(4.0 * ones, ones, 0.0 * ones, 1e-6 * ones), 200)
+    n = 50 * 200
+    assert errors.mean == pytest.approx(np.sqrt(4.0 / n))
+    assert errors.variance == pytest.approx(np.sqrt((4.0 + 2 * 16.0) / n))
+    assert errors.nuced_variance == pytest.approx(errors.variance)

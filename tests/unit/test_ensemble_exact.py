@@ -1,0 +1,198 @@
+"""The exact ensemble: sums of PCDs, tallies of the data, and the mass of the electron number."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm, poisson
+
+from pchem_pipeline.model import ensemble_numba
+from pchem_pipeline.model.ensemble import (
+    DnAxis,
+    NucedAxis,
+    electron_pmf,
+    ensemble_sums,
+    epcd_exact,
+    merge_sums,
+    merge_tallies,
+    nuced_axis,
+    tally,
+)
+from pchem_pipeline.model.pixels import PixelParameters, usable_pixels
+
+
+def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> PixelParameters:
+    rng = np.random.default_rng(seed)
+    g = gain * np.exp(0.05 * rng.standard_normal(n))
+    return PixelParameters(
+        2.0 * np.exp(0.5 * rng.standard_normal(n)),
+        g,
+        100.0 + 4.0 * rng.standard_normal(n),
+        0.3 * np.exp(0.1 * rng.standard_normal(n)) / g,
+    )
+
+
+def plain_pcd(pixels: PixelParameters, dn: np.ndarray) -> np.ndarray:
+    """PCD of every pixel at every DN, eq. X_density term by term."""
+    k = np.arange(200)
+    rows = []
+    for h, g, mu, sigma in zip(*pixels.columns(), strict=True):
+        rows.append(poisson.pmf(k, h) @ norm.pdf(dn[None, :], mu + k[:, None] / g, sigma))
+    return np.array(rows)
+
+
+def test_sum_over_pixels_is_that_of_the_formula() -> None:
+    pixels, dn = make_pixels(30), DnAxis(40, 300)
+    rows = plain_pcd(pixels, dn.dn)
+    sums = ensemble_sums(pixels, dn)
+    np.testing.assert_allclose(sums.raw, rows.sum(axis=0), rtol=1e-11, atol=1e-15)
+    np.testing.assert_allclose(sums.raw_square, (rows**2).sum(axis=0), rtol=1e-11, atol=1e-15)
+    np.testing.assert_allclose(epcd_exact(pixels, dn), rows.mean(axis=0), rtol=1e-11, atol=1e-15)
+
+
+def test_nuced_sums_sort_whole_dn_into_bins() -> None:
+    pixels, dn, axis = make_pixels(30), DnAxis(0, 400), NucedAxis(0.13, -40, 320)
+    rows = plain_pcd(pixels, dn.dn)
+    expected, squares = np.zeros((2, axis.size))
+    for row, g, mu in zip(rows, pixels.conversion_gain, pixels.bias, strict=True):
+        place = np.floor((dn.dn - mu) * g / axis.width + 0.5).astype(int) - axis.start
+        inside = (place >= 0) & (place < axis.size)
+        mass = np.bincount(place[inside], weights=row[inside], minlength=axis.size)
+        expected += mass
+        squares += mass**2
+    sums = ensemble_sums(pixels, dn, axis)
+    np.testing.assert_allclose(sums.nuced, expected, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose(sums.nuced_square, squares, rtol=1e-11, atol=1e-14)
+    assert sums.nuced.sum() == pytest.approx(sums.raw.sum(), rel=1e-12)
+    assert sums.raw.sum() == pytest.approx(30.0, abs=1e-3)
+
+
+def test_narrow_pixels_give_the_mass_of_the_cell() -> None:
+    # sigma = 0.6 DN at an integer + 0.3: the density at the integers does not add up to 1, the masses do
+    pixels = PixelParameters(np.array([1.5]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
+    dn = DnAxis(0, 60)
+    k = np.arange(60)
+    analog = np.sqrt(0.36 - 1 / 12)
+    centres = 10.3 + k[:, None] / 0.5
+    cells = norm.cdf(dn.dn + 0.5, centres, analog) - norm.cdf(dn.dn - 0.5, centres, analog)
+    np.testing.assert_allclose(epcd_exact(pixels, dn), poisson.pmf(k, 1.5) @ cells, atol=1e-14)
+
+
+def test_a_hot_pixel_keeps_its_mass() -> None:
+    pixels = PixelParameters(np.array([3000.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]))
+    density = epcd_exact(pixels, DnAxis(0, 60_000))
+    assert density.sum() == pytest.approx(1.0, abs=1e-10)
+    assert density @ np.arange(60_000) == pytest.approx(100.0 + 30_000.0, rel=1e-10)
+
+
+@pytest.mark.parametrize("exposure", [0.0, 1e-9, 0.4, 8.0, 700.0, 2e5])
+def test_poisson_weights(exposure: float) -> None:
+    size = int(exposure + 12 * np.sqrt(exposure) + 40)
+    weights = np.zeros(size)
+    low, high = ensemble_numba.poisson_weights(exposure, weights)
+    k = np.arange(low, high + 1)
+    np.testing.assert_allclose(weights[low : high + 1], poisson.pmf(k, exposure), rtol=1e-8, atol=1e-300)
+    assert weights[low : high + 1].sum() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_compiled_and_plain_kernels_agree() -> None:
+    pixels, axis = make_pixels(6), NucedAxis(0.1, -20, 150)
+    results = []
+    for kernel in (ensemble_numba.sum_pcd_pixels, ensemble_numba.sum_pcd_pixels.py_func):
+        raw, square = np.zeros((2, 300))
+        bins, bins_square = np.zeros((2, axis.size))
+        kernel(*pixels.columns(), 50, raw, square, axis.width, axis.start, bins, bins_square)
+        results.append(np.concatenate([raw, square, bins, bins_square]))
+    np.testing.assert_allclose(*results, rtol=1e-13)
+    for kernel in (ensemble_numba.add_density, ensemble_numba.add_mass):
+        outs = np.zeros((2, 60))
+        kernel(outs[0], 3.0, 0.7, 20.2, 2.5)
+        kernel.py_func(outs[1], 3.0, 0.7, 20.2, 2.5)
+        np.testing.assert_allclose(outs[0], outs[1], rtol=1e-13)
+
+
+def test_tally_is_that_of_the_samples() -> None:
+    rng = np.random.default_rng(3)
+    pixels, dn, axis = make_pixels(12), DnAxis(90, 40), NucedAxis(0.11, -3, 30)
+    samples = rng.integers(80, 150, size=(12, 500))
+    origin = samples.min(axis=1)
+    counts = np.stack([np.bincount(s - o, minlength=80) for s, o in zip(samples, origin, strict=True)])
+    result = tally(counts.astype(np.uint16), origin, pixels, dn, axis)
+    inside = (samples >= 90) & (samples < 130)
+    np.testing.assert_array_equal(result.raw, np.bincount(samples[inside] - 90, minlength=40))
+    assert result.outside == np.count_nonzero(~inside)
+    values = (samples - pixels.bias[:, None]) * pixels.conversion_gain[:, None]
+    place = np.floor(values / 0.11 + 0.5).astype(int) + 3
+    good = (place >= 0) & (place < 30)
+    np.testing.assert_array_equal(result.nuced, np.bincount(place[good], minlength=30))
+    assert result.nuced_outside == np.count_nonzero(~good)
+    assert result.nuced_sum == pytest.approx(values.sum(), rel=1e-12)
+    assert result.nuced_sum_square == pytest.approx((values**2).sum(), rel=1e-12)
+
+
+def test_axis_is_not_stretched_by_one_strange_gain() -> None:
+    pixels = make_pixels(1000)
+    strange = PixelParameters(
+        pixels.quanta_exposure,
+        np.where(np.arange(1000) == 7, 50.0, pixels.conversion_gain),
+        pixels.bias,
+        pixels.read_noise_dn,
+    )
+    axis, usual = nuced_axis(strange, DnAxis(60, 200)), nuced_axis(pixels, DnAxis(60, 200))
+    assert axis.size < 1.2 * usual.size
+    assert usual.width == pytest.approx(0.1, rel=0.01)
+    assert usual.electrons[0] < -1.0
+    assert usual.electrons[-1] > 15.0
+    assert nuced_axis(pixels, DnAxis(60, 200), steps=3).width == pytest.approx(3 * usual.width)
+    assert nuced_axis(pixels, DnAxis(60, 200), width=0.25).width == 0.25
+
+
+def test_merging_tiles_gives_the_whole() -> None:
+    pixels, dn = make_pixels(50), DnAxis(40, 300)
+    axis = nuced_axis(pixels, dn)
+    whole = ensemble_sums(pixels, dn, axis)
+    parts = []
+    for start, stop in ((30, 50), (0, 7), (7, 30)):
+        piece = PixelParameters(*(column[start:stop] for column in pixels.columns()))
+        parts.append(ensemble_sums(piece, dn, axis))
+    merged = merge_sums(parts)
+    assert merged.n_pixels == 50
+    for name in ("raw", "raw_square", "nuced", "nuced_square"):
+        np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
+    np.testing.assert_array_equal(merged.raw, merge_sums(parts[::-1]).raw)
+
+
+def test_merging_tallies() -> None:
+    pixels, dn, axis = make_pixels(2), DnAxis(0, 5), NucedAxis(1.0, -20, 40)
+    parts = []
+    for p in range(2):
+        one = PixelParameters(*(column[p : p + 1] for column in pixels.columns()))
+        parts.append(tally(np.array([[1, 2, 3, 4, 5, 6]]), np.array([p]), one, dn, axis))
+    merged = merge_tallies(parts)
+    np.testing.assert_array_equal(merged.raw, [1, 3, 5, 7, 9])
+    assert merged.outside == 6 + 5 + 6
+    assert merged.nuced_sum == pytest.approx(parts[0].nuced_sum + parts[1].nuced_sum)
+
+
+def test_electron_mass_is_the_mean_of_poisson_masses() -> None:
+    exposure = np.array([0.0, 0.3, 2.0, 60.0])
+    expected = poisson.pmf(np.arange(30), exposure[:, None]).mean(axis=0)
+    np.testing.assert_allclose(electron_pmf(exposure, 30), expected, rtol=1e-11, atol=1e-17)
+    share = np.array([0.1, 0.2, 0.3, 0.4])
+    expected = share @ poisson.pmf(np.arange(30), exposure[:, None])
+    np.testing.assert_allclose(electron_pmf(exposure, 30, share), expected, rtol=1e-11, atol=1e-17)
+
+
+def test_parameters_must_be_usable() -> None:
+    good = np.ones(3)
+    with pytest.raises(ValueError, match="usable"):
+        PixelParameters(good, good, good, np.array([1.0, np.nan, 1.0]))
+    with pytest.raises(ValueError, match="equally long"):
+        PixelParameters(good, good, good, np.ones(2))
+    maps = np.ones((4, 2, 2))
+    maps[0, 0, 1] = -1.0
+    maps[1, 1, 0] = np.inf
+    pixels, mask = PixelParameters.from_maps(list(maps))
+    np.testing.assert_array_equal(mask, [[True, False], [False, True]])
+    assert len(pixels) == 2
+    assert not usable_pixels(good, 0 * good, good, good).any()

@@ -1,0 +1,153 @@
+"""Derived maps, quality, robust summaries and the display transform."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import beta
+
+from pchem_pipeline.model.ensemble_settings import EnsembleSettings, MapsSettings
+from pchem_pipeline.model.fit_status import FAILED, FitStatus
+from pchem_pipeline.model.maps import (
+    CAUTION,
+    GOOD,
+    NO_VALUE,
+    derived_maps,
+    display_transform,
+    quality_map,
+    status_counts,
+    summarise,
+)
+
+PARAMETERS = {
+    "quanta_exposure": np.array([[2.0, 1.0]]),
+    "conversion_gain": np.array([[0.1, 0.5]]),
+    "bias": np.array([[100.0, 90.0]]),
+    "read_noise_dn": np.array([[3.0, 0.8]]),
+}
+
+
+def make_covariance() -> np.ndarray:
+    root = np.random.default_rng(1).standard_normal((1, 2, 4, 4)) * np.array([0.01, 1e-3, 0.1, 0.02])[:, None]
+    return np.asarray(root @ np.swapaxes(root, -1, -2))
+
+
+def numeric_stderr(function: object, covariance: np.ndarray, at: np.ndarray) -> float:
+    """Delta method with derivatives by central differences."""
+    slopes = []
+    for i in range(4):
+        step = 1e-5 * at[i]
+        up, down = at.copy(), at.copy()
+        up[i] += step
+        down[i] -= step
+        slopes.append((function(*up) - function(*down)) / (2 * step))  # type: ignore[operator]
+    return float(np.sqrt(np.array(slopes) @ covariance @ np.array(slopes)))
+
+
+FUNCTIONS = {
+    "read_noise_e": lambda h, g, mu, s: g * s,
+    "analog_read_noise_e": lambda h, g, mu, s: g * np.sqrt(s * s - 1 / 12),
+    "dark_current": lambda h, g, mu, s: h / 4.87,
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_derived_maps_and_their_errors(name: str) -> None:
+    covariance = make_covariance()
+    maps = derived_maps(PARAMETERS, covariance, 4.87)
+    for x in range(2):
+        at = np.array([values[0, x] for values in PARAMETERS.values()])
+        assert maps[name][0, x] == pytest.approx(FUNCTIONS[name](*at), rel=1e-12)
+        expected = numeric_stderr(FUNCTIONS[name], covariance[0, x], at)
+        assert maps[f"{name}_stderr"][0, x] == pytest.approx(expected, rel=1e-6)
+
+
+def test_noise_below_rounding_has_no_analog_part() -> None:
+    below = {**PARAMETERS, "read_noise_dn": np.array([[0.28, np.nan]])}
+    maps = derived_maps(below, make_covariance(), None)
+    assert np.isnan(maps["analog_read_noise_e"]).all()
+    assert np.isnan(maps["analog_read_noise_e_stderr"]).all()
+    assert maps["read_noise_e"][0, 0] == pytest.approx(0.028)
+    assert "dark_current" not in maps
+
+
+def test_quality_follows_the_status() -> None:
+    status = np.array([0, int(FitStatus.BIAS_AMBIGUOUS), int(FitStatus.NO_DATA), 0], dtype=np.uint16)
+    gain = np.array([0.1, 0.1, np.nan, np.nan])
+    np.testing.assert_array_equal(quality_map(status, gain), [GOOD, CAUTION, NO_VALUE, NO_VALUE])
+    for bit in FitStatus:
+        if bit & FAILED:
+            assert quality_map(np.array([int(bit)]), np.array([0.1]))[0] == NO_VALUE
+
+
+def test_every_reason_is_counted() -> None:
+    status = np.array([[0, 32, 32 | 512], [1, 0, 0]], dtype=np.uint16)
+    counts = status_counts(status)
+    assert counts["ok"] == 3
+    assert counts["bias_ambiguous"] == 2
+    assert counts["poor_fit"] == 1
+    assert counts["no_data"] == 1
+    assert sum(counts.values()) == 7
+    assert len(counts) == 1 + len(FitStatus)
+
+
+def test_a_handful_of_hot_pixels_does_not_move_the_summary() -> None:
+    rng = np.random.default_rng(4)
+    values = 0.3 + 0.02 * rng.standard_normal((100, 100))
+    clean = summarise(values)
+    hot = values.copy()
+    hot.flat[:7] = 1e6
+    hot.flat[7] = np.nan
+    found = summarise(hot)
+    assert found.median == pytest.approx(clean.median, abs=3 * clean.median_stderr)
+    assert found.robust_sd == pytest.approx(clean.robust_sd, rel=0.01)
+    assert (found.n_high, found.n_low, found.n_missing, found.n_valid) == (7, 0, 1, 9999)
+    assert found.maximum == 1e6
+    assert clean.n_high == 0
+    assert found.percentiles[99.0] == pytest.approx(clean.percentiles[99.0], rel=0.01)
+
+
+def test_summary_of_nothing_and_of_one_value() -> None:
+    nothing = summarise(np.full((2, 2), np.nan))
+    assert nothing.n_missing == 4
+    assert np.isnan(nothing.median)
+    one = summarise(np.array([3.0]))
+    assert one.median == 3.0
+    assert np.isnan(one.median_stderr)
+    assert one.n_high == 0
+
+
+def test_median_error_of_a_normal_map() -> None:
+    values = np.random.default_rng(5).standard_normal(40_000)
+    # the distance of two order statistics 200 ranks apart scatters by 1/sqrt(200) of itself
+    expected = np.sqrt(np.pi / 2) / 200
+    assert summarise(values).median_stderr == pytest.approx(expected, rel=5 / np.sqrt(200))
+
+
+def test_display_transform_has_the_beta_shape() -> None:
+    values = np.random.default_rng(6).lognormal(0, 2, size=(40, 50))
+    shown = display_transform(values)
+    rank = (values.ravel().argsort().argsort() + 0.5) / values.size
+    np.testing.assert_allclose(shown.ravel(), beta(2, 2).ppf(rank), atol=1e-12)
+    np.testing.assert_allclose(display_transform(-values), 1 - shown, atol=1e-12)
+
+
+def test_display_transform_keeps_order_ties_and_gaps() -> None:
+    values = np.array([[1.0, 1.0, 5.0], [np.nan, -2.0, 1e9]])
+    shown = display_transform(values)
+    assert np.isnan(shown[1, 0])
+    assert shown[0, 0] == shown[0, 1]
+    assert shown[1, 1] < shown[0, 0] < shown[0, 2] < shown[1, 2]
+    assert shown[0, 0] == pytest.approx(beta(2, 2).ppf(0.4))
+    assert np.isnan(display_transform(np.full(3, np.nan))).all()
+    np.testing.assert_allclose(display_transform(np.ones(5)), 0.5)
+
+
+def test_settings_refuse_nonsense() -> None:
+    with pytest.raises(ValueError, match="at least one frame"):
+        EnsembleSettings(frames=0)
+    assert EnsembleSettings(frames="all").frames == "all"
+    with pytest.raises(ValueError, match="increase"):
+        MapsSettings(percentiles=(50.0, 10.0))
+    with pytest.raises(ValueError, match=r"0\.\.100"):
+        MapsSettings(percentiles=(50.0, 110.0))
