@@ -216,7 +216,13 @@ def poisson_start(mean):  # type: ignore[no-untyped-def]
     last = int(mean + spread + 20.0)
     if first == 0:
         return 0, math.exp(-mean), last
-    return first, math.exp(first * math.log(mean) - mean - math.lgamma(first + 1.0)), last
+    if first < 100:
+        return first, math.exp(first * math.log(mean) - mean - math.lgamma(first + 1.0)), last
+    # the logarithms above would cancel: Loader 2000, with Stirling's series and the deviance
+    stirling = (1.0 / 12.0 - (1.0 / 360.0 - 1.0 / (1260.0 * first * first)) / (first * first)) / first
+    d = (first - mean) / mean
+    deviance = mean * ((1.0 + d) * math.log1p(d) - d)
+    return first, math.exp(-stirling - deviance) / math.sqrt(2.0 * math.pi * first), last
 
 
 @njit(nogil=True, cache=True)

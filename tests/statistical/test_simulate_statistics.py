@@ -1,0 +1,239 @@
+"""Simulated frames have the distribution of the model: exact masses, independence, correlations.
+
+Limits are five standard errors from theory, or a probability of 6e-7; each test also shows that it would
+have caught the error that it guards against.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.maps import draw_truth
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.streams import make_key, to_words, uniform_pair
+from pchem_pipeline.simulate.truth import Defect, TruthMaps
+
+FALSE_ALARM = 6e-7
+N = 1 << 20
+
+
+def exact_mass(x: NDArray[np.int64], h: float, g: float, mu: float, sigma: float) -> NDArray[np.float64]:
+    """P(X = x) of eq. PCD_RV_definition: Poisson weights times normal mass of the rounding cell."""
+    k = np.arange(int(h + 12 * np.sqrt(h) + 20))
+    centres, scale = mu + k / g, sigma / g
+    cells = stats.norm.cdf((x[:, None] + 0.5 - centres) / scale) - stats.norm.cdf(
+        (x[:, None] - 0.5 - centres) / scale
+    )
+    return np.asarray(cells @ stats.poisson.pmf(k, h))
+
+
+def chi_square_p(dn: NDArray[np.uint16], h: float, g: float, mu: float, sigma: float) -> float:
+    """Probability of a larger chi-square against the exact mass, bins of fewer than 20 expected merged."""
+    top = int(mu + (h + 12 * np.sqrt(h) + 20) / g)
+    expected = exact_mass(np.arange(top), h, g, mu, sigma) * dn.size
+    observed = np.bincount(dn.ravel(), minlength=top)[:top]
+    full = expected >= 20
+    o = np.append(observed[full], dn.size - observed[full].sum())
+    e = np.append(expected[full], dn.size - expected[full].sum())
+    return float(stats.chi2.sf(((o - e) ** 2 / e).sum(), full.sum()))
+
+
+def identical_pixels(shape: tuple[int, int], h: float, g: float, mu: float, sigma: float) -> TruthMaps:
+    return TruthMaps(*(np.full(shape, v) for v in (h, g, mu, sigma)), defect=np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize("effects", [[], [{"tag": "row_noise", "row_noise_dn": 0.0}]])
+@pytest.mark.parametrize(
+    ("h", "dn_per_electron", "mu", "sigma"),
+    [
+        (2.0, 11.0, 100.3, 0.3),
+        (0.1, 8.0, 90.0, 0.2),
+        (8.0, 14.0, 100.0, 0.42),
+        (150.0, 3.0, 20.0, 0.9),
+        (1.5, 1.0, 5.2, 0.25),
+    ],
+)
+def test_frames_have_the_exact_mass_of_the_model(h, dn_per_electron, mu, sigma, effects):
+    settings = SimulateSettings(shape=(32, 64), n_frames=N // 2048, seed=21, effects=effects)
+    truth = identical_pixels(settings.shape, h, 1 / dn_per_electron, mu, sigma)
+    dn, electrons = simulate_block(truth, settings, (0, settings.n_frames))
+    assert chi_square_p(dn, h, 1 / dn_per_electron, mu, sigma) > FALSE_ALARM
+    # an exposure wrong by 5 % would not have passed, nor, with peaks, a read noise wrong by 10 %
+    assert chi_square_p(dn, h * 1.05, 1 / dn_per_electron, mu, sigma) < 1e-20
+    if sigma < 0.5 and dn_per_electron > 4:
+        assert chi_square_p(dn, h, 1 / dn_per_electron, mu, sigma * 1.1) < 1e-20
+    counts = np.bincount(electrons.ravel())
+    expected = stats.poisson.pmf(np.arange(counts.size), h) * N
+    full = expected >= 20
+    chi2 = ((counts - expected)[full] ** 2 / expected[full]).sum()
+    assert stats.chi2.sf(chi2, full.sum()) > FALSE_ALARM
+
+
+def test_uniforms_are_uniform():
+    words = (to_words(np.arange(n)) for n in (64, 128, 128))
+    for numbers in uniform_pair(make_key(33, "check"), *words):
+        assert stats.kstest(numbers.ravel(), "uniform").pvalue > FALSE_ALARM
+        assert stats.kstest(numbers.ravel() ** 1.02, "uniform").pvalue < 1e-20
+
+
+def pairs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Pairs of uniforms that have to be independent, a million each."""
+    words = [to_words(np.arange(n)) for n in (65, 128, 128)]
+    u, v = uniform_pair(make_key(34, "check"), *words)
+    other = uniform_pair(make_key(34, "other"), *words)[0]
+    seed = uniform_pair(make_key(35, "check"), *words)[0]
+    draw = uniform_pair(make_key(34, "check"), *words, draw=1)[0]
+    return {
+        "frames": (u[1:], u[:-1]),
+        "rows": (u[:, 1:], u[:, :-1]),
+        "columns": (u[:, :, 1:], u[:, :, :-1]),
+        "halves": (u, v),
+        "purposes": (u, other),
+        "seeds": (u, seed),
+        "draws": (u, draw),
+        "a number and itself": (u, u),
+        "a number and a slightly mixed one": (u, np.where(v < 0.06, u, other)),
+    }
+
+
+def test_numbers_are_independent_across_all_that_they_are_keyed_on():
+    for name, (a, b) in pairs().items():
+        cells = np.bincount((np.floor(16 * a) * 16 + np.floor(16 * b)).astype(int).ravel(), minlength=256)
+        expected = a.size / 256
+        p_cells = stats.chi2.sf(((cells - expected) ** 2 / expected).sum(), 255)
+        z = np.corrcoef(a.ravel(), b.ravel())[0, 1] * np.sqrt(a.size)
+        if name.startswith("a number"):
+            assert abs(z) > 20, name
+            assert p_cells < 1e-30, name
+        else:
+            assert abs(z) < 5, name
+            assert p_cells > FALSE_ALARM, name
+
+
+def correlation_z(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1] * np.sqrt(a.size))
+
+
+def test_samples_are_independent_in_time_and_space_and_row_noise_is_seen():
+    def residual(effects):
+        settings = SimulateSettings(shape=(40, 64), n_frames=200, seed=5, effects=effects)
+        truth = identical_pixels(settings.shape, 1.0, 0.1, 100.0, 0.3)
+        return simulate_block(truth, settings, (0, 200))[0] - (100.0 + 10.0)
+
+    r = residual([])
+    noisy = residual([{"tag": "row_noise", "row_noise_dn": 3.0}])
+    for a, b in ((r[1:], r[:-1]), (r[:, 1:], r[:, :-1]), (r[..., 1:], r[..., :-1])):
+        assert abs(correlation_z(a, b)) < 5
+    assert correlation_z(noisy[..., 1:], noisy[..., :-1]) > 20
+    assert abs(correlation_z(noisy[1:], noisy[:-1])) < 5
+    # rows of a frame are drawn independently; pixels of a row share one number, so it counts once
+    means = noisy.mean(axis=2)
+    assert abs(correlation_z(means[:, 1:], means[:, :-1])) < 5
+
+
+def test_row_noise_has_the_strength_asked_for():
+    strength, shape, n = 1.5, (48, 64), 300
+    settings = SimulateSettings(
+        shape=shape, n_frames=n, seed=6, effects=[{"tag": "row_noise", "row_noise_dn": strength}]
+    )
+    truth = identical_pixels(shape, 1.0, 0.1, 100.0, 0.3)
+    means = simulate_block(truth, settings, (0, n))[0].mean(axis=2)
+    # a pixel's variance is H / g^2 + (sigma_R / g)^2 + 1/12 DN^2
+    own = (100.0 + 9.0 + 1 / 12) / shape[1]
+    error = (strength**2 + own) * np.sqrt(2 / means.size)
+    assert abs(means.var() - own - strength**2) < 5 * error
+    assert strength**2 > 20 * error
+
+
+def test_exposure_drift_moves_the_exposure_and_keeps_its_mean():
+    drift, n, shape = 0.3, 400, (40, 50)
+    settings = SimulateSettings(
+        shape=shape, n_frames=n, seed=7, effects=[{"tag": "exposure_drift", "drift": drift}]
+    )
+    truth = identical_pixels(shape, 2.0, 0.1, 100.0, 0.3)
+    _, electrons = simulate_block(truth, settings, (0, n))
+    frame_means = electrons.mean(axis=(1, 2))
+    position = np.arange(n) / (n - 1) - 0.5
+    weights = position / (position @ position)
+    slope = weights @ frame_means
+    error = np.sqrt(2.0 / electrons[0].size * (weights @ weights))
+    assert abs(slope - 2.0 * drift) < 5 * error
+    assert 2.0 * drift > 20 * error
+    assert abs(frame_means.mean() - 2.0) < 5 * np.sqrt(2.0 / electrons.size)
+    # variance of a pixel over the run: Poisson, plus that of the drift itself
+    variance = 2.0 + (2.0 * drift) ** 2 / 12
+    spread = np.sqrt((variance * (1 + 3 * variance) - variance**2) / electrons.size)
+    assert abs(electrons.var() - variance) < 5 * spread
+
+
+def test_clipping_piles_the_tails_up_at_its_limits():
+    h, g, mu, sigma, low, high = 1.0, 0.1, 100.0, 0.3, 97, 125
+    settings = SimulateSettings(
+        shape=(40, 50), n_frames=300, seed=9, effects=[{"tag": "clipping", "low": low, "high": high}]
+    )
+    dn, _ = simulate_block(identical_pixels((40, 50), h, g, mu, sigma), settings, (0, 300))
+    mass = exact_mass(np.arange(400), h, g, mu, sigma)
+    assert (dn.min(), dn.max()) == (low, high)
+    for code, p in ((low, mass[: low + 1].sum()), (high, mass[high:].sum())):
+        error = np.sqrt(p * (1 - p) / dn.size)
+        assert abs((dn == code).mean() - p) < 5 * error
+        assert p - mass[code] > 20 * error
+
+
+def test_maps_have_the_distributions_and_rank_correlations_asked_for():
+    settings = SimulateSettings(
+        shape=(200, 200),
+        seed=10,
+        parameters={
+            "quanta_exposure": {"kind": "lognormal", "median": 2.0, "log_std": 0.4},
+            "dn_per_electron": {"kind": "uniform", "low": 8, "high": 14},
+            "bias": {"kind": "normal", "mean": 100, "std": 4},
+            "analog_read_noise_e": {"kind": "gamma", "mean": 0.3, "std": 0.05},
+            "correlations": [
+                {"between": ["dn_per_electron", "analog_read_noise_e"], "rank": -0.6},
+                {"between": ["quanta_exposure", "bias"], "rank": 0.3},
+            ],
+            "hot_pixels": {"fraction": 0.0},
+        },
+    )
+    truth = draw_truth(settings)
+    given = {
+        "quanta_exposure": (truth.quanta_exposure, stats.lognorm(0.4, scale=2)),
+        "dn_per_electron": (1 / truth.conversion_gain, stats.uniform(8, 6)),
+        "bias": (truth.bias, stats.norm(100, 4)),
+        "analog_read_noise_e": (truth.analog_read_noise_e, stats.gamma(36, scale=0.3 / 36)),
+    }
+    for values, reference in given.values():
+        assert stats.kstest(values.ravel(), reference.cdf).pvalue > FALSE_ALARM
+        assert stats.kstest(values.ravel() * 1.02, reference.cdf).pvalue < 1e-4
+    wanted = {("dn_per_electron", "analog_read_noise_e"): -0.6, ("quanta_exposure", "bias"): 0.3}
+    names = list(given)
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            rank = wanted.get((a, b), wanted.get((b, a), 0.0))
+            found = stats.spearmanr(given[a][0].ravel(), given[b][0].ravel()).statistic
+            # the rank correlation of a normal copula has at most the error of an independent one
+            assert abs(found - rank) < 5 / np.sqrt(200 * 200)
+            assert rank == 0 or abs(rank) > 20 / np.sqrt(200 * 200)
+
+
+def test_hot_pixels_are_as_many_and_as_hot_as_asked_for():
+    multiplier = {"kind": "lognormal", "median": 5.0, "log_std": 0.3}
+    settings = SimulateSettings(
+        shape=(300, 300),
+        seed=12,
+        parameters={
+            "quanta_exposure": {"kind": "constant", "value": 1.0},
+            "hot_pixels": {"fraction": 0.05, "multiplier": multiplier},
+        },
+    )
+    truth = draw_truth(settings)
+    hot = truth.defect == Defect.HOT
+    assert abs(hot.mean() - 0.05) < 5 * np.sqrt(0.05 * 0.95 / hot.size)
+    assert stats.kstest(truth.quanta_exposure[hot], stats.lognorm(0.3, scale=5).cdf).pvalue > FALSE_ALARM
+    assert stats.kstest(truth.quanta_exposure[hot] * 1.1, stats.lognorm(0.3, scale=5).cdf).pvalue < 1e-20
+    assert (truth.quanta_exposure[~hot] == 1.0).all()

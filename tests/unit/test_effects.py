@@ -1,0 +1,170 @@
+"""The door for effects: our files, others' entry points, and what is refused."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from importlib.metadata import EntryPoint
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.effects import registry
+from pchem_pipeline.effects.adc.clipping import Clipping
+from pchem_pipeline.effects.base import Effect, Plane, register_effect, registered_effects, tag_of
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+
+class Glow(Effect):
+    """An effect of somebody else."""
+
+    tag: Literal["glow"] = "glow"
+    plane: ClassVar[Plane] = Plane.EXPOSURE
+    extra: float = 0.5
+
+    def apply(self, values: Any, context: Any) -> Any:
+        return values + self.extra
+
+
+class Impostor(Effect):
+    """An effect of somebody else with a tag of ours."""
+
+    tag: Literal["row_noise"] = "row_noise"
+    plane: ClassVar[Plane] = Plane.ANALOG
+
+    def apply(self, values: Any, context: Any) -> Any:
+        return values
+
+
+class Tagless(Effect):
+    plane: ClassVar[Plane] = Plane.ANALOG
+
+    def apply(self, values: Any, context: Any) -> Any:
+        return values
+
+
+class Planeless(Effect):
+    tag: Literal["planeless"] = "planeless"
+
+    def apply(self, values: Any, context: Any) -> Any:
+        return values
+
+
+class Idle(Effect):
+    tag: Literal["idle"] = "idle"
+    plane: ClassVar[Plane] = Plane.ANALOG
+
+
+NOT_AN_EFFECT = 3
+
+
+def entry(name: str, value: str | None = None) -> EntryPoint:
+    return EntryPoint(name, value or f"{__name__}:{name}", registry.ENTRY_POINT_GROUP)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Pretend that packages with these entry points are installed."""
+
+    def install(*points: EntryPoint) -> None:
+        monkeypatch.setattr(registry, "entry_points", lambda group: points)
+        registry._discover.cache_clear()
+
+    yield install
+    registry._discover.cache_clear()
+
+
+def test_planes_are_in_the_order_of_the_signal():
+    assert [plane.name for plane in Plane] == ["EXPOSURE", "CHARGE", "ANALOG", "ADC", "READOUT"]
+
+
+def test_our_effects_are_found_in_the_folder_of_their_plane():
+    found = registry.effect_classes()
+    assert {"exposure_drift", "row_noise", "clipping"} <= found.keys()
+    for tag, effect in found.items():
+        assert effect.__module__ == f"pchem_pipeline.effects.{effect.plane.value}.{tag}"
+
+
+def test_every_effect_is_documented():
+    for effect in registry.effect_classes().values():
+        assert effect.__doc__
+        assert "Signature:" in effect.__doc__
+        assert importlib.import_module(effect.__module__).__doc__
+        assert all(field.description for field in effect.model_fields.values())
+
+
+def test_a_plugin_is_found_and_used(installed):
+    installed(entry("Glow"))
+    assert registry.effect_class("glow") is Glow
+    settings = SimulateSettings(effects=[{"tag": "glow", "extra": 0.25}])
+    assert settings.effects == (Glow(extra=0.25),)
+    assert settings.model_dump(mode="json")["effects"] == [{"tag": "glow", "extra": 0.25}]
+    with pytest.raises(ValidationError, match="extar"):
+        SimulateSettings(effects=[{"tag": "glow", "extar": 0.25}])
+
+
+@pytest.mark.parametrize(
+    ("point", "reason"),
+    [
+        (entry("Impostor"), "taken by pchem_pipeline.effects.analog.row_noise"),
+        (entry("Missing"), "AttributeError"),
+        (entry("gone", "package_that_is_not_there:Effect"), "ModuleNotFoundError"),
+        (entry("NOT_AN_EFFECT"), "is not an effect"),
+        (entry("Tagless"), "has no tag"),
+        (entry("Planeless"), "has no plane"),
+        (entry("Idle"), "does nothing"),
+    ],
+)
+def test_a_broken_plugin_is_named_and_left_out(installed, caplog, point, reason):
+    installed(point, entry("Glow"))
+    with caplog.at_level(logging.WARNING):
+        assert registry.effect_class("glow") is Glow
+    assert list(registry.broken_plugins()) == [point.name]
+    assert reason in registry.broken_plugins()[point.name]
+    assert point.name in caplog.text
+    assert registry.effect_class("row_noise") is not Impostor
+
+
+def test_asking_for_a_broken_plugin_says_why_it_is_missing(installed):
+    installed(entry("gone", "package_that_is_not_there:Effect"))
+    with pytest.raises(ConfigError, match="left out: package_that_is_not_there"):
+        registry.effect_class("gone")
+
+
+def test_two_plugins_with_one_tag(installed):
+    installed(entry("Glow"), entry("other", f"{__name__}:Glow"))
+    assert registry.effect_class("glow") is Glow
+    assert "taken" in registry.broken_plugins()["other"]
+
+
+def test_our_own_tags_cannot_be_taken_twice():
+    before = registered_effects()
+    with pytest.raises(ConfigError, match=r"'row_noise' of .* is taken"):
+        register_effect(Impostor)
+    assert registered_effects() == before
+    assert register_effect(Clipping) is Clipping
+
+
+def test_effects_are_frozen_and_have_no_reach_by_default():
+    glow = Glow()
+    assert (glow.halo(), glow.history(), tag_of(Glow)) == (0, 0, "glow")
+    with pytest.raises(ValidationError):
+        glow.extra = 2.0
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [({}, "does nothing"), ({"low": 5, "high": 5}, "not below"), ({"low": -1}, "greater")],
+)
+def test_impossible_clipping_is_refused(limits, words):
+    with pytest.raises(ValidationError, match=words):
+        Clipping(**limits)
+
+
+def test_effects_can_be_given_by_tag_alone_only_if_they_need_nothing():
+    with pytest.raises(ValidationError, match="row_noise_dn"):
+        SimulateSettings(effects=["row_noise"])
+    assert np.size(SimulateSettings().effects) == 0

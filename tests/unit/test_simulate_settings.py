@@ -1,0 +1,114 @@
+"""The section simulate: what it accepts, what it refuses and with which words."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.simulate.settings import ParameterSettings, SimulateSettings
+
+CONSTANT = {"kind": "constant", "value": 0.1}
+
+
+def test_defaults_survive_a_round_trip_through_json():
+    settings = SimulateSettings()
+    assert SimulateSettings.model_validate_json(settings.model_dump_json()) == settings
+
+
+def test_effects_survive_a_round_trip_with_their_own_fields():
+    settings = SimulateSettings(effects=[{"tag": "row_noise", "row_noise_dn": 0.2}])
+    again = SimulateSettings.model_validate_json(settings.model_dump_json())
+    assert again == settings
+    assert again.effects[0].row_noise_dn == 0.2
+
+
+def test_giving_the_second_way_replaces_the_first():
+    parameters = ParameterSettings(dark_current=CONSTANT, conversion_gain=CONSTANT)
+    assert list(parameters.given()) == ["dark_current", "conversion_gain", "bias", "analog_read_noise_e"]
+    assert ParameterSettings.model_validate_json(parameters.model_dump_json()) == parameters
+
+
+def test_every_field_says_what_it_is():
+    def check(model):
+        for name, field in model.model_fields.items():
+            assert field.description, f"{model.__name__}.{name}"
+
+    from pchem_pipeline.simulate import distributions, patterns, settings
+
+    for module in (distributions, patterns, settings):
+        for name in dir(module):
+            found = getattr(module, name)
+            if isinstance(found, type) and hasattr(found, "model_fields"):
+                check(found)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"n_frames": 0}, "greater than or equal to 1"),
+        ({"shape": [0, 4]}, "no pixels"),
+        ({"shape": [4, 70000]}, "larger than 65535"),
+        ({"integration_time": 0}, "greater than 0"),
+        ({"integration_time": float("nan")}, "finite"),
+        ({"format": "gif"}, "tiff"),
+        ({"frame_count": 5}, "Extra inputs"),
+        ({"parameters": {"quanta_exposure": CONSTANT, "dark_current": CONSTANT}}, "exactly one of"),
+        ({"parameters": {"dn_per_electron": None}}, "exactly one of"),
+        ({"parameters": {"bias": {"kind": "normal", "mean": 1, "std": 0}}}, "greater than 0"),
+        ({"parameters": {"bias": {"kind": "uniform", "low": 2, "high": 1}}}, "not below"),
+        ({"parameters": {"bias": {"kind": "loguniform", "low": 2, "high": 1}}}, "not below"),
+        ({"parameters": {"bias": {**CONSTANT, "minimum": 2, "maximum": 1}}}, "not below"),
+        ({"parameters": {"bias": {"kind": "cauchy"}}}, "cauchy"),
+        ({"parameters": {"dead_fraction": 0.6, "stuck_fraction": 0.6}}, "above 1"),
+        ({"effects": ["earthquake"]}, "unknown; known are clipping"),
+        ({"effects": [{"row_noise_dn": 1}]}, "needs a tag"),
+        ({"effects": [{"tag": "row_noise", "row_noise": 1}]}, "row_noise_dn"),
+    ],
+)
+def test_what_is_refused(change, words):
+    with pytest.raises(ValidationError, match=words):
+        SimulateSettings.model_validate(change)
+
+
+def correlated(*pairs):
+    return {"correlations": [{"between": [a, b], "rank": rank} for a, b, rank in pairs]}
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        ([("bias", "bias", 0.5)], "with itself"),
+        ([("bias", "quanta_exposure", 1.5)], "less than 1"),
+        ([("bias", "dark_current", 0.5)], "not given"),
+        ([("bias", "quanta_exposure", 0.5), ("quanta_exposure", "bias", 0.4)], "given twice"),
+        (
+            [
+                ("bias", "quanta_exposure", 0.9),
+                ("bias", "dn_per_electron", 0.9),
+                ("quanta_exposure", "dn_per_electron", -0.9),
+            ],
+            "contradict",
+        ),
+    ],
+)
+def test_impossible_correlations_are_refused(pairs, words):
+    with pytest.raises(ValidationError, match=words):
+        ParameterSettings.model_validate(correlated(*pairs))
+
+
+def test_strong_but_possible_correlations_are_accepted():
+    pairs = [("bias", "quanta_exposure", 0.9), ("bias", "dn_per_electron", 0.9)]
+    both = [*pairs, ("quanta_exposure", "dn_per_electron", 0.8)]
+    assert len(ParameterSettings.model_validate(correlated(*both)).correlations) == 3
+
+
+def test_the_settings_import_nothing_heavy():
+    code = (
+        "import sys; import pchem_pipeline.simulate.settings; "
+        "print([m for m in ('numpy', 'numba', 'scipy') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
