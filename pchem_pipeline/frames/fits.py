@@ -74,8 +74,13 @@ class FitsReader(ContiguousReader):
             n, rows, columns = stack_shape(path, sizes, "image")
             compressed = isinstance(hdu, fits.CompImageHDU)
             start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
+            end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
             self._read_facts(primary, header)
         if compressed:
+            if end > size:
+                raise InputError(
+                    f"{path}: truncated: {end} bytes are needed, the file has {size}; copy it again"
+                )
             self.paths, self.shape, self.dtype = (path,), (n, rows, columns), unsigned_type(stored)
             self._compressed, self._size, self._signed = number, size, signed
             self._full = tuple(sizes)
@@ -118,8 +123,7 @@ class FitsReader(ContiguousReader):
         try:
             if path.stat().st_size != self._size:
                 raise changed(path, "the file changed its size")
-            with _LOCK, warnings.catch_warnings(), fits.open(path, memmap=False) as hdus:
-                warnings.simplefilter("ignore")
+            with _LOCK, fits.open(path, memmap=False) as hdus:
                 return np.asarray(hdus[self._compressed].section[window])
         except FileNotFoundError as error:
             raise changed(path, "the file vanished") from error

@@ -146,17 +146,11 @@ def _read(path: Path) -> list[_Channel]:
 def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]:
     """Read npy or npz: DN, the counts of each channel, and names of the channels."""
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if path.suffix.lower() == ".npz":
-            with loaded as archive:
-                if not {"dn", "counts"} <= set(archive.files):
-                    held = ", ".join(archive.files) or "nothing"
-                    raise InputError(
-                        f"{path}: needs the arrays dn and counts, holds {held}; save it with these names"
-                    )
-                dn, table = archive["dn"], np.atleast_2d(archive["counts"])
-        else:
-            dn, table = _split_npy(path, loaded)
+        with path.open("rb") as stream:
+            loaded = np.load(stream, allow_pickle=False)
+            dn, table = (
+                _split_npz(path, loaded) if path.suffix.lower() == ".npz" else _split_npy(path, loaded)
+            )
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(
             f"{path}: not a sound {path.suffix[1:]} file of plain numbers (pickles are never opened); "
@@ -171,6 +165,15 @@ def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]
             f"{path}: dn {dn.shape} and counts {table.shape} do not fit; counts is (channels, bins)"
         )
     return dn, list(table), [str(i) for i in range(len(table))]
+
+
+def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return DN and counts (channels, bins) of an archive of named arrays."""
+    held = set(getattr(archive, "files", ()))
+    if not {"dn", "counts"} <= held:
+        listed = ", ".join(sorted(held)) or "nothing"
+        raise InputError(f"{path}: needs the arrays dn and counts, holds {listed}; save it with these names")
+    return archive["dn"], np.atleast_2d(archive["counts"])
 
 
 def _split_npy(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -200,18 +203,18 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
         [cell.strip() for cell in row]
         for row in csv.reader(io.StringIO("\n".join(lines)), delimiter=mark, skipinitialspace=True)
     ]
+    rows = [row[:-1] if len(row) > 2 and not row[-1] else row for row in rows]  # a comma at the end of lines
     header = None if _is_number(rows[0][0]) else rows.pop(0)
     width = len(header or rows[0])
     if width < 2:
         raise InputError(f"{path}: needs two columns or more, DN and count; write it so")
     table = np.empty((len(rows), width))
     for number, row in enumerate(rows, 1 + (header is not None)):
-        cells = row[:-1] if len(row) == width + 1 and not row[-1] else row
-        if len(cells) != width or not all(_is_number(cell) for cell in cells):
+        if len(row) != width or not all(_is_number(cell) for cell in row):
             raise InputError(
                 f"{path}: row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it"
             )
-        table[number - 1 - (header is not None)] = [float(cell) for cell in cells]
+        table[number - 1 - (header is not None)] = [float(cell) for cell in row]
     names = (
         [name or str(i) for i, name in enumerate(header[1:])]
         if header

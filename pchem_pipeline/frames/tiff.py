@@ -8,6 +8,7 @@ the wanted rows need.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from pchem_pipeline.frames.tiff_facts import (
 )
 
 __all__ = ["TiffReader", "write_frames"]
+
+_QUIET = logging.NullHandler()
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class TiffReader(ContiguousReader):
         """See `FrameReader.open`."""
         import tifffile
 
+        logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
         reader = cls()
         reader._guard = threading.Lock()
         reader._decoders = {}
@@ -91,7 +95,7 @@ class TiffReader(ContiguousReader):
         pages = [page for page in file.pages if not page.is_reduced]
         reduced = len(file.pages) - len(pages)
         if not pages:
-            raise InputError(f"{path}: holds no frames; leave it out")
+            raise InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
         check_chain(path, file, size)
         notes = [f"{path.name}: {reduced} reduced pages (previews) are left out"] if reduced else []
         first = pages[0]

@@ -1,0 +1,128 @@
+"""Any window of any stack in any format equals the same slice of the whole array."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from astropy.io import fits
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import WRITERS, write_frames
+
+DTYPES = ("uint8", "uint16", "uint32")
+
+
+@st.composite
+def stacks(draw: st.DrawFn) -> NDArray[Any]:
+    shape = draw(st.tuples(st.integers(2, 9), st.integers(1, 12), st.integers(1, 12)))
+    dtype = draw(st.sampled_from(DTYPES))
+    seed = draw(st.integers(0, 2**32 - 1))
+    return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, shape, dtype=dtype, endpoint=True)
+
+
+def window(data: st.DataObject, length: int, least: int = 0) -> tuple[int, int]:
+    start = data.draw(st.integers(0, length - least))
+    return start, data.draw(st.integers(start + least, length))
+
+
+def check(data: st.DataObject, path: Path, stack: NDArray[Any], **more: Any) -> None:
+    """Compare drawn windows, with a drawn region and range, with slices of the array."""
+    n, rows, columns = stack.shape
+    t, y, x = window(data, n, 2), window(data, rows, 1), window(data, columns, 1)
+    region = data.draw(st.booleans())
+    if region:
+        more |= {"roi": (*y, *x), "frame_range": t}
+        stack = stack[slice(*t), slice(*y), slice(*x)]
+    reader = open_frames(InputSettings(files=(str(path),), **more), path.parent, check_duplicates=False)
+    assert reader.shape == stack.shape
+    for _ in range(3):
+        (t0, t1), (y0, y1) = window(data, stack.shape[0]), window(data, stack.shape[1])
+        np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), stack=stacks(), format=st.sampled_from(sorted(WRITERS)))
+def test_windows_of_what_we_write(data: st.DataObject, stack: NDArray[Any], format: str) -> None:
+    if format == "ser" and stack.dtype.itemsize == 4:
+        stack = stack.astype(np.uint16)
+    parts = data.draw(st.one_of(st.none(), st.integers(1, len(stack))))
+    with tempfile.TemporaryDirectory() as folder:
+        write_frames(
+            format, Path(folder) / "in" / "a", iter([stack]), stack.shape, stack.dtype, frames_per_file=parts
+        )
+        check(data, Path(folder) / "in", stack, format=format)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    data=st.data(),
+    stack=stacks(),
+    compression=st.sampled_from([None, "zlib", "lzw"]),
+    byteorder=st.sampled_from("<>"),
+    rows=st.one_of(st.none(), st.integers(1, 12)),
+    bigtiff=st.booleans(),
+)
+def test_windows_of_tiff(
+    data: st.DataObject,
+    stack: NDArray[Any],
+    compression: str | None,
+    byteorder: Any,
+    rows: int | None,
+    bigtiff: bool,
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.tif"
+        with tifffile.TiffWriter(path, byteorder=byteorder, bigtiff=bigtiff) as writer:
+            for frame in stack:
+                options = {"compression": compression, "rowsperstrip": rows, "metadata": None}
+                writer.write(frame, photometric="minisblack", **options)
+        check(data, path, stack)
+
+
+@settings(max_examples=15, deadline=None)
+@given(data=st.data(), stack=stacks(), compressed=st.booleans())
+def test_windows_of_fits(data: st.DataObject, stack: NDArray[Any], compressed: bool) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.fits"
+        (fits.CompImageHDU(stack) if compressed else fits.PrimaryHDU(stack)).writeto(path)
+        check(data, path, stack)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    data=st.data(),
+    stack=stacks(),
+    order=st.sampled_from(["little", "big"]),
+    header=st.integers(0, 40),
+    padding=st.integers(0, 20),
+    shift=st.integers(0, 5),
+)
+def test_windows_of_raw(
+    data: st.DataObject, stack: NDArray[Any], order: str, header: int, padding: int, shift: int
+) -> None:
+    stack = stack >> stack.dtype.type(shift)
+    stored = (stack << stack.dtype.type(shift)).astype(
+        stack.dtype.newbyteorder(">" if order == "big" else "<")
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.raw"
+        path.write_bytes(bytes(header) + b"".join(frame.tobytes() + b"\x99" * padding for frame in stored))
+        check(
+            data,
+            path,
+            stack,
+            shape=stack.shape,
+            dtype=stack.dtype.name,
+            byte_order=order,
+            header_bytes=header,
+            frame_padding_bytes=padding,
+            bit_shift=shift,
+        )

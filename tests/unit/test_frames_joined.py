@@ -1,0 +1,409 @@
+"""Files joined to one stack: order, range, region, bit shift, threads, identity, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from pchem_pipeline.errors import ConfigError, ExitCode, InputError
+from pchem_pipeline.frames.identity import hash_file
+from pchem_pipeline.frames.open import inspect_files, open_frames
+from pchem_pipeline.frames.resolve import natural_key, resolve_files
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import WRITERS, write_frames
+
+STACK = np.random.default_rng(15).integers(0, 4096, (12, 17, 19)).astype(np.uint16)
+
+
+def refused(settings: InputSettings, base: Path, words: str) -> None:
+    """Assert one clear line with exit code 4."""
+    with pytest.raises(InputError, match=words) as caught:
+        open_frames(settings, base)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == ExitCode.INPUT == 4
+
+
+def test_natural_order() -> None:
+    names = [
+        "frame10.tif",
+        "frame2.tif",
+        "Frame1.tif",
+        "a9b10.tif",
+        "a9b9.tif",
+        "frame.tif",
+        "10.tif",
+        "9.tif",
+    ]
+    order = sorted((Path(name) for name in names), key=natural_key)
+    wanted = [
+        "9.tif",
+        "10.tif",
+        "a9b9.tif",
+        "a9b10.tif",
+        "Frame1.tif",
+        "frame2.tif",
+        "frame10.tif",
+        "frame.tif",
+    ]
+    assert [path.name for path in order] == wanted
+
+
+def test_resolve(tmp_path: Path) -> None:
+    for name in ("d2/f1.npy", "d10/f1.npy", "d2/f10.npy", "d2/f9.npy", "d2/notes.txt", "d2/.hidden.npy"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        np.save(path, STACK[0]) if path.suffix == ".npy" else path.write_text("x")
+
+    def names(*files: str) -> list[str]:
+        found = resolve_files(InputSettings(files=files), tmp_path)
+        return [path.relative_to(tmp_path).as_posix() for path in found]
+
+    assert names("d2") == ["d2/f1.npy", "d2/f9.npy", "d2/f10.npy"]
+    assert names("d10", "d2/f9.npy") == ["d2/f9.npy", "d10/f1.npy"]
+    assert names("d*/*.npy") == ["d2/f1.npy", "d2/f9.npy", "d2/f10.npy", "d10/f1.npy"]
+    assert names("**/f1.npy") == ["d2/f1.npy", "d10/f1.npy"]
+    assert names(str(tmp_path / "d10" / "f1.npy")) == ["d10/f1.npy"]
+    literal = tmp_path / "odd[1].npy"
+    np.save(literal, STACK)
+    assert names("odd[1].npy") == ["odd[1].npy"]
+
+
+def test_missing_and_empty(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"input\.files is empty"):
+        open_frames(InputSettings(), tmp_path)
+    refused(InputSettings(files=("none.tif",)), tmp_path, r"none\.tif: no such file or folder")
+    refused(InputSettings(files=("*.tif",)), tmp_path, r"\*\.tif: matches no file")
+    (tmp_path / "empty").mkdir()
+    refused(InputSettings(files=("empty",)), tmp_path, "holds no camera files")
+    (tmp_path / "empty" / "a.tif").touch()
+    refused(InputSettings(files=("empty",)), tmp_path, r"a\.tif: the file is empty")
+    (tmp_path / "b.xyz").write_bytes(b"what is this")
+    refused(InputSettings(files=("b.xyz",)), tmp_path, r"b\.xyz: not a known camera format")
+    (tmp_path / "c.tif").write_bytes(b"II*\0nonsense")
+    refused(InputSettings(files=("c.tif",)), tmp_path, r"c\.tif: not a sound TIFF")
+    (tmp_path / "d.fits").write_text("hello")
+    refused(InputSettings(files=("d.fits",)), tmp_path, r"d\.fits: not a sound FITS")
+    with pytest.raises(ConfigError, match="input.format 'jpeg' is not known; choose one of: auto, npy, tiff"):
+        open_frames(InputSettings(files=("b.xyz",), format="jpeg"), tmp_path)
+
+
+def test_folder_of_several_formats(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    tifffile.imwrite(tmp_path / "a.tif", STACK + 1, photometric="minisblack")
+    refused(InputSettings(files=(".",)), tmp_path, r"several formats \(npy, tiff\); set input.format")
+    with open_frames(InputSettings(files=(".",), format="tiff"), tmp_path) as reader:
+        np.testing.assert_array_equal(reader.read(), STACK + 1)
+
+
+def test_content_wins_over_suffix(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "really_tiff.fits", STACK, photometric="minisblack")
+    np.testing.assert_array_equal(open_frames(InputSettings(files=("*",)), tmp_path).read(), STACK)
+
+
+def test_mixed_formats_are_concatenated(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "p1.tif", STACK[:5], photometric="minisblack", compression="zlib")
+    fits.PrimaryHDU(STACK[5]).writeto(tmp_path / "p2.fits")
+    with h5py.File(tmp_path / "p3.h5", "w") as file:
+        file["x"] = STACK[6:9]
+    np.save(tmp_path / "p10.npy", STACK[9:])
+    reader = open_frames(InputSettings(files=("p*",)), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    for t0, t1 in [(0, 1), (4, 6), (5, 6), (3, 10), (11, 12)]:
+        np.testing.assert_array_equal(reader.read(t0, t1, 3, 14), STACK[t0:t1, 3:14])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).read(), STACK)
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_range_and_region(tmp_path: Path, format: str) -> None:
+    write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16", frames_per_file=5)
+    settings = InputSettings(files=("a_*",), roi=(2, 13, 4, 18), frame_range=(3, 11))
+    reader = open_frames(settings, tmp_path)
+    wanted = STACK[3:11, 2:13, 4:18]
+    assert reader.shape == wanted.shape
+    np.testing.assert_array_equal(reader.read(), wanted)
+    np.testing.assert_array_equal(reader.read(1, 6, 3, 5), wanted[1:6, 3:5])
+
+
+def test_region_through_a_small_scratch_buffer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    monkeypatch.setattr("pchem_pipeline.frames.sequence._SCRATCH_BYTES", 3 * 17 * 19 * 2)
+    reader = open_frames(InputSettings(files=("a.npy",), roi=(0, 17, 5, 6)), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK[:, :, 5:6])
+
+
+def test_range_and_region_out_of_bounds(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    refused(
+        InputSettings(files=("a.npy",), roi=(0, 18, 0, 5)),
+        tmp_path,
+        r"input\.roi \[0, 18, 0, 5\] reaches beyond",
+    )
+    refused(
+        InputSettings(files=("a.npy",), frame_range=(0, 13)), tmp_path, r"does not hold at least 2 of the 12"
+    )
+    refused(InputSettings(files=("a.npy",), frame_range=(11, None)), tmp_path, "at least 2 of the 12 frames")
+    bad: list[dict[str, Any]] = [
+        {"roi": (5, 5, 0, 3)},
+        {"frame_range": (4, 4)},
+        {"integration_time": 0.0},
+        {"integration_time": float("nan")},
+        {"shape": (0, 4)},
+        {"shape": (4,)},
+        {"bit_depth": 0},
+        {"unknown": 1},
+    ]
+    for keys in bad:
+        with pytest.raises(ValidationError):
+            InputSettings(files=("a.npy",), **keys)
+
+
+def test_bit_shift(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK << 4)
+    reader = open_frames(InputSettings(files=("a.npy",), bit_shift=4), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert reader.bit_depth == 12
+    dirty = STACK << 4
+    dirty[7, 8, 9] |= 2
+    np.save(tmp_path / "a.npy", dirty)
+    reader = open_frames(InputSettings(files=("a.npy",), bit_shift=4), tmp_path)
+    np.testing.assert_array_equal(reader.read(0, 7), STACK[:7])
+    with pytest.raises(InputError, match=r"a\.npy: the lowest 4 bits are not all zero.*input\.bit_shift"):
+        reader.read()
+    refused(InputSettings(files=("a.npy",), bit_shift=16), tmp_path, "leaves nothing of uint16")
+    refused(
+        InputSettings(files=("a.npy",), bit_shift=4, bit_depth=14), tmp_path, "bit depth of 14 does not fit"
+    )
+
+
+def test_bit_depth_is_checked(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    np.testing.assert_array_equal(
+        open_frames(InputSettings(files=("a.npy",), bit_depth=12), tmp_path).read(), STACK
+    )
+    reader = open_frames(InputSettings(files=("a.npy",), bit_depth=11), tmp_path)
+    with pytest.raises(InputError, match=r"a\.npy: values need more than the bit depth of 11"):
+        reader.read()
+
+
+def test_files_that_contradict_each_other(tmp_path: Path) -> None:
+    for i, time in enumerate((1.5, 1.5, 2.0)):
+        hdu = fits.PrimaryHDU(STACK[i])
+        hdu.header["EXPTIME"] = time
+        hdu.writeto(tmp_path / f"f{i}.fits")
+    refused(
+        InputSettings(files=("*.fits",)),
+        tmp_path,
+        r"different integration_time: 1\.5 in f0\.fits, 2\.0 in f2\.fits",
+    )
+    assert (
+        open_frames(InputSettings(files=("*.fits",), integration_time=3.0), tmp_path).integration_time == 3.0
+    )
+    fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
+    assert open_frames(InputSettings(files=("*.fits",)), tmp_path).integration_time is None
+
+
+def test_zero_and_one_frame(tmp_path: Path) -> None:
+    np.save(tmp_path / "one.npy", STACK[0])
+    refused(InputSettings(files=("one.npy",)), tmp_path, r"one\.npy: 1 frame in all; at least 2 are needed")
+    np.save(tmp_path / "zero.npy", STACK[:0])
+    refused(InputSettings(files=("zero.npy",)), tmp_path, r"zero\.npy: holds no frames")
+    fits.PrimaryHDU().writeto(tmp_path / "zero.fits")
+    refused(InputSettings(files=("zero.fits",)), tmp_path, "holds no image")
+    with h5py.File(tmp_path / "zero.h5", "w") as file:
+        file["a"] = STACK[:0]
+    refused(InputSettings(files=("zero.h5",)), tmp_path, "holds no frames")
+
+
+def make_bad_folder(folder: Path) -> None:
+    """Write good files f0..f4, and one of each kind of bad file."""
+    for i in range(5):
+        tifffile.imwrite(folder / f"f{i}.tif", STACK[i], photometric="minisblack")
+    data = (folder / "f0.tif").read_bytes()
+    (folder / "f5.tif").write_bytes(data[:-50])
+    shutil.copy(folder / "f1.tif", folder / "f6.tif")
+    tifffile.imwrite(folder / "f7.tif", STACK[0, :9], photometric="minisblack")
+    tifffile.imwrite(folder / "f8.tif", STACK[0].astype(np.uint8), photometric="minisblack")
+    tifffile.imwrite(folder / "f9.tif", STACK[0].astype(np.float32), photometric="minisblack")
+    tifffile.imwrite(folder / "f10.tif", np.zeros((17, 19, 3), np.uint16), photometric="rgb")
+    (folder / "f11.tif").write_bytes(b"")
+
+
+def test_one_message_lists_all_bad_files(tmp_path: Path) -> None:
+    make_bad_folder(tmp_path)
+    settings = InputSettings(files=("*.tif", str(tmp_path / "f2.tif")))
+    with pytest.raises(InputError) as caught:
+        open_frames(settings, tmp_path)
+    message = str(caught.value)
+    assert message.startswith("8 of 13 input files cannot be used: ")
+    assert message.endswith("; repair or remove them, or set input.on_bad_file: skip")
+    for words in (
+        "f2.tif: is named twice in input.files",
+        "f5.tif: truncated",
+        "f6.tif: has the same content as f1.tif",
+        "f7.tif: has 9 x 19 uint16 frames, where the others have 17 x 19 uint16",
+        "f8.tif: has 17 x 19 uint8 frames, where the others have 17 x 19 uint16",
+        "f9.tif: floating-point samples",
+        "f10.tif: colour",
+        "f11.tif: the file is empty",
+    ):
+        assert words in message
+    assert "\n" not in message
+    report = inspect_files(settings, tmp_path)
+    assert len(report.bad) == 8
+    assert [file.path.name for file in report.good] == [f"f{i}.tif" for i in range(5)]
+    reader = open_frames(settings.model_copy(update={"on_bad_file": "skip"}), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK[:5])
+    assert "they were left out (input.on_bad_file: skip)" in reader.report.message()
+    assert reader.report.to_dict()["used"] == 5
+    assert len(reader.report.to_dict()["left_out"]) == 8
+
+
+def test_skip_with_nothing_left(tmp_path: Path) -> None:
+    for name in ("a.tif", "b.tif"):
+        (tmp_path / name).write_bytes(b"II*\0rubbish")
+    refused(
+        InputSettings(files=("*.tif",), on_bad_file="skip"), tmp_path, "2 of 2 input files cannot be used"
+    )
+
+
+def test_duplicate_by_link_and_by_content(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    (tmp_path / "b.npy").symlink_to(tmp_path / "a.npy")
+    refused(InputSettings(files=("*.npy",)), tmp_path, r"b\.npy: is named twice")
+    (tmp_path / "b.npy").unlink()
+    shutil.copy(tmp_path / "a.npy", tmp_path / "b.npy")
+    refused(InputSettings(files=("*.npy",)), tmp_path, r"b\.npy: has the same content as a\.npy")
+    other = np.load(tmp_path / "b.npy")
+    other[6, 8, 9] ^= 1
+    np.save(tmp_path / "b.npy", other)
+    assert open_frames(InputSettings(files=("*.npy",)), tmp_path).shape[0] == 24
+
+
+def test_large_files_that_differ_between_the_samples(tmp_path: Path) -> None:
+    """Equal beginning, middle and end is not equal content."""
+    big = np.zeros((8, 200, 200), np.uint16)
+    np.save(tmp_path / "a.npy", big)
+    big[2, 100, 100] = 1
+    np.save(tmp_path / "b.npy", big)
+    assert open_frames(InputSettings(files=("*.npy",)), tmp_path).shape[0] == 16
+
+
+def test_gaps_in_the_numbers(tmp_path: Path) -> None:
+    for i in (1, 2, 3, 6, 7):
+        np.save(tmp_path / f"frame_{i:04d}.npy", STACK[i])
+    message = open_frames(InputSettings(files=(".",)), tmp_path).report.message()
+    assert message == "2 of the numbered files frame_#.npy are missing between the first and the last"
+    for i in (4, 5):
+        np.save(tmp_path / f"frame_{i:04d}.npy", STACK[i])
+    assert open_frames(InputSettings(files=(".",)), tmp_path).report.message() == ""
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_file_that_vanishes(tmp_path: Path, format: str) -> None:
+    [path] = write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16")
+    reader = open_frames(InputSettings(files=(str(path),)), tmp_path)
+    path.rename(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"vanished while it was being read; restore"):
+        reader.read()
+
+
+@pytest.mark.parametrize("format", ["raw", "npy", "tiff", "fits", "ser"])
+def test_file_that_shrinks(tmp_path: Path, format: str) -> None:
+    [path] = write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16")
+    reader = open_frames(InputSettings(files=(str(path),)), tmp_path)
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(InputError, match=r"became shorter while it was being read"):
+        reader.read()
+
+
+@pytest.mark.parametrize("format", [*WRITERS, "zlib", "rice"])
+def test_many_threads_on_one_reader(tmp_path: Path, format: str) -> None:
+    if format == "zlib":
+        tifffile.imwrite(tmp_path / "a.tif", STACK, photometric="minisblack", compression="zlib")
+    elif format == "rice":
+        fits.CompImageHDU(STACK).writeto(tmp_path / "a.fits")
+    else:
+        write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16", frames_per_file=5)
+    reader = open_frames(InputSettings(files=("a[._]*",)), tmp_path)
+    rng = np.random.default_rng(4)
+    windows = []
+    for _ in range(120):
+        t0, t1 = sorted(rng.choice(13, 2, replace=False).tolist())
+        y0, y1 = sorted(rng.choice(18, 2, replace=False).tolist())
+        windows.append((t0, t1, y0, y1))
+
+    def task(window: tuple[int, int, int, int]) -> bool:
+        t0, t1, y0, y1 = window
+        return bool((reader.read(t0, t1, y0, y1) == STACK[t0:t1, y0:y1]).all())
+
+    with ThreadPoolExecutor(6) as pool:
+        assert all(pool.map(task, windows))
+
+
+def test_read_into_checks_its_arguments(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    reader = open_frames(InputSettings(files=("a.npy",)), tmp_path)
+    good: NDArray[np.uint16] = np.empty((2, 17, 19), np.uint16)
+    reader.read_into(good, 3, 5)
+    np.testing.assert_array_equal(good, STACK[3:5])
+    for buffer in (good[:1], good.astype(np.uint32), np.asfortranarray(good), good[:, ::2]):
+        with pytest.raises(ValueError, match="does not fit"):
+            reader.read_into(buffer, 3, 5)
+    for window in [(-1, 1), (11, 13), (5, 4)]:
+        with pytest.raises(ValueError, match="outside of the stack"):
+            reader.read_into(good, *window)
+    with pytest.raises(ValueError, match="outside of the stack"):
+        reader.read_into(good, 3, 5, 0, 18)
+
+
+def test_identity(tmp_path: Path) -> None:
+    first, second = tmp_path / "one", tmp_path / "two"
+    for folder in (first, second):
+        write_frames("npy", folder / "a.npy", iter([STACK]), STACK.shape, "uint16", frames_per_file=4)
+    settings = InputSettings(files=("*.npy",))
+    here, there = open_frames(settings, first), open_frames(settings, second)
+    identity = here.identity()
+    assert identity == there.identity()
+    assert [file["name"] for file in identity["files"]] == ["a_00001.npy", "a_00002.npy", "a_00003.npy"]
+    assert identity["files"][0]["xxh3_128"] == hash_file(first / "a_00001.npy")
+    assert str(tmp_path) not in str(identity)
+    before = there.quick_identity()
+    changed = np.load(second / "a_00002.npy")
+    changed[0, 0, 0] ^= 1
+    np.save(second / "a_00002.npy", changed)
+    os.utime(second / "a_00002.npy", ns=(1, 1))
+    assert there.identity()["digest"] != identity["digest"]
+    assert there.quick_identity() != before
+    assert [file["size"] for file in before["files"]] == [file["size"] for file in identity["files"]]
+    (second / "a_00003.npy").unlink()
+    with pytest.raises(InputError, match="check that it is still there"):
+        there.quick_identity()
+
+
+def test_hash_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
+    import xxhash
+
+    data = np.random.default_rng(1).bytes((1 << 22) + 12345)
+    (tmp_path / "a").write_bytes(data)
+    assert hash_file(tmp_path / "a") == xxhash.xxh3_128(data).hexdigest()
+
+
+def test_unreadable_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, STACK)
+    path.chmod(0)
+    if os.access(path, os.R_OK):
+        pytest.skip("this user may read everything")
+    refused(InputSettings(files=("a.npy",)), tmp_path, "cannot be read")

@@ -1,0 +1,276 @@
+"""Raw bytes with settings or sidecar, npy and SER, written as plain bytes, read back exactly."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.raw import RawReader
+from pchem_pipeline.frames.ser import SerReader
+from pchem_pipeline.frames.settings import InputSettings
+
+STACK = np.random.default_rng(14).integers(0, 65536, (5, 11, 13)).astype(np.uint16)
+
+
+def read(path: Path, **settings: Any) -> NDArray[Any]:
+    with open_frames(InputSettings(files=(str(path),), **settings), path.parent) as reader:
+        return reader.read()
+
+
+def raw_bytes(stack: NDArray[Any], dtype: str, header: int, padding: int, last_padding: bool = True) -> bytes:
+    """Lay frames out by hand."""
+    frames = [frame.astype(dtype).tobytes() + b"\xaa" * padding for frame in stack]
+    data = b"\x55" * header + b"".join(frames)
+    return data if last_padding or not padding else data[:-padding]
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32"])
+@pytest.mark.parametrize(
+    ("header", "padding", "last"), [(0, 0, True), (7, 0, True), (0, 5, True), (512, 3, False)]
+)
+def test_raw_by_settings(
+    tmp_path: Path, order: str, dtype: str, header: int, padding: int, last: bool
+) -> None:
+    stack = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, STACK.shape, dtype=dtype, endpoint=True)
+    path = tmp_path / "a.raw"
+    code = (">" if order == "big" else "<") + np.dtype(dtype).str[1:]
+    path.write_bytes(raw_bytes(stack, code, header, padding, last))
+    settings: dict[str, Any] = {
+        "dtype": dtype,
+        "byte_order": order,
+        "header_bytes": header,
+        "frame_padding_bytes": padding,
+    }
+    for shape in ((11, 13), (5, 11, 13)):
+        np.testing.assert_array_equal(read(path, shape=shape, **settings), stack)
+    reader = open_frames(InputSettings(files=("a.raw",), shape=(11, 13), **settings), tmp_path)
+    np.testing.assert_array_equal(reader.read(1, 4, 2, 9), stack[1:4, 2:9])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).read(4, 5, 10, 11), stack[4:5, 10:11])
+
+
+@pytest.mark.parametrize("name", ["a.raw.json", "a.json", "a.raw.yaml", "a.yml"])
+def test_raw_by_sidecar(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.raw"
+    path.write_bytes(raw_bytes(STACK >> 4 << 4, ">u2", 16, 4))
+    side = {
+        "shape": [11, 13],
+        "dtype": "uint16",
+        "byte_order": "big",
+        "header_bytes": 16,
+        "frame_padding_bytes": 4,
+        "bit_shift": 4,
+        "integration_time": 0.25,
+        "camera": "left alone",
+    }
+    text = (
+        json.dumps(side)
+        if name.endswith("json")
+        else "\n".join(f"{k}: {json.dumps(v)}" for k, v in side.items())
+    )
+    (tmp_path / name).write_text(text)
+    reader = open_frames(InputSettings(files=("*.raw",)), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK >> 4)
+    assert (reader.bit_shift, reader.bit_depth, reader.integration_time) == (4, 12, 0.25)
+    # a setting wins over the sidecar
+    np.testing.assert_array_equal(read(path, bit_shift=0), STACK >> 4 << 4)
+
+
+def test_raw_needs_a_description(tmp_path: Path) -> None:
+    path = tmp_path / "a.raw"
+    path.write_bytes(bytes(100))
+    with pytest.raises(
+        InputError, match=r"raw frames need input.shape and input.dtype; .*sidecar a\.raw\.json"
+    ):
+        read(path)
+    with pytest.raises(InputError, match=r"raw frames need input.dtype;"):
+        read(path, shape=(5, 5))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "cannot be read"),
+        ("[1]", "Input should be a valid dictionary"),
+        ('{"shape": [5, 5], "dtype": "int16"}', "dtype"),
+        ('{"shape": "x", "dtype": "uint8"}', "shape"),
+        ('{"shape": [0, 5], "dtype": "uint8"}', "make no sense"),
+        ('{"shape": [5, 5], "dtype": "uint8", "header_bytes": -3}', "make no sense"),
+    ],
+)
+def test_raw_with_a_bad_sidecar(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "a.raw"
+    path.write_bytes(bytes(100))
+    path.with_name("a.raw.json").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_raw_truncated_or_of_another_shape(tmp_path: Path) -> None:
+    path = tmp_path / "a.raw"
+    path.write_bytes(raw_bytes(STACK, "<u2", 0, 0)[:-1])
+    with pytest.raises(
+        InputError, match=r"a\.raw: truncated, or not 11 x 13 uint16: 1429 bytes .*input.shape"
+    ):
+        read(path, shape=(11, 13), dtype="uint16")
+    with pytest.raises(
+        InputError, match=r"truncated: 5 frames need 1430 bytes, the file has 1429 \(4 whole frames\)"
+    ):
+        read(path, shape=(5, 11, 13), dtype="uint16")
+    with pytest.raises(InputError, match="truncated, or not"):
+        read(path, shape=(11, 13), dtype="uint16", header_bytes=10_000)
+
+
+def test_raw_with_more_frames_than_stated(tmp_path: Path) -> None:
+    path = tmp_path / "a.raw"
+    path.write_bytes(raw_bytes(STACK, "<u2", 0, 0))
+    reader = open_frames(InputSettings(files=("a.raw",), shape=(3, 11, 13), dtype="uint16"), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK[:3])
+    assert "holds 5 frames, of which the first 3 are used" in reader.report.message()
+
+
+@pytest.mark.parametrize("dtype", ["u1", "<u2", ">u2", "<u4", ">u4"])
+@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0)])
+def test_npy(tmp_path: Path, dtype: str, version: tuple[int, int]) -> None:
+    stack = np.random.default_rng(2).integers(0, 256 ** np.dtype(dtype).itemsize, STACK.shape).astype(dtype)
+    path = tmp_path / "a.npy"
+    with path.open("wb") as stream:
+        np.lib.format.write_array(stream, stack, version=version)
+    np.testing.assert_array_equal(read(path), stack)
+    reader = open_frames(InputSettings(files=("a.npy",)), tmp_path)
+    assert reader.dtype.isnative
+    np.testing.assert_array_equal(reader.read(1, 4, 2, 9), stack[1:4, 2:9])
+
+
+def test_npy_single_frames_and_cubes_together(tmp_path: Path) -> None:
+    np.save(tmp_path / "f1.npy", STACK[0])
+    np.save(tmp_path / "f2.npy", STACK[1:4])
+    np.save(tmp_path / "f10.npy", STACK[4])
+    np.testing.assert_array_equal(read(tmp_path), STACK)
+
+
+def test_npy_refusals(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+
+    def refused(array: NDArray[Any], words: str, **settings: Any) -> None:
+        np.save(path, array)
+        with pytest.raises(InputError, match=words) as caught:
+            read(path, **settings)
+        assert str(caught.value).startswith(str(path))
+
+    refused(np.array([[{"a": 1}, None]] * 2), "object array, whose pickle is never opened")
+    refused(STACK.astype(np.float64), "floating-point")
+    refused(STACK.astype(np.complex64), "floating-point")
+    refused(STACK.astype(bool), "samples of type bool")
+    refused(STACK.astype(np.uint64), "samples of type uint64")
+    refused(STACK.astype(np.int16), "signed samples")
+    refused(np.zeros(3, np.uint8), "frames need")
+    refused(np.zeros((2, 2, 4, 5), np.uint8), "2 axes before rows and columns")
+    refused(np.zeros((2, 1, 6, 5, 3), np.uint8), "2 axes before rows and columns")
+    refused(np.zeros((1, 6, 5, 3), np.uint8), "looks like colour")
+    refused(np.asfortranarray(STACK), "Fortran order")
+    refused(STACK, "input.dtype says uint8", dtype="uint8")
+    refused(np.zeros((3, 4), np.dtype([("a", "u1"), ("b", "u2")])), "objects, not numbers")
+    np.save(path, (STACK & 0x7FFF).astype(">i2"))
+    np.testing.assert_array_equal(read(path, dtype="uint16"), STACK & 0x7FFF)
+    refused(-(STACK & 0xFF).astype(np.int16), "negative values", dtype="uint16")
+
+
+def test_npy_never_opens_a_pickle(tmp_path: Path) -> None:
+    """A file that would run code when unpickled."""
+
+    class Trap:
+        def __reduce__(self) -> Any:
+            return (Path.touch, (tmp_path / "sprung",))
+
+    np.save(tmp_path / "a.npy", np.array([Trap(), Trap()], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="never opened"):
+        read(tmp_path / "a.npy")
+    (tmp_path / "b.npy").write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(InputError, match="not a sound npy file"):
+        read(tmp_path / "b.npy")
+    assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("kept", [3, 9, 60, 128, 129, -1])
+def test_npy_truncated(tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, STACK)
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(InputError, match="truncated"):
+        read(path)
+
+
+def ser_bytes(stack: NDArray[Any], depth: int, colour: int = 0, flag: int = 0, times: bool = False) -> bytes:
+    """Build a SER file by hand, from the text of the format."""
+    n, rows, columns = stack.shape
+    head = b"LUCAM-RECORDER" + struct.pack("<7i", 0, colour, flag, columns, rows, depth, n) + bytes(120)
+    head += struct.pack("<2q", 637_000_000_000_000_000, 637_000_000_000_000_000)
+    assert len(head) == 178
+    tail = (
+        struct.pack(f"<{n}q", *(637_000_000_000_000_000 + 5_000_000 * i for i in range(n))) if times else b""
+    )
+    return head + stack.tobytes() + tail
+
+
+def test_ser(tmp_path: Path) -> None:
+    path = tmp_path / "a.ser"
+    for stack, depth, flag in [
+        ((STACK & 255).astype(np.uint8), 8, 0),
+        ((STACK & 4095).astype("<u2"), 12, 0),
+        (STACK.astype("<u2"), 16, 0),
+        (STACK.astype(">u2"), 16, 1),
+    ]:
+        path.write_bytes(ser_bytes(stack, depth, flag=flag))
+        reader = open_frames(InputSettings(files=("a.ser",)), tmp_path)
+        np.testing.assert_array_equal(reader.read(), stack)
+        np.testing.assert_array_equal(reader.read(2, 5, 3, 8), stack[2:5, 3:8])
+        assert reader.bit_depth == depth
+        assert reader.timestamps is None
+    path.write_bytes(ser_bytes(STACK.astype(">u2"), 16, flag=0))
+    np.testing.assert_array_equal(read(path, byte_order="big"), STACK)
+
+
+def test_ser_times(tmp_path: Path) -> None:
+    path = tmp_path / "a.ser"
+    path.write_bytes(ser_bytes(STACK, 16, times=True))
+    times = SerReader.open(path, InputSettings()).timestamps
+    assert times is not None
+    np.testing.assert_allclose(np.diff(times), 0.5, atol=1e-6)
+    assert np.datetime64(int(times[0]), "s").astype(str).startswith("2019-07-2")
+    both = open_frames(InputSettings(files=("a.ser",), frame_range=(2, 5)), tmp_path)
+    assert both.timestamps is not None
+    np.testing.assert_array_equal(both.timestamps, times[2:5])
+
+
+def test_ser_refusals(tmp_path: Path) -> None:
+    path = tmp_path / "a.ser"
+    for data, words in [
+        (ser_bytes(STACK, 16, colour=8), r"colour video \(Bayer, ColorID 8\)"),
+        (ser_bytes(STACK, 16, colour=100), r"colour video \(RGB"),
+        (ser_bytes(STACK, 33), "damaged header"),
+        (ser_bytes(STACK, 16)[:100], "truncated, or not SER"),
+        (
+            ser_bytes(STACK, 16)[:-1],
+            r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 whole frames\)",
+        ),
+    ]:
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=words):
+            read(path)
+
+
+def test_reader_of_a_missing_file(tmp_path: Path) -> None:
+    for cls in (RawReader, SerReader):
+        with pytest.raises(InputError, match="cannot be read"):
+            cls.open(tmp_path / "none", InputSettings(shape=(2, 2), dtype="uint8"))

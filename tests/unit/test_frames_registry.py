@@ -1,0 +1,145 @@
+"""Readers from elsewhere, doubles, missing optional libraries, and import manners."""
+
+from __future__ import annotations
+
+import builtins
+import importlib
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import ConfigError, MissingDependencyError
+from pchem_pipeline.frames import registry
+from pchem_pipeline.frames.base import FrameReader, check_window
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import write_frames
+
+
+class TextReader(FrameReader):
+    """A reader as someone else would write it: frames as lines of text."""
+
+    format_name = "textframes"
+    suffixes: ClassVar[tuple[str, ...]] = (".txf",)
+    magic: ClassVar[tuple[bytes, ...]] = (b"TEXTFRAMES",)
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        reader = cls()
+        reader.paths = (path,)
+        lines = path.read_text().splitlines()[1:]
+        reader.data = np.array(
+            [[[int(v) for v in row.split()] for row in line.split("|")] for line in lines], np.uint16
+        )
+        n, rows, columns = reader.data.shape
+        reader.shape, reader.dtype = (n, rows, columns), reader.data.dtype
+        return reader
+
+    data: NDArray[np.uint16]
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        buffer[...] = self.data[t0:t1, y0:y1]
+
+
+class NoReader:
+    """Not a reader at all."""
+
+
+def plug_in(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
+    found = [EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in points]
+    monkeypatch.setattr(registry, "entry_points", lambda group: found)
+
+
+def test_reader_from_a_plug_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plug_in(monkeypatch, ("textframes", f"{__name__}:TextReader"))
+    (tmp_path / "a.txf").write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
+    for settings in (
+        InputSettings(files=("a.txf",)),
+        InputSettings(files=(".",)),
+        InputSettings(files=("a.txf",), format="textframes"),
+    ):
+        np.testing.assert_array_equal(
+            open_frames(settings, tmp_path).read(), np.arange(1, 9).reshape(2, 2, 2)
+        )
+    assert "textframes" in registry.reader_names()
+
+
+def test_plug_in_is_not_loaded_without_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plug_in(monkeypatch, ("broken", "there_is_no_such_module:Reader"))
+    np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
+    assert open_frames(InputSettings(files=("a.npy",)), tmp_path).shape == (2, 3, 4)
+    with pytest.raises(ConfigError, match="the reader 'broken' .* cannot be loaded"):
+        open_frames(InputSettings(files=("a.npy",), format="broken"), tmp_path)
+
+
+def test_doubles_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    plug_in(monkeypatch, ("tiff", "other.package:Tiff"))
+    with pytest.raises(
+        ConfigError, match="two readers are named 'tiff': pchem_pipeline itself and other.package:Tiff"
+    ):
+        registry.reader_names()
+    plug_in(monkeypatch, ("sif", "one.package:Sif"), ("sif", "two.package:Sif"))
+    with pytest.raises(ConfigError, match="two readers are named 'sif': one.package:Sif and two.package:Sif"):
+        registry.reader_class("sif")
+    plug_in(monkeypatch, ("sif", "one.package:Sif"), ("sif", "one.package:Sif"))
+    assert registry.reader_names()[-1] == "sif"
+
+
+@pytest.mark.parametrize(("name", "cls"), [("noreader", "NoReader"), ("othername", "TextReader")])
+def test_plug_in_that_is_no_reader(monkeypatch: pytest.MonkeyPatch, name: str, cls: str) -> None:
+    plug_in(monkeypatch, (name, f"{__name__}:{cls}"))
+    with pytest.raises(ConfigError, match=f"must be a FrameReader with format_name = '{name}'"):
+        registry.reader_class(name)
+
+
+@pytest.mark.parametrize(
+    ("format", "module", "extra"), [("fits", "astropy", "fits"), ("hdf5", "h5py", "hdf5")]
+)
+def test_missing_library_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str, module: str, extra: str
+) -> None:
+    stack = np.zeros((2, 3, 4), np.uint16)
+    [path] = write_frames(format, tmp_path / "a", iter([stack]), stack.shape, "uint16")
+    for name in list(sys.modules):
+        if name == module or name.startswith(f"{module}."):
+            monkeypatch.delitem(sys.modules, name)
+    real = builtins.__import__
+
+    def importer(name: str, *rest: Any) -> Any:
+        if name.split(".")[0] == module:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", importer)
+    real_import = importlib.import_module
+    monkeypatch.setattr(
+        importlib,
+        "import_module",
+        lambda name, *rest: importer(name) if name.split(".")[0] == module else real_import(name, *rest),
+    )
+    for action in (
+        lambda: open_frames(InputSettings(files=(str(path),)), tmp_path),
+        lambda: write_frames(format, tmp_path / "b", iter([stack]), stack.shape, "uint16"),
+    ):
+        with pytest.raises(MissingDependencyError) as caught:
+            action()
+        assert f'pip install "pchem-pipeline[{extra}]"' in str(caught.value)
+
+
+def test_settings_and_registry_import_nothing_heavy() -> None:
+    code = (
+        "import sys, pchem_pipeline.frames.settings, pchem_pipeline.frames.open, pchem_pipeline.frames.writing\n"
+        "from pchem_pipeline.frames.registry import frame_suffixes\n"
+        "frame_suffixes()\n"
+        "heavy = {'numba', 'scipy', 'zarr', 'matplotlib', 'tifffile', 'astropy', 'h5py', 'dask', 'yaml'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

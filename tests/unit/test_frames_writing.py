@@ -1,0 +1,143 @@
+"""Writers: every format, streamed, in parts, whole or not at all, readable by the format's own library."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import zarr
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import WRITERS, write_frames
+
+SHAPE = (13, 9, 10)
+
+
+def make_stack(dtype: str) -> NDArray[Any]:
+    stack = np.random.default_rng(5).integers(0, np.iinfo(dtype).max, SHAPE, dtype=dtype, endpoint=True)
+    stack[0, 0, :2] = 0, np.iinfo(dtype).max
+    return stack
+
+
+def blocks(stack: NDArray[Any], size: int) -> Iterator[NDArray[Any]]:
+    for start in range(0, len(stack), size):
+        yield stack[start : start + size]
+
+
+@pytest.mark.parametrize("format", WRITERS)
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32"])
+@pytest.mark.parametrize(("size", "per_file"), [(4, None), (13, None), (4, 1), (5, 3), (2, 6)])
+def test_round_trip(tmp_path: Path, format: str, dtype: str, size: int, per_file: int | None) -> None:
+    stack = make_stack(dtype)
+    if format == "ser" and dtype == "uint32":
+        with pytest.raises(InputError, match="at most 16 bits"):
+            write_frames(format, tmp_path / "a", blocks(stack, size), SHAPE, dtype)
+        return
+    paths = write_frames(
+        format,
+        tmp_path / "new" / "a",
+        blocks(stack, size),
+        SHAPE,
+        dtype,
+        frames_per_file=per_file,
+        integration_time=0.5,
+    )
+    assert len(paths) == (1 if per_file is None else -(-13 // per_file))
+    assert not list(tmp_path.rglob(".partial*"))
+    reader = open_frames(InputSettings(files=tuple(str(path) for path in paths)), tmp_path)
+    assert reader.dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(reader.read(), stack)
+    assert reader.integration_time == (None if format in ("npy", "ser") else 0.5)
+
+
+def test_own_libraries_read_what_we_write(tmp_path: Path) -> None:
+    stack = make_stack("uint16")
+    written = {
+        name: write_frames(
+            name, tmp_path / "a", blocks(stack, 4), SHAPE, "uint16", integration_time=4.87, bit_depth=16
+        )[0]
+        for name in WRITERS
+    }
+    np.testing.assert_array_equal(tifffile.imread(written["tiff"]), stack)
+    with fits.open(written["fits"]) as units:
+        units.verify("exception")
+        np.testing.assert_array_equal(units[0].data, stack)
+        assert units[0].header["EXPTIME"] == 4.87
+    with h5py.File(written["hdf5"]) as file:
+        np.testing.assert_array_equal(file["frames"][()], stack)
+        assert file["frames"].attrs["integration_time"] == 4.87
+    np.testing.assert_array_equal(np.load(written["npy"]), stack)
+    np.testing.assert_array_equal(np.fromfile(written["raw"], "<u2").reshape(SHAPE), stack)
+    assert json.loads((tmp_path / "a.raw.json").read_text())["bit_depth"] == 16
+    array = zarr.open_array(written["zarr"], mode="r")
+    np.testing.assert_array_equal(np.asarray(array[:]), stack)
+    assert array.metadata.dimension_names == ("frame", "y", "x")
+
+
+def test_big_files_become_bigtiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    real = tifffile.imwrite
+    monkeypatch.setattr(
+        tifffile, "imwrite", lambda *a, **k: asked.append(k["bigtiff"]) or real(*a, **{**k, "bigtiff": True})
+    )
+    write_frames("tiff", tmp_path / "a", blocks(make_stack("uint16"), 4), SHAPE, "uint16")
+    assert asked == [False]
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        assert file.is_bigtiff
+
+    def stop(*args: Any, bigtiff: bool, **rest: Any) -> None:
+        asked.append(bigtiff)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tifffile, "imwrite", stop)
+    with pytest.raises(InputError, match=r"b\.tif: cannot be written \(No space left on device\)"):
+        write_frames("tiff", tmp_path / "b", iter([]), (17_750, 512, 512), "uint16")
+    assert asked[-1]
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_nothing_is_left_of_a_broken_write(tmp_path: Path, format: str) -> None:
+    stack = make_stack("uint16")
+
+    def breaking() -> Iterator[NDArray[Any]]:
+        yield stack[:4]
+        raise RuntimeError("simulated mishap")
+
+    with pytest.raises(RuntimeError, match="mishap"):
+        write_frames(format, tmp_path / "a", breaking(), SHAPE, "uint16")
+    assert list(tmp_path.iterdir()) == []
+    write_frames(format, tmp_path / "a", iter([stack]), SHAPE, "uint16")
+    before = sorted((p.name, p.stat().st_size) for p in tmp_path.rglob("*"))
+    with pytest.raises(RuntimeError, match="mishap"):
+        write_frames(format, tmp_path / "a", breaking(), SHAPE, "uint16")
+    assert sorted((p.name, p.stat().st_size) for p in tmp_path.rglob("*")) == before
+
+
+def test_blocks_must_make_up_the_shape(tmp_path: Path) -> None:
+    stack = make_stack("uint16")
+    with pytest.raises(ValueError, match="end 3 frames too early"):
+        write_frames("npy", tmp_path / "a", iter([stack[:10]]), SHAPE, "uint16")
+    with pytest.raises(ValueError, match="more frames than"):
+        write_frames("npy", tmp_path / "a", iter([stack, stack[:1]]), SHAPE, "uint16")
+    with pytest.raises(ValueError, match="a block of shape"):
+        write_frames("npy", tmp_path / "a", iter([stack[:, :4]]), SHAPE, "uint16")
+    with pytest.raises(ValueError, match="not int16"):
+        write_frames("npy", tmp_path / "a", iter([stack]), SHAPE, "int16")
+    with pytest.raises(ConfigError, match="cannot be written as 'jpeg'; choose one of: tiff, fits"):
+        write_frames("jpeg", tmp_path / "a", iter([stack]), SHAPE, "uint16")
+
+
+def test_a_folder_in_the_way(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_frames("npy", tmp_path / "file" / "a", iter([make_stack("uint8")]), SHAPE, "uint8")
