@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["CAPTIONS", "SECTIONS", "case_name", "highlighted_cases"]
+__all__ = ["CAPTIONS", "MAP_READING", "SECTIONS", "case_name", "highlighted_cases"]
 
 #: (id, heading, introduction, parts that may be missing) of the sections that show figures.
 SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
@@ -86,20 +86,12 @@ CAPTIONS: dict[str, str] = {
     ),
     "read_noise_histogram": (
         "Read noise, quantisation included. The blue line is the median, the shaded part holds the pixels"
-        " from 5 to 95 %. {below} of the pixels with a value lie below 0.4 e⁻."
+        " from 5 to 95 %. {below} of the {noun}s with a value lie below 0.4 e⁻."
     ),
-    "map_beta": (
-        "Top: histogram, with the median as a blue line. Bottom: map; colours follow the rank of a pixel "
-        "(Beta(2,2) stretch), so that a few outliers do not hide the structure. The five labels of the "
-        "colour bar are the minimum, the 15.6, 50 and 84.4 % quantiles and the maximum."
-    ),
-    "map_linear": (
-        "Top: histogram, with the median as a blue line. Bottom: map; colours are linear between the 1st "
-        "and the 99th percentile, values beyond have the end colours."
-    ),
-    "channels": (
-        "Value of each channel with its standard error; crosses at the bottom are channels without a value."
-    ),
+    "map_dark_current": "Dark current: quanta exposure over integration time.",
+    "map_conversion_gain": "Conversion gain: electrons per digital number.",
+    "map_bias": "Bias: the digital number at zero electrons.",
+    "map_read_noise_e": "Read noise in electrons, quantisation included.",
     "ensemble": (
         "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
         "uniformity correction at the bottom, where the peaks lie at whole electrons. Lines: prediction "
@@ -123,6 +115,22 @@ CAPTIONS: dict[str, str] = {
     "fit_status": (
         "Light gray pixels have a good fit. A pixel with several reasons has the colour of the first that"
         " applies; the numbers count every reason."
+    ),
+}
+
+#: How to read the figures of the section ``maps``, by how they are drawn.
+MAP_READING: dict[str, str] = {
+    "beta": (
+        "Colours follow the rank of a pixel (Beta(2,2) stretch), so that a few outliers do not hide the "
+        "structure: the five labels of the colour bar are the minimum, the 15.6, 50 and 84.4 % quantiles "
+        "and the maximum. The blue line in a histogram is the median."
+    ),
+    "linear": (
+        "Colours are linear between the 1st and the 99th percentile; values beyond have the end colours. "
+        "The blue line in a histogram is the median."
+    ),
+    "channels": (
+        "Each point is a channel with its standard error; crosses at the bottom are channels without a value."
     ),
 }
 

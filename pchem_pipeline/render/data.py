@@ -106,3 +106,12 @@ class ReportData:
     inputs: Sequence[Mapping[str, Any]] = ()
     stages: Sequence[Mapping[str, Any]] = ()
     missing: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def noun(self) -> str:
+        """What an element of a map is called: ``pixel``, or ``channel`` for ready-made histograms."""
+        return "channel" if self.shape[0] == 1 else "pixel"
+
+    def has_values(self, name: str) -> bool:
+        """Tell whether a map exists and at least one pixel has a value in it."""
+        return name in self.maps and bool(np.isfinite(self.maps[name]).any())

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.render.pixel_figures import shown_bins
@@ -84,6 +85,7 @@ def ensemble(
         top = figure.add_subplot(grid[2 * i, 0])
         strip = figure.add_subplot(grid[2 * i + 1, 0], sharex=top)
         _ensemble_bulk(top, half, rmse, n_frames)
+        top.set_ylim(0.0, (1.3 if wide else 1.75) * top.get_ylim()[1])
         _ensemble_strip(strip, half)
         top.tick_params(labelbottom=False)
         if wide:
@@ -126,8 +128,11 @@ def _half(arrays: Mapping[str, NDArray[Any]], axis_name: str, data: str, model: 
 
 
 def _bulk(half: _Half) -> slice:
-    """Return the bins that can be seen on a linear axis: above 1/300 of the peak, and a margin."""
-    seen = np.flatnonzero(half.density > half.density.max() / 300.0)
+    """Return the bins that can be seen on a linear axis: above 1/300 of the peak, the last 0.2 % left out."""
+    rest = np.cumsum(half.counts) / half.counts.sum()
+    seen = np.flatnonzero((half.density > half.density.max() / 300.0) & (rest > 5e-4) & (rest < 0.998))
+    if seen.size == 0:
+        seen = np.flatnonzero(half.density == half.density.max())
     margin = max(2, int(seen[-1] - seen[0]) // 14)
     return slice(max(int(seen[0]) - margin, 0), int(seen[-1]) + margin + 1)
 
@@ -148,7 +153,6 @@ def _ensemble_bulk(top: Axes, half: _Half, rmse: Mapping[str, float], n_frames: 
     if floor is not None:
         top.plot([], [], color="none", label=f"sampling noise alone, RMSE {short(floor, 2)}")
     top.set(ylabel=f"density (1/{half.unit})", xlim=(edges[0], edges[-1]))
-    top.set_ylim(0.0, 1.3 * top.get_ylim()[1])
     top.set_title("raw ensemble" if half.raw else "after non-uniformity correction")
     top.legend(loc="upper right")
 
@@ -219,7 +223,7 @@ def electron_numbers(
     strip.axhline(0.0, color=BLACK, linewidth=0.5)
     top.set(ylabel="probability", ylim=(0.0, 1.4 * max(float(np.nanmax(mass, initial=0.0)), 1e-12)))
     strip.set(xlabel="electron number k (e⁻)", ylabel="difference\n(10⁻³)", xlim=(-0.6, last + 0.6))
-    strip.xaxis.get_major_locator().set_params(integer=True)
+    strip.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     handles, labels = top.get_legend_handles_labels()
     top.legend(handles[-1:] + handles[:-1], labels[-1:] + labels[:-1], loc="upper right")
     return figure
@@ -227,7 +231,7 @@ def electron_numbers(
 
 def _last_shown(mass: NDArray[Any], pmf: NDArray[Any]) -> int:
     """Return the last electron number with a mass that can be seen, at least 1."""
-    seen = np.flatnonzero(np.nan_to_num(np.maximum(mass, pmf)) > 2e-4)
+    seen = np.flatnonzero(np.nan_to_num(np.maximum(mass, pmf)) > 1e-3)
     return int(max(seen[-1] + 1 if seen.size else 1, 1)) if mass.size > 1 else 0
 
 
@@ -279,7 +283,7 @@ def component_widths(
     for panel in axes:
         low, high = panel.get_ylim()
         panel.set_ylim(0.0 if low < 0.5 * high else low - 0.1 * abs(low), 1.08 * max(high, 1e-12))
-        panel.xaxis.get_major_locator().set_params(integer=True)
+        panel.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     if chosen:
         figure.legend(loc="outside lower center", ncols=3 if wide else 2)
     else:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from pchem_pipeline.model.electrons import thresholds
 from pchem_pipeline.model.maps import summarise
 from pchem_pipeline.render import ensemble_figures, map_figures, pixel_figures
 from pchem_pipeline.render.captions import CAPTIONS, highlighted_cases
@@ -58,10 +59,9 @@ def _at(draw: Callable[..., Figure], *args: object, **kwargs: object) -> Callabl
     return lambda width_mm: bound(width_mm=width_mm)
 
 
-def _edges_text(parameters: dict[str, float] | PixelFit) -> str:
-    values = parameters.parameters if isinstance(parameters, PixelFit) else parameters
-    exposure, gain, bias, sigma = (values[name] for name in pixel_figures.PAPER_EXAMPLE)
-    edges = pixel_figures.thresholds(exposure, gain, bias, sigma, 4)
+def _edges_text(parameters: Mapping[str, float]) -> str:
+    exposure, gain, bias, sigma = (parameters[name] for name in pixel_figures.PAPER_EXAMPLE)
+    edges = thresholds(exposure, gain, bias, sigma, 4)
     return ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
 
 
@@ -73,7 +73,8 @@ def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "cells",
             "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
             CAPTIONS["cluster_edges_example"],
-            f"Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at {_edges_text(example)} e⁻.",
+            "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
+            f"{_edges_text(example)} e⁻.",
             _at(pixel_figures.cluster_edges, example),
         )
     ]
@@ -86,7 +87,8 @@ def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
                 "cells",
                 f"Pixel y = {pixel.y}, x = {pixel.x} of this run",
                 CAPTIONS["cluster_edges_pixel"],
-                f"Histogram and density of pixel ({pixel.y}, {pixel.x}); first cell edges at {_edges_text(pixel)} DN.",
+                f"Histogram and density of pixel ({pixel.y}, {pixel.x}); first cell edges at "
+                f"{_edges_text(pixel.parameters)} DN.",
                 _at(
                     pixel_figures.cluster_edges,
                     dict(pixel.parameters),
@@ -98,15 +100,19 @@ def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
     return found
 
 
+def _value_text(pixel: PixelFit, name: str) -> str:
+    _, words, unit = symbol(name)
+    nan = float("nan")
+    return f"{words} {measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), unit)}"
+
+
 def _pixels(data: ReportData, _: ReportSettings) -> list[Exhibit]:
     if not data.pixels:
         return []
     words = []
     for pixel in data.pixels:
-        numbers = ", ".join(
-            f"{symbol(name)[1]} {measured(pixel.parameters.get(name, float('nan')), pixel.stderr.get(name, float('nan')), symbol(name)[2])}"
-            for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
-        )
+        names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+        numbers = ", ".join(_value_text(pixel, name) for name in names)
         state = f" ({pixel.status})" if pixel.status else ""
         words.append(f"{pixel.label or 'pixel'} at ({pixel.y}, {pixel.x}): {numbers}{state}")
     return [
@@ -125,18 +131,16 @@ def _pixels(data: ReportData, _: ReportSettings) -> list[Exhibit]:
 def _map_alt(data: ReportData, name: str, what: str) -> str:
     _, words, unit = symbol(name)
     summary = summarise(data.maps[name], percentiles=(5.0, 95.0), outlier_sigmas=data.outlier_sigmas)
-    if summary.n_valid == 0:
-        return f"{what} of the {words}: no pixel has a value."
     low, high = summary.percentiles[5.0], summary.percentiles[95.0]
     return (
         f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
-        f"5 to 95 % of the pixels from {short(low)} to {short(high)} {unit}, extremes {short(summary.minimum)} and "
-        f"{short(summary.maximum)} {unit}; {count(summary.n_missing, 'pixel')} without a value."
+        f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
+        f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; {count(summary.n_missing, data.noun)} without a value."
     )
 
 
 def _read_noise(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
-    if "read_noise_e" not in data.maps:
+    if not data.has_values("read_noise_e"):
         return []
     known = finite(data.maps["read_noise_e"])
     below = percent(float((known < 0.4).sum()), known.size)
@@ -145,9 +149,9 @@ def _read_noise(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
             "read_noise_histogram",
             "read-noise",
             "Read noise of the pixels",
-            CAPTIONS["read_noise_histogram"].format(below=below),
+            CAPTIONS["read_noise_histogram"].format(below=below, noun=data.noun),
             _map_alt(data, "read_noise_e", "Histogram")
-            + f" {below} of the pixels with a value lie below 0.4 e⁻.",
+            + f" {below} of the {data.noun}s with a value lie below 0.4 e⁻.",
             _at(map_figures.read_noise_histogram, data.maps["read_noise_e"], bins=settings.histogram_bins),
         )
     ]
@@ -156,7 +160,7 @@ def _read_noise(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
 def _maps(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
     found = []
     for name in MAP_NAMES:
-        if name not in data.maps:
+        if not data.has_values(name):
             continue
         strip = map_figures.is_strip(data.maps[name].shape)
         found.append(
@@ -164,7 +168,7 @@ def _maps(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
                 f"map_{name}",
                 "maps",
                 symbol(name)[1].capitalize(),
-                CAPTIONS["channels" if strip else f"map_{settings.map_stretch}"],
+                CAPTIONS[f"map_{name}"],
                 _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
                 _at(
                     map_figures.map_and_histogram,
@@ -191,7 +195,8 @@ def _ensemble(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "ensemble",
             "Ensemble histogram and its prediction",
             CAPTIONS["ensemble"],
-            f"Ensemble histogram before and after non-uniformity correction with predictions. RMSE: {numbers}.",
+            "Ensemble histogram before and after non-uniformity correction with predictions. "
+            f"RMSE: {numbers}.",
             _at(ensemble_figures.ensemble, data.ensemble, rmse, n_frames=data.ensemble_facts.get("n_frames")),
             PAGE_MM,
         )
@@ -235,8 +240,8 @@ def _components(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "components",
             "Width of the components of the ensemble",
             CAPTIONS["component_widths"],
-            f"Standard deviation of the ensemble's component k, nothing held constant: {short(float(width[0]))} DN at k = 0, "
-            f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
+            "Standard deviation of the ensemble's component k, nothing held constant: "
+            f"{short(float(width[0]))} DN at k = 0, {short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
             _at(
                 ensemble_figures.component_widths,
                 np.arange(variance.shape[1]),
@@ -255,8 +260,8 @@ def _status(data: ReportData, _: ReportSettings) -> list[Exhibit]:
     if status is None:
         return []
     rows = map_figures.status_counts(status, data.status_words)
-    parts = [f"{count(int((status == 0).sum()), 'pixel')} with a good fit"]
-    parts += [f"{count(n, 'pixel')}: {text}" for _, text, n in rows]
+    parts = [f"{count(int((status == 0).sum()), data.noun)} with a good fit"]
+    parts += [f"{count(n, data.noun)}: {text}" for _, text, n in rows]
     return [
         Exhibit(
             "fit_status",

@@ -81,11 +81,11 @@ def map_and_histogram(
     sign, words, unit = symbol(name)
     label = f"{words} {sign} ({unit})"
     if is_strip(full.shape):
-        return _channels(full.ravel(), None if stderr is None else np.ravel(stderr), label, width_mm)
+        return _channels(full.ravel(), None if stderr is None else np.ravel(stderr), label, unit, width_mm)
     map_height = _map_height(full.shape, width_mm - 24.0)
     figure = new_figure(width_mm, 34.0 + map_height)
     top, bottom = figure.subplots(2, 1, height_ratios=(30.0, map_height))
-    _histogram(top, full, label, bins)
+    _histogram(top, full, label, unit, bins)
     _image(figure, bottom, full, f"{sign} ({unit})", stretch)
     return figure
 
@@ -97,7 +97,7 @@ def _map_height(shape: tuple[int, ...], width_mm: float) -> float:
     return float(np.clip(width_mm * ratio, 28.0, 1.6 * width_mm)) + 10.0
 
 
-def _histogram(axes: Axes, values: FloatArray, label: str, bins: int) -> DisplayRange:
+def _histogram(axes: Axes, values: FloatArray, label: str, unit: str, bins: int) -> DisplayRange:
     """Draw the histogram of a map with its median; return the range drawn."""
     shown = robust_range(values)
     known = finite(values)
@@ -116,7 +116,7 @@ def _histogram(axes: Axes, values: FloatArray, label: str, bins: int) -> Display
     if not shown.logarithmic:
         axes.xaxis.set_major_locator(MaxNLocator(5))
     words = f"; {shown.words()}" if shown.words() else ""
-    axes.set_title(f"median {short(median)}{words}", fontsize=6.5, color="#444444")
+    axes.set_title(f"median {short(median)} {unit}{words}", fontsize=6.5, color="#444444")
     return shown
 
 
@@ -145,19 +145,21 @@ def _show(figure: Figure, axes: Axes, colour: NDArray[Any], **options: Any) -> A
     )
     axes.set(xlabel="x (pixel)", ylabel="y (pixel)")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.get_major_locator().set_params(integer=True, nbins=6)
+        axis.set_major_locator(MaxNLocator(6, integer=True))
     for side in ("top", "right"):
         axes.spines[side].set_visible(True)
     return image
 
 
-def _channels(values: FloatArray, stderr: FloatArray | None, label: str, width_mm: float) -> Figure:
+def _channels(
+    values: FloatArray, stderr: FloatArray | None, label: str, unit: str, width_mm: float
+) -> Figure:
     """Draw a line of channels as points with error bars, and their histogram if they are many."""
     many = finite(values).size >= _FEW
     figure = new_figure(width_mm, 92.0 if many else 52.0)
     if many:
         top, axes = figure.subplots(2, 1, height_ratios=(1.0, 1.4))
-        _histogram(top, values, label, 64)
+        _histogram(top, values, label, unit, 64)
     else:
         axes = figure.add_subplot()
     known = np.isfinite(values)
@@ -174,7 +176,7 @@ def _channels(values: FloatArray, stderr: FloatArray | None, label: str, width_m
         elinewidth=0.8, capsize=2 if not many else 0,
     )  # fmt: skip
     axes.set(xlabel="channel", ylabel=label, xlim=(-0.5, values.size - 0.5))
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     if many or shown.n_outside:
         axes.set_ylim(*_padded(shown))
     missing = channel[~known]
@@ -183,7 +185,7 @@ def _channels(values: FloatArray, stderr: FloatArray | None, label: str, width_m
                   transform=axes.get_xaxis_transform())  # fmt: skip
     if shown.words():
         cross = " (×)" if missing.size else ""
-        note(axes, shown.words().replace("pixel", "channel") + cross)
+        note(axes, shown.words() + cross)
     return figure
 
 
@@ -209,7 +211,10 @@ def read_noise_histogram(
     axes = figure.add_subplot()
     sign, words, unit = symbol("read_noise_e")
     known = finite(read_noise_e)
-    shown = _histogram(axes, np.asarray(read_noise_e, dtype=np.float64), f"{words} {sign} ({unit})", bins)
+    shown = _histogram(
+        axes, np.asarray(read_noise_e, dtype=np.float64), f"{words} {sign} ({unit})", unit, bins
+    )
+    axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
     if known.size and shown.low < 0.5 < shown.high:
         axes.axvline(0.5, color=VERMILION, linewidth=0.9, linestyle=":")
         axes.text(0.5, 0.03, " 0.5 e⁻", color=VERMILION, fontsize=6.5, transform=axes.get_xaxis_transform())
@@ -278,7 +283,7 @@ def fit_status_map(
             edgecolor="white",
         )
         axes.set(xlabel="channel", yticks=[], xlim=(-0.5, status.size - 0.5), ylim=(0.0, 1.0))
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     else:
         figure = new_figure(width_mm, _map_height(status.shape, width_mm - 14.0) + legend_mm)
         axes = figure.add_subplot()

@@ -102,7 +102,7 @@ def cluster_edges(
         axes.text(
             (cells[k] + cells[k + 1]) / 2,
             0.87 * top,
-            str(k),
+            f"k = {k}" if k == 0 else str(k),
             ha="center",
             va="bottom",
             color=BLUE,

@@ -40,11 +40,10 @@ class DisplayRange:
         return self.n_below + self.n_above
 
     def words(self) -> str:
-        """Return a note on what is not drawn, e.g. ``3 pixels outside the axis; 5 without a value``."""
+        """Return a note on what is not drawn, e.g. ``3 outside the axis; 5 without a value``."""
         parts = []
         if self.n_outside:
-            noun = "pixel" if self.n_outside == 1 else "pixels"
-            parts.append(f"{self.n_outside:,} {noun} outside the axis")
+            parts.append(f"{self.n_outside:,} outside the axis")
         if self.n_missing:
             parts.append(f"{self.n_missing:,} without a value")
         return "; ".join(parts)
@@ -56,11 +55,11 @@ def finite(values: NDArray[Any]) -> FloatArray:
     return flat[np.isfinite(flat)]
 
 
-def robust_range(values: NDArray[Any], *, tail: float = 0.005, allow_log: bool = True) -> DisplayRange:
+def robust_range(values: NDArray[Any], *, tail: float = 0.01, allow_log: bool = True) -> DisplayRange:
     """Choose the range of an axis from the bulk of the values.
 
-    The range between the quantiles ``tail`` and ``1 - tail``, widened by a quarter on each side (on a
-    logarithmic axis by a quarter of its decades), and cut to the values that occur. Where that leaves out
+    The range between the quantiles ``tail`` and ``1 - tail``, widened by 0.3 of it on each side (on a
+    logarithmic axis by 0.3 of its decades), and cut to the values that occur. Where that leaves out
     only a thin margin, all values are drawn.
 
     Args:
@@ -90,7 +89,7 @@ def robust_range(values: NDArray[Any], *, tail: float = 0.005, allow_log: bool =
 
 
 def _widened(low: float, high: float) -> tuple[float, float]:
-    margin = 0.25 * (high - low)
+    margin = 0.3 * (high - low)
     return low - margin, high + margin
 
 

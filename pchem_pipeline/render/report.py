@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 import importlib.resources
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jinja2
 
-from pchem_pipeline.render.captions import SECTIONS
+from pchem_pipeline.render.captions import MAP_READING, SECTIONS
 from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.report_json import report_json
@@ -21,7 +21,7 @@ from pchem_pipeline.render.verdict import flags, key_numbers, sentence
 __all__ = ["RenderedReport", "render_report"]
 
 #: SVG files beyond this size are embedded as PNG.
-_LARGEST_SVG = 300_000
+_LARGEST_SVG = 450_000
 
 _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
@@ -90,7 +90,7 @@ def render_report(data: ReportData, settings: ReportSettings | None = None) -> R
         flags=flags(data),
         flag_words=_FLAG_WORDS,
         flag_signs=_FLAG_SIGNS,
-        sections=_sections(data, pictures, tables),
+        sections=_sections(data, settings, pictures, tables),
         tables=[table for table in tables if table.id not in _TABLE_PLACE],
         provenance=provenance_tables(data),
     )
@@ -135,15 +135,19 @@ def _data_url(content: bytes, kind: str) -> str:
     return f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def _sections(data: ReportData, pictures: Iterable[_Picture], tables: Iterable[Table]) -> list[_Section]:
+def _sections(
+    data: ReportData, settings: ReportSettings, pictures: list[_Picture], tables: list[Table]
+) -> list[_Section]:
     """Put figures and tables into their sections; one without any says why."""
-    pictures, tables = list(pictures), list(tables)
+    reading = MAP_READING["channels" if min(data.shape) < 2 else settings.map_stretch]
     found = []
     for id_, title, intro, parts in SECTIONS:
         shown = [picture for picture in pictures if picture.exhibit.section == id_]
         rows = [table for table in tables if _TABLE_PLACE.get(table.id) == id_]
         why = [data.missing[part] for part in parts if part in data.missing]
         if not shown and not rows and not why:
-            why = ["This run has no data for it."]
+            why = ["this run has no data for it."]
+        if id_ == "maps":
+            intro = f"{intro} {reading}"
         found.append(_Section(id_, title, intro, tuple(why), shown, rows))
     return found

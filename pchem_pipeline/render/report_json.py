@@ -29,7 +29,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
     """
     facts = dict(data.ensemble_facts)
     rmse = dict(facts.pop("rmse", {}))
-    return _plain(
+    numbers: dict[str, Any] = _plain(
         {
             "report_version": REPORT_VERSION,
             "title": data.title,
@@ -54,6 +54,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             "stages": list(data.stages),
         }
     )
+    return numbers
 
 
 def report_json(data: ReportData) -> str:

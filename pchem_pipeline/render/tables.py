@@ -73,8 +73,9 @@ def _parameters(data: ReportData) -> Table:
     return Table(
         "parameters",
         "Parameters",
-        "Median over the pixels with its standard error, robust standard deviation between pixels (1.4826 MAD), median "
-        f"standard error of one pixel, percentiles, and outliers beyond {data.outlier_sigmas:g} robust standard deviations.",
+        f"Median over the {data.noun}s with its standard error, robust standard deviation between them "
+        f"(1.4826 MAD), median standard error of one {data.noun}, percentiles, and outliers beyond "
+        f"{data.outlier_sigmas:g} robust standard deviations.",
         (
             "parameter",
             "median",
@@ -123,8 +124,8 @@ def _against_truth(data: ReportData) -> Table:
     return Table(
         "truth",
         "Estimates against the truth",
-        "Simulated data only. Pulls are (estimate − truth) / standard error: mean 0 and standard deviation 1 if estimates "
-        "are unbiased and errors right.",
+        "Simulated data only. Pulls are (estimate − truth) / standard error: mean 0 and standard deviation 1 "
+        "if estimates are unbiased and errors right.",
         ("parameter", "true median", "estimated median", "RMSE", "mean pull", "sd of pulls"),
         tuple(rows),
     )
@@ -189,10 +190,15 @@ def _moments(data: ReportData) -> Table:
     return Table(
         "moments",
         "Moments of the ensemble",
-        "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data, with the standard error of the data.",
+        "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data, with "
+        "the standard error of the data.",
         ("moment", "from the maps", "from the data", "difference / standard error"),
         tuple(rows),
     )
+
+
+#: Larger electron numbers are in ``report.json`` only.
+_MOST_NUMBERS = 24
 
 
 def _electrons(data: ReportData) -> Table:
@@ -202,7 +208,8 @@ def _electrons(data: ReportData) -> Table:
     k = np.asarray(arrays["k"])
     mass, pmf = np.asarray(arrays["electron_mass"]), np.asarray(arrays["electron_pmf"])
     expected = np.asarray(arrays["electron_pmf_map"]) if "electron_pmf_map" in arrays else None
-    last = int(np.flatnonzero(mass > 1e-4)[-1]) if (mass > 1e-4).any() else 0
+    seen = np.flatnonzero(mass > 1e-3)
+    last = int(seen[-1]) if seen.size else 0
     rows = [
         (
             str(int(k[i])),
@@ -210,13 +217,14 @@ def _electrons(data: ReportData) -> Table:
             f"{pmf[i]:.5f}",
             f"{expected[i]:.5f}" if expected is not None else "",
         )
-        for i in range(min(last + 1, 40))
+        for i in range(min(last + 1, _MOST_NUMBERS))
     ]
     words = ""
     if facts.get("error_rate") is not None:
         words += f" Against the true electron numbers, {percent(float(facts['error_rate']), 1.0)} are wrong."
     if facts.get("expected_error_rate") is not None:
-        words += f" The fitted parameters lead one to expect {percent(float(facts['expected_error_rate']), 1.0)} wrong numbers."
+        expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
+        words += f" The fitted parameters lead one to expect {expected_errors} wrong numbers."
     return Table(
         "electron-table",
         "Electron numbers",

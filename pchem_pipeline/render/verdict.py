@@ -94,7 +94,7 @@ def key_numbers(data: ReportData) -> list[KeyNumber]:
     """Return the numbers of the first screen."""
     found = []
     for name in _KEY_MAPS:
-        if name not in data.maps:
+        if not data.has_values(name):
             continue
         _, words, unit = symbol(name)
         summary = summarise(data.maps[name], percentiles=(5.0, 95.0))
@@ -105,8 +105,10 @@ def key_numbers(data: ReportData) -> list[KeyNumber]:
                 name,
                 words,
                 measured(summary.median, summary.median_stderr, unit),
-                f"5–95 % of the pixels: {short(low)} to {short(high)} {unit}" if summary.n_valid else "",
-                f"one pixel is known to ± {short(float(np.median(errors)), 2)} {unit}" if errors.size else "",
+                f"5–95 % of the {data.noun}s: {short(low)} to {short(high)} {unit}",
+                f"one {data.noun} is known to ± {short(float(np.median(errors)), 2)} {unit}"
+                if errors.size
+                else "",
             )
         )
     return found
@@ -117,7 +119,7 @@ def sentence(data: ReportData) -> str:
     pixels = pixel_counts(data)
     if pixels.fitted == 0:
         return (
-            f"None of the {count(pixels.total, 'pixel')} could be fitted; the table of fit status says why."
+            f"None of the {count(pixels.total, data.noun)} could be fitted; the table of fit status says why."
         )
     parts = []
     for name, lead in (
@@ -125,17 +127,17 @@ def sentence(data: ReportData) -> str:
         ("conversion_gain", "conversion gain"),
         ("dark_current", "dark current"),
     ):
-        if name in data.maps:
+        if data.has_values(name):
             summary = summarise(data.maps[name])
             parts.append(f"{lead} {measured(summary.median, summary.median_stderr, symbol(name)[2])}")
     frames = f" from {count(data.n_frames, 'frame')}" if data.n_frames else ""
-    text = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, 'pixel')} were fitted{frames}. "
-    text += "Medians over the pixels: " + ", ".join(parts) + "."
+    text = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} were fitted{frames}. "
+    text += f"Medians over the {data.noun}s: " + ", ".join(parts) + "."
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     if "epcd_exact" in rmse and rmse.get("noise_floor"):
         text += (
-            f" The fitted pixels predict the raw ensemble histogram with an RMSE of {short(rmse['epcd_exact'], 2)}; "
-            f"sampling noise alone gives {short(rmse['noise_floor'], 2)}."
+            f" The fitted {data.noun}s predict the raw ensemble histogram with an RMSE of "
+            f"{short(rmse['epcd_exact'], 2)}; sampling noise alone gives {short(rmse['noise_floor'], 2)}."
         )
     return text
 
@@ -150,13 +152,13 @@ def flags(data: ReportData) -> list[Flag]:
 def _failed_pixels(data: ReportData) -> list[Flag]:
     pixels = pixel_counts(data)
     share = pixels.failed / max(pixels.total, 1)
-    text = f"{count(pixels.failed, 'pixel')} ({percent(pixels.failed, pixels.total)}) without a value"
+    text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
         allowed = percent(data.allowed_failed, 1.0)
         return [Flag("serious", f"{text}, more than the {allowed} that is allowed.")]
     if pixels.failed:
         return [Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}.")]
-    return [Flag("good", "Every pixel has a value.")]
+    return [Flag("good", f"Every {data.noun} has a value.")]
 
 
 def _cautions(data: ReportData) -> list[Flag]:
@@ -165,7 +167,7 @@ def _cautions(data: ReportData) -> list[Flag]:
         return []
     kept = [row for row in status_counts(status, data.status_words) if not row[0] & data.failed_mask]
     return [
-        Flag("caution", f"{percent(n, status.size)} of the pixels: {text}.")
+        Flag("caution", f"{percent(n, status.size)} of the {data.noun}s: {text}.")
         for _, text, n in kept
         if n > _CAUTION_SHARE * status.size
     ]
@@ -178,7 +180,7 @@ def _goodness(data: ReportData) -> list[Flag]:
     poor = int((p < _POOR_P).sum())
     expected = _POOR_P * p.size
     text = (
-        f"Goodness of fit: {percent(poor, p.size)} of the fitted pixels have p < {_POOR_P:g}, "
+        f"Goodness of fit: {percent(poor, p.size)} of the fitted {data.noun}s have p < {_POOR_P:g}, "
         f"where the model alone leads to {percent(expected, p.size)}"
     )
     if poor > 0.05 * p.size:
@@ -214,7 +216,7 @@ def _agreement(data: ReportData) -> list[Flag]:
 
 
 def _conditions(data: ReportData) -> list[Flag]:
-    found = [Flag("note", f"{text.rstrip('.')}.") for text in data.missing.values()]
+    found = [Flag("note", _as_sentence(text)) for text in data.missing.values()]
     read_noise = finite(data.maps.get("read_noise_e", np.empty(0)))
     if read_noise.size and float(np.median(read_noise)) > 0.5:
         found.append(
@@ -238,3 +240,7 @@ def _conditions(data: ReportData) -> list[Flag]:
             )
         found += [Flag("note", f"{stage.get('stage')}: {remark}") for remark in stage.get("notes", ())]
     return list(dict.fromkeys(found))
+
+
+def _as_sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
