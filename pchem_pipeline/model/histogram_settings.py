@@ -37,7 +37,7 @@ class HistogramSettings(Section):
         "covariances",
     )
     band_memory: int = Field(
-        default=384,
+        default=640,
         ge=16,
         description="memory of a worker, MiB; decides the rows that it takes at a time, never the result",
     )

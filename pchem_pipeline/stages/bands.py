@@ -48,7 +48,7 @@ def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, setting
     row = 0
     if settings.summaries:
         # sums, covariances and their temporaries; then what waits for its chunk along time to be whole
-        pixel += 140 + 2 * 2 * CHUNK_BLOCKS * 8
+        pixel += 170 + 2 * 2 * CHUNK_BLOCKS * 8
         pixel += math.ceil(2 * min(COLUMN_FRAMES, n_frames) * 4 / ROW_GROUP)
         row = 2 * 2 * min(_ROW_FRAMES, n_frames) * 8
     return columns * pixel + row
