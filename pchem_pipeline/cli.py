@@ -123,6 +123,19 @@ def init(
     typer.echo(path)
 
 
+for _name, _summary in {
+    "simulate": "Write a simulated camera's frames, and its truth.",
+    "ingest": "Check the camera files; copy or reference their frames.",
+    "histogram": "Count every pixel's DN; keep summaries in time and space.",
+    "fit": "Fit H, g, mu and sigma of every pixel by PCH-EM.",
+    "maps": "Make the maps, with units, standard errors and quality.",
+    "ensemble": "Predict the ensemble from the maps; compare with the data.",
+    "report": "Write report.html, report.json and the figures.",
+    "electrons": "Write the stack of electron numbers into the store.",
+}.items():
+    _stage_command(_name, _summary)
+
+
 @app.command()
 def run(
     targets: Annotated[
@@ -208,19 +221,6 @@ def demo(
     from pchem_pipeline.stages.demo import run_demo
 
     typer.echo(run_demo(output, size=size, n_frames=frames, seed=seed, quiet=quiet))
-
-
-for _name, _summary in {
-    "simulate": "Write a simulated camera's frames, and its truth.",
-    "ingest": "Check the camera files; copy or reference their frames.",
-    "histogram": "Count every pixel's DN; keep summaries in time and space.",
-    "fit": "Fit H, g, mu and sigma of every pixel by PCH-EM.",
-    "maps": "Make the maps, with units, standard errors and quality.",
-    "ensemble": "Predict the ensemble from the maps; compare with the data.",
-    "report": "Write report.html, report.json and the figures.",
-    "electrons": "Write the stack of electron numbers into the store.",
-}.items():
-    _stage_command(_name, _summary)
 
 
 def _version(wanted: bool) -> None:

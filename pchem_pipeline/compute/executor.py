@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.compute.environment import available_workers, prepare_environment
@@ -140,10 +141,7 @@ class DistributedExecutor:
         self._cluster: Any = None
         try:
             if settings.scheduler is not None:
-                is_address = "://" in settings.scheduler
-                self._client = distributed.Client(
-                    **{("address" if is_address else "scheduler_file"): settings.scheduler}, timeout="20s"
-                )
+                self._client = distributed.Client(**_address(settings.scheduler), timeout="20s")
             elif settings.cluster is not None:
                 self._cluster = _cluster_class(settings.cluster.cls)(**settings.cluster.kwargs)
                 self._cluster.scale(settings.cluster.scale)
@@ -182,6 +180,15 @@ class DistributedExecutor:
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
+
+
+def _address(scheduler: str) -> dict[str, str]:
+    """Return how to name a scheduler: by address, or by its file (for which dask would wait for ever)."""
+    if "://" in scheduler:
+        return {"address": scheduler}
+    if not Path(scheduler).exists():
+        raise FileNotFoundError("no such scheduler file")
+    return {"scheduler_file": scheduler}
 
 
 def _cluster_class(name: str) -> Any:

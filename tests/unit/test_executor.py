@@ -1,0 +1,79 @@
+import os
+import threading
+
+import pytest
+
+from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
+from pchem_pipeline.compute.executor import Stop, make_executor
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.errors import ConfigError, IncompleteRunError
+
+BACKENDS = ["serial", "threads", "processes", "distributed"]
+
+
+def reciprocal(number):
+    return 1 / number
+
+
+def die(number):
+    os._exit(9)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_every_backend_reports_values_and_errors_alike(backend):
+    executor = make_executor(ComputeSettings(backend=backend, workers=2))
+    found = {}
+    try:
+        executor.map(reciprocal, [1, 2, 0, 4], lambda item, outcome: found.update({item: outcome}))
+    finally:
+        executor.close()
+    assert {item: outcome.value for item, outcome in found.items()} == {1: 1.0, 2: 0.5, 0: None, 4: 0.25}
+    assert isinstance(found[0].error, ZeroDivisionError)
+    assert "reciprocal" in found[0].trace
+
+
+@pytest.mark.parametrize("backend", BACKENDS[:2])
+def test_stop_lets_running_items_finish_and_starts_no_others(backend):
+    executor = make_executor(ComputeSettings(backend=backend, workers=2))
+    started, lock = [], threading.Lock()
+
+    def work(item):
+        with lock:
+            started.append(item)
+
+    def stop(item, outcome):
+        raise Stop
+
+    with pytest.raises(Stop):
+        executor.map(work, range(100), stop)
+    assert 1 <= len(started) <= 4
+
+
+def test_a_dead_worker_process_is_one_clear_line():
+    executor = make_executor(ComputeSettings(backend="processes", workers=1))
+    with pytest.raises(IncompleteRunError, match="worker process died"):
+        executor.map(die, [1], lambda item, outcome: None)
+
+
+def test_no_scheduler_at_the_address():
+    settings = ComputeSettings(backend="distributed", scheduler="no/such/file.json")
+    with pytest.raises(ConfigError, match="no scheduler answers"):
+        make_executor(settings)
+
+
+def test_cluster_class_that_does_not_exist():
+    settings = ComputeSettings.model_validate(
+        {"backend": "distributed", "cluster": {"class": "nowhere.Cluster"}}
+    )
+    with pytest.raises(ConfigError, match="cannot import nowhere"):
+        make_executor(settings)
+
+
+def test_zero_workers_are_refused():
+    with pytest.raises(ConfigError, match="workers"):
+        make_executor(ComputeSettings(workers=0))
+
+
+def test_environment_is_measured():
+    assert 1 <= available_workers() <= (os.cpu_count() or 1)
+    assert peak_rss_bytes() > 10_000_000

@@ -1,0 +1,166 @@
+import errno
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pchem_pipeline.errors import LockedError, StoreError
+from pchem_pipeline.store.files import is_fatal, read_json, storage_error, write_atomic, write_json
+from pchem_pipeline.store.records import Records, StageRecord, fingerprint_of
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.variables import VARIABLES
+
+
+@pytest.fixture
+def store(tmp_path):
+    return RunStore.create(tmp_path / "läuft hier" / "run.zarr")
+
+
+def test_xarray_reads_a_group_with_units_and_dimensions(store):
+    store.create_array("fit/bias", (100, 70), chunks=(64, 64))
+    store.write("fit/bias", (slice(0, 64), slice(0, 64)), np.full((64, 64), 3.5))
+    data = xr.open_zarr(store.path, group="fit", consolidated=False)
+    assert data.bias.dims == ("y", "x")
+    assert data.bias.attrs["units"] == "DN"
+    assert data.bias.attrs["symbol"] == "mu"
+    assert float(data.bias[0, 0]) == 3.5
+    assert np.isnan(data.bias[99, 69])
+
+
+def test_integers_and_floats_come_back_exactly(store):
+    rng = np.random.default_rng(5)
+    counts = rng.integers(0, 2**16, (10, 12, 40), dtype=np.uint16)
+    store.create_array("histogram/counts", counts.shape, chunks=(8, 8, 40), dtype=np.uint16)
+    store.write("histogram/counts", (slice(None),) * 3, counts)
+    np.testing.assert_array_equal(store.read("histogram/counts"), counts)
+    values = rng.normal(size=(9, 9))
+    store.write_array("fit/log_likelihood", values)
+    np.testing.assert_array_equal(store.read("fit/log_likelihood"), values)
+
+
+def test_only_registered_arrays_are_stored(store):
+    with pytest.raises(KeyError):
+        store.create_array("fit/offset", (4, 4), chunks=(4, 4))
+
+
+def test_a_flipped_bit_is_never_silent(store):
+    store.write_array("fit/bias", np.ones((8, 8)))
+    chunk = store.path / "fit" / "bias" / "c" / "0" / "0"
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    with pytest.raises(StoreError, match=r"fit/bias.*redo that stage"):
+        store.read("fit/bias")
+
+
+def test_missing_array_names_the_cure(store):
+    with pytest.raises(StoreError, match="run the stage that writes it"):
+        store.read("fit/bias")
+
+
+def test_another_schema_version_is_refused_with_both_numbers(store):
+    store._root.attrs["pchem_schema"] = 99
+    with pytest.raises(StoreError, match=r"version 99.*version 1"):
+        RunStore.open(store.path)
+
+
+def test_a_half_written_store_is_refused(tmp_path):
+    (tmp_path / "run.zarr").mkdir()
+    (tmp_path / "run.zarr" / "zarr.json").write_text("{")
+    with pytest.raises(StoreError, match="damaged"):
+        RunStore.open(tmp_path / "run.zarr")
+
+
+def test_no_store_is_made_over_other_files(tmp_path):
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(StoreError, match="is not a run"):
+        RunStore.create(tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "precious"
+
+
+def test_missing_store_names_the_cure(tmp_path):
+    with pytest.raises(StoreError, match="pchem run"):
+        RunStore.open(tmp_path / "nothing.zarr")
+
+
+def test_second_process_finds_the_run_locked_and_a_killed_one_frees_it(store):
+    code = (
+        "import sys, time; from pathlib import Path; from pchem_pipeline.store.run_store import RunStore\n"
+        "with RunStore.open(Path(sys.argv[1]), writable=True).locked():\n"
+        "    print('locked', flush=True); time.sleep(60)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(store.path)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "locked\n"
+    with pytest.raises(LockedError, match="another pchem process"), store.locked():
+        pass
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    with store.locked():
+        pass
+
+
+def test_partial_files_of_a_killed_process_are_swept(store):
+    orphan = store.path / "fit" / "c" / "x.partial"
+    orphan.parent.mkdir(parents=True)
+    orphan.write_bytes(b"half")
+    with store.locked():
+        assert not orphan.exists()
+
+
+def test_write_atomic_replaces_whole_files_and_leaves_no_litter(tmp_path):
+    write_atomic(tmp_path / "a.txt", b"old")
+    write_atomic(tmp_path / "a.txt", b"new")
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.txt", b"new")]
+
+
+def test_damaged_json_names_the_file(tmp_path):
+    write_json(tmp_path / "a.json", {"x": 1})
+    assert read_json(tmp_path / "a.json") == {"x": 1}
+    assert read_json(tmp_path / "b.json") is None
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(StoreError, match=r"a\.json is damaged"):
+        read_json(tmp_path / "a.json")
+
+
+def test_disk_errors_are_translated_with_their_cure():
+    full = OSError(errno.ENOSPC, "No space left on device")
+    assert "free some space" in str(storage_error(full, "run.zarr"))
+    assert is_fatal(full)
+    assert not is_fatal(ValueError())
+
+
+def test_fingerprint_depends_on_content_not_on_order():
+    assert fingerprint_of({"a": 1, "b": 2}) == fingerprint_of({"b": 2, "a": 1})
+    assert fingerprint_of({"a": 1}) != fingerprint_of({"a": 2})
+
+
+def test_markers_belong_to_one_fingerprint(tmp_path):
+    records = Records(tmp_path)
+    records.mark("fit", "f" * 64, "0.1", {"pixels": 5})
+    assert records.done("fit", "f" * 64) == {"0.1"}
+    assert records.done("fit", "e" * 64) == set()
+    assert records.summaries("fit", "f" * 64) == {"0.1": {"pixels": 5}}
+    records.unmark("fit", "f" * 64, "0.1")
+    assert records.done("fit", "f" * 64) == set()
+
+
+def test_stage_record_survives_the_disk(tmp_path):
+    records = Records(tmp_path)
+    record = StageRecord("fit", 1, "abc", {"settings": {}}, keys=4, failed={"0.0": "why"}, notes=("n",))
+    records.write(record)
+    assert records.read("fit") == record
+    records.forget("fit")
+    assert records.read("fit") is None
+
+
+def test_every_variable_is_described():
+    for path, variable in VARIABLES.items():
+        assert variable.path == path
+        assert variable.unit, path
+        assert len(variable.long_name) > 8, path

@@ -1,0 +1,45 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.store.tiles import parse_tiles, roi_tiles, tile_grid
+
+
+@given(ny=st.integers(1, 200), nx=st.integers(1, 200), size=st.sampled_from([8, 16, 64]))
+def test_tiles_cover_every_pixel_once(ny, nx, size):
+    seen = [[0] * nx for _ in range(ny)]
+    for tile in tile_grid((ny, nx), size):
+        for y in range(tile.y0, tile.y1):
+            for x in range(tile.x0, tile.x1):
+                seen[y][x] += 1
+    assert all(count == 1 for row in seen for count in row)
+
+
+def test_tile_is_named_like_its_chunk():
+    tile = tile_grid((100, 130), 64)[-1]
+    assert (tile.key, tile.keys, tile.shape) == ("1.2", ("1.2",), (36, 2))
+    assert tile.region == (slice(64, 100), slice(128, 130))
+
+
+def test_tiles_are_chosen_by_name_and_by_range():
+    grid = tile_grid((256, 256), 64)
+    assert [t.key for t in parse_tiles("2.1, 0.3", grid)] == ["0.3", "2.1"]
+    assert [t.key for t in parse_tiles("0:2.1:3", grid)] == ["0.1", "0.2", "1.1", "1.2"]
+
+
+@pytest.mark.parametrize("text", ["", "3", "a.b", "0.4", "4.0", "0:9999999999.0", "2:2.0"])
+def test_wrong_tiles_are_refused(text):
+    with pytest.raises(ConfigError, match="--tiles"):
+        parse_tiles(text, tile_grid((256, 256), 64))
+
+
+def test_roi_chooses_the_tiles_that_it_touches():
+    grid = tile_grid((256, 256), 64)
+    assert [t.key for t in roi_tiles((63, 65, 128, 129), grid)] == ["0.2", "1.2"]
+
+
+@pytest.mark.parametrize("roi", [(10, 10, 0, 5), (300, 310, 0, 5), (-1, 5, 0, 5), (5, 2, 0, 5)])
+def test_empty_roi_is_refused(roi):
+    with pytest.raises(ConfigError, match="selects nothing"):
+        roi_tiles(roi, tile_grid((256, 256), 64))
