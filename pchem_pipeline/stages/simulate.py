@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -216,15 +217,17 @@ def _prepare(folder: Path, settings: SimulateSettings) -> None:
 
 def _remove_simulated(folder: Path) -> None:
     try:
-        with np.load(folder / TRUTH_FILE, allow_pickle=False) as truth:
+        with (folder / TRUTH_FILE).open("rb") as stream, np.load(stream, allow_pickle=False) as truth:
             names = [str(name) for name in truth["files"]]
-    except (FileNotFoundError, KeyError, ValueError):
+    except (FileNotFoundError, KeyError, ValueError, EOFError, BadZipFile):
         raise ConfigError(
             f"simulate.output: {folder} holds other files (no {TRUTH_FILE} of an earlier simulation); "
             "choose another folder"
         ) from None
     for name in names:
-        for path in (folder / Path(name).name, folder / f"{Path(name).name}.json"):
+        plain = Path(name).name
+        # the frames, their sidecar, and what a killed run left of them
+        for path in (folder / plain, folder / f"{plain}.json", folder / f".partial-{plain}"):
             if path.is_dir():
                 shutil.rmtree(path)
             else:
