@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,20 @@ def test_result_depends_on_neither_tile_nor_memory_nor_mode(tmp_path, frames, ex
 def test_result_does_not_depend_on_threads(tmp_path, frames, expected):
     executor = make_executor(ComputeSettings(backend="threads", workers=3))
     context = make_context(tmp_path, frames, executor=executor)
+    assert execute("histogram", context).state == "complete"
+    assert_equal(contents(context.store), expected)
+
+
+class _PickledTasks(SerialExecutor):
+    """Sends tasks and units through pickle, as a backend of other processes does."""
+
+    def map(self, function, items, on_result):
+        super().map(pickle.loads(pickle.dumps(function)), pickle.loads(pickle.dumps(list(items))), on_result)
+
+
+@pytest.mark.parametrize("mode", ["copy", "reference"])
+def test_tasks_can_go_to_other_processes(tmp_path, frames, expected, mode):
+    context = make_context(tmp_path, frames, mode=mode, executor=_PickledTasks())
     assert execute("histogram", context).state == "complete"
     assert_equal(contents(context.store), expected)
 
