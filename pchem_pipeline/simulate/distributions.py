@@ -5,9 +5,9 @@ Only the settings live here; ``quantiles.py`` turns them into numbers.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from pchem_pipeline.settings import Section
 from pchem_pipeline.simulate.patterns import Pattern
@@ -40,6 +40,17 @@ class DistributionBase(Section):
     patterns: tuple[Pattern, ...] = Field(
         default=(), description="patterns on top: column, row, gradient, radial"
     )
+
+    @model_serializer(mode="wrap")
+    def _kind_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write the kind and its numbers first, then the bounds and patterns that there are."""
+        data = handler(self)
+        common = {name: data.pop(name) for name in DistributionBase.model_fields}
+        return {
+            "kind": data.pop("kind"),
+            **data,
+            **{name: v for name, v in common.items() if v not in (None, [], ())},
+        }
 
     @model_validator(mode="after")
     def _bounds_in_order(self) -> Self:

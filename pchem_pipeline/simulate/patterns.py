@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from pchem_pipeline.settings import Section
 
@@ -17,6 +17,12 @@ class PatternBase(Section):
     relative: bool = Field(
         default=False, description="true: multiply the parameter by 1 + pattern; false: add the pattern to it"
     )
+
+    @model_serializer(mode="wrap")
+    def _kind_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data = handler(self)
+        relative = data.pop("relative")
+        return {**data, "relative": relative}
 
 
 class ColumnPattern(PatternBase):

@@ -54,7 +54,10 @@ class ParameterSettings(Section):
 
     quanta_exposure: Distribution | None = Field(
         default=LogNormal(median=2.0, log_std=0.35, minimum=0.02),
-        description="quanta exposure H, e- per frame; null if dark_current is given",
+        description="quanta exposure H, e- per frame; null if dark_current is given. A distribution is a "
+        "kind with its numbers: constant (value), normal (mean, std), lognormal (median, log_std), gamma "
+        "(mean, std), uniform or loguniform (low, high); each can have minimum, maximum and patterns of kind "
+        "column, row, radial (amplitude) or gradient (amplitude, angle), relative or not",
     )
     dark_current: Distribution | None = Field(
         default=None, description="H / integration_time, e-/px/s, instead of quanta_exposure"

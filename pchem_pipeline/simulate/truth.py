@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pchem_pipeline.errors import ConfigError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -15,6 +17,8 @@ __all__ = ["Defect", "TruthMaps"]
 
 # variance of rounding to whole DN, uniform over one DN (sigma_Q of the paper)
 _QUANTISATION_VARIANCE = 1.0 / 12.0
+#: largest quanta exposure that can be simulated, e-
+LARGEST_EXPOSURE = 1e7
 
 
 class Defect(IntEnum):
@@ -36,6 +40,9 @@ class TruthMaps:
         bias: mu, DN.
         analog_read_noise_e: sigma_R, e-, without quantisation.
         defect: uint8, see :class:`Defect`.
+
+    Raises:
+        ConfigError: if a value is not finite, or impossible (H < 0, g <= 0, sigma_R < 0).
     """
 
     quanta_exposure: NDArray[np.float64]
@@ -43,6 +50,28 @@ class TruthMaps:
     bias: NDArray[np.float64]
     analog_read_noise_e: NDArray[np.float64]
     defect: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        """Refuse what no sensor can be, since the compiled chain would make nonsense of it."""
+        allowed = {
+            "quanta_exposure": (0.0, LARGEST_EXPOSURE),
+            "conversion_gain": (np.nextafter(0.0, 1.0), np.inf),
+            "bias": (-np.inf, np.inf),
+            "analog_read_noise_e": (0.0, np.inf),
+        }
+        for name, (low, high) in allowed.items():
+            values = getattr(self, name)
+            if values.shape != self.bias.shape:
+                raise ConfigError(
+                    f"truth: {name} has shape {values.shape}, bias {self.bias.shape}; make them equal"
+                )
+            bad = ~(np.isfinite(values) & (values >= low) & (values <= high))
+            if bad.any():
+                y, x = np.argwhere(bad)[0]
+                raise ConfigError(
+                    f"truth: {name} is impossible in {bad.sum()} pixels (first: {values[y, x]} at y={y}, "
+                    f"x={x}); give them finite values that a sensor can have"
+                )
 
     @property
     def shape(self) -> tuple[int, int]:

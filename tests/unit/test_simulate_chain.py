@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -133,6 +133,28 @@ def test_other_seeds_give_other_frames():
 def test_a_truth_of_another_shape_is_refused():
     with pytest.raises(ConfigError, match="make them equal"):
         simulate_block(constant_truth((3, 3)), sensor(), (0, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"exposure": np.nan}, "quanta_exposure is impossible in 42 pixels"),
+        ({"exposure": -1.0}, "quanta_exposure"),
+        ({"exposure": 1e8}, "quanta_exposure"),
+        ({"gain": 0.0}, "conversion_gain"),
+        ({"bias": np.inf}, "bias"),
+        ({"noise": -0.1}, "analog_read_noise_e.*-0.1 at y=0, x=0"),
+    ],
+)
+def test_an_impossible_truth_is_refused(change, words):
+    with pytest.raises(ConfigError, match=words):
+        constant_truth(**change)
+
+
+def test_a_truth_of_unequal_maps_is_refused():
+    truth = constant_truth()
+    with pytest.raises(ConfigError, match="make them equal"):
+        replace(truth, conversion_gain=truth.conversion_gain[:2])
 
 
 def test_effects_meet_the_signal_in_the_order_of_the_planes():

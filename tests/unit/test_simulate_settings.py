@@ -8,6 +8,8 @@ import sys
 import pytest
 from pydantic import ValidationError
 
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.config.template import commented_config
 from pchem_pipeline.simulate.settings import ParameterSettings, SimulateSettings
 
 CONSTANT = {"kind": "constant", "value": 0.1}
@@ -112,3 +114,9 @@ def test_the_settings_import_nothing_heavy():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_the_commented_yaml_of_a_simulated_run_gives_the_defaults():
+    text = commented_config("config.yaml", files=[], simulated=True)
+    assert parse_config(text).simulate == SimulateSettings()
+    assert "loguniform (low, high)" in " ".join(text.replace("#", " ").split())
