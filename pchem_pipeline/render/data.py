@@ -73,6 +73,7 @@ class ReportData:
         moments: rows ``{name, quantity, unit, predicted, observed, stderr}`` of Appendix A; the last two are
             None for terms that data do not show.
         truth: true maps of simulated data.
+        channel_names: names of the channels of ready-made histograms.
         percentiles: percentiles of the summaries, %.
         outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
         allowed_failed: fraction of pixels without a value that is accepted.
@@ -98,6 +99,7 @@ class ReportData:
     component_cases: Sequence[str] = ()
     moments: Sequence[Mapping[str, Any]] = ()
     truth: Mapping[str, FloatArray] = field(default_factory=dict)
+    channel_names: Sequence[str] = ()
     percentiles: tuple[float, ...] = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
     outlier_sigmas: float = 6.0
     allowed_failed: float = 0.1

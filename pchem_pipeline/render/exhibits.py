@@ -19,7 +19,20 @@ from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM
 from pchem_pipeline.render.wording import count, measured, percent, short, symbol
 
-__all__ = ["Exhibit", "exhibits"]
+__all__ = ["EXHIBIT_NAMES", "Exhibit", "exhibits"]
+
+#: Names of all figures that a report can have, in their order.
+EXHIBIT_NAMES = (
+    "cluster_edges_example",
+    "cluster_edges_pixel",
+    "pixel_fits",
+    "read_noise_histogram",
+    *(f"map_{name}" for name in MAP_NAMES),
+    "ensemble",
+    "electron_numbers",
+    "component_widths",
+    "fit_status",
+)
 
 
 @dataclass(frozen=True)
@@ -135,7 +148,8 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
     return (
         f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
         f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
-        f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; {count(summary.n_missing, data.noun)} without a value."
+        f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; "
+        f"{count(summary.n_missing, data.noun)} without a value."
     )
 
 
@@ -241,7 +255,8 @@ def _components(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Width of the components of the ensemble",
             CAPTIONS["component_widths"],
             "Standard deviation of the ensemble's component k, nothing held constant: "
-            f"{short(float(width[0]))} DN at k = 0, {short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
+            f"{short(float(width[0]))} DN at k = 0, "
+            f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
             _at(
                 ensemble_figures.component_widths,
                 np.arange(variance.shape[1]),

@@ -30,7 +30,7 @@ class Table:
 
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
-    makers = (_parameters, _against_truth, _rmse, _moments, _electrons, _status)
+    makers = (_channels, _parameters, _against_truth, _rmse, _moments, _electrons, _status)
     return [table for make in makers if (table := make(data)).rows]
 
 
@@ -85,6 +85,34 @@ def _parameters(data: ReportData) -> Table:
             "outliers",
             "pixels",
         ),
+        tuple(rows),
+    )
+
+
+#: More channels than these are in the maps of the store only.
+_MOST_CHANNELS = 100
+
+
+def _channels(data: ReportData) -> Table:
+    names = [name for name in _ORDER if data.has_values(name)]
+    rows = []
+    if data.shape[0] == 1 and data.shape[1] <= _MOST_CHANNELS:
+        status = np.ravel(data.fit.get("fit_status", np.zeros(data.shape, dtype=np.uint16)))
+        for x in range(data.shape[1]):
+            label = data.channel_names[x] if x < len(data.channel_names) else ""
+            values = []
+            for name in names:
+                stderr = data.maps.get(f"{name}_stderr")
+                error = float(stderr[0, x]) if stderr is not None else float("nan")
+                values.append(measured(float(data.maps[name][0, x]), error))
+            words = "; ".join(text for bit, text in data.status_words.items() if int(status[x]) & bit)
+            rows.append((f"{x} {label}".strip(), *values, words or "good fit"))
+    head = tuple(f"{symbol(name)[1]} ({symbol(name)[2]})" for name in names)
+    return Table(
+        "channels",
+        "Channels",
+        "Estimates with their standard errors.",
+        ("channel", *head, "fit status"),
         tuple(rows),
     )
 

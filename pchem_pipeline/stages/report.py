@@ -1,0 +1,318 @@
+"""Stage ``report``: report.html, report.json and the figures, from what the other stages stored."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.model.components import COMPONENT_CASES
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS, describe
+from pchem_pipeline.render.captions import case_name
+from pchem_pipeline.render.data import PixelFit, ReportData
+from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
+from pchem_pipeline.render.report import RenderedReport, render_report
+from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
+from pchem_pipeline.variables import PARAMETERS, variables_of
+
+if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.render.settings import ReportSettings
+    from pchem_pipeline.stages.sensor import SensorInfo
+    from pchem_pipeline.store.records import StageRecord
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = [
+    "NAME",
+    "READS",
+    "SETTINGS",
+    "UPSTREAM",
+    "VERSION",
+    "WRITES",
+    "choose_pixels",
+    "report_tile",
+    "run",
+]
+
+NAME = "report"
+VERSION = 1
+UPSTREAM: tuple[str, ...] = ("histogram", "fit", "maps", "ensemble")
+SETTINGS: tuple[str, ...] = ("report", "maps", "run.title", "run.allowed_failed_pixels")
+READS: tuple[str, ...] = ("histogram", "fit", "maps", "ensemble", "truth")
+WRITES: tuple[str, ...] = ()
+
+_FIT_MAPS = ("fit_status", "goodness_p")
+_TRUTH = (*PARAMETERS, "read_noise_e")
+#: Labels of the four shown pixels, and the ranks of read noise and quanta exposure at which they lie.
+_CORNERS = (
+    ("low read noise, low exposure", 0.1, 0.1),
+    ("low read noise, high exposure", 0.1, 0.9),
+    ("high read noise, low exposure", 0.9, 0.1),
+    ("high read noise, high exposure", 0.9, 0.9),
+)
+#: All channels of a line of so few are shown.
+_FEW_CHANNELS = 12
+
+Chosen = tuple[str, int, int]
+
+
+def choose_pixels(
+    read_noise_e: NDArray[np.float64], quanta_exposure: NDArray[np.float64], fit_status: NDArray[Any]
+) -> list[Chosen]:
+    """Choose four pixels at low and high read noise and low and high exposure (fig:plot_per_pixel_fits).
+
+    Ranks are taken among the pixels with a good fit (with any value, if fewer than four are good); the
+    pixel nearest to the 10 or 90 % rank of both is taken, each once. Where no pixel has a value, one of each
+    reason for it is shown, the most frequent reasons first.
+
+    Args:
+        read_noise_e: sigma_e-, e-, shape (ny, nx), NaN where there is no value.
+        quanta_exposure: H, e-, shape (ny, nx).
+        fit_status: status words, shape (ny, nx).
+
+    Returns:
+        Label, y and x of each; at most four.
+    """
+    known = np.isfinite(read_noise_e) & np.isfinite(quanta_exposure)
+    if not known.any():
+        words, first, counts = np.unique(fit_status, return_index=True, return_counts=True)
+        order = np.argsort(-counts, kind="stable")[:4]
+        places = [divmod(int(first[i]), fit_status.shape[1]) for i in order]
+        return [("no fit", y, x) for (y, x), _ in zip(places, words[order], strict=True)]
+    good = known & (fit_status == 0)
+    where = np.argwhere(good if good.sum() >= len(_CORNERS) else known)
+    noise, exposure = (_ranks(values[tuple(where.T)]) for values in (read_noise_e, quanta_exposure))
+    chosen: list[Chosen] = []
+    free = np.ones(len(where), dtype=bool)
+    for label, at_noise, at_exposure in _CORNERS[: len(where)]:
+        distance = (noise - at_noise) ** 2 + (exposure - at_exposure) ** 2
+        best = int(np.argmin(np.where(free, distance, np.inf)))
+        free[best] = False
+        chosen.append((label, int(where[best, 0]), int(where[best, 1])))
+    return chosen
+
+
+def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    ranks = np.empty(values.size)
+    ranks[np.argsort(values, kind="stable")] = (np.arange(values.size) + 0.5) / values.size
+    return ranks
+
+
+def report_tile(data: ReportData, settings: ReportSettings) -> RenderedReport:
+    """Return the files of the report; pure."""
+    return render_report(data, settings)
+
+
+def run(context: StageContext) -> None:
+    """Write the report.
+
+    Raises:
+        ConfigError: a pixel of ``report.pixels`` lies outside the sensor.
+        StoreError: an array is missing or the store cannot be written.
+    """
+    ny, nx = context.sensor.shape
+    for y, x in context.config.report.pixels:
+        if y >= ny or x >= nx:
+            raise ConfigError(
+                f"report.pixels: pixel y = {y}, x = {x} lies outside the sensor of {ny} x {nx} pixels; "
+                f"choose y below {ny} and x below {nx}"
+            )
+    task = functools.partial(
+        _write, context.store.path, context.config, context.integration_time, _stage_rows(context)
+    )
+    context.run_units([WHOLE], task, unit_name="report")
+
+
+def _write(
+    path: Path,
+    config: RunConfig,
+    integration_time: float | None,
+    stages: list[dict[str, Any]],
+    unit: Unit,
+) -> dict[str, Any]:
+    """Gather, draw and write; files of figures that this run does not have any more are removed."""
+    store = open_store(path)
+    data = gather(store, config, integration_time, stages)
+    rendered = report_tile(data, config.report)
+    for name, content in rendered.figures.items():
+        store.write_file(f"figures/{name}", content)
+    for old in (path / "figures").glob("*.*"):
+        if old.name not in rendered.figures and old.stem in EXHIBIT_NAMES:
+            old.unlink(missing_ok=True)
+    store.write_file("report.json", rendered.json.encode())
+    store.write_file("report.html", rendered.html.encode())
+    return {"figures": len(rendered.figures), "html_bytes": len(rendered.html.encode())}
+
+
+def gather(
+    store: RunStore, config: RunConfig, integration_time: float | None, stages: Sequence[Mapping[str, Any]]
+) -> ReportData:
+    """Read all that the report shows.
+
+    Args:
+        store: the run.
+        config: its configuration.
+        integration_time: seconds, or None.
+        stages: rows of the table of stages.
+
+    Raises:
+        StoreError: maps or histograms are missing.
+    """
+    from pchem_pipeline.config.load import dump_config
+    from pchem_pipeline.stages.sensor import SensorInfo
+
+    sensor = SensorInfo.read(store)
+    maps = _group(store, "maps", skip=("quality",))
+    fit = {name: store.read(f"fit/{name}") for name in _FIT_MAPS if store.has(f"fit/{name}")}
+    ensemble = _group(store, "ensemble")
+    facts = dict(store.attributes("ensemble"))
+    moments = facts.pop("moments", [])
+    return ReportData(
+        title=config.run.title or store.path.name,
+        shape=sensor.shape,
+        n_frames=sensor.n_frames if sensor.kind == "frames" else None,
+        integration_time=integration_time,
+        maps=maps,
+        fit=fit,
+        status_words={int(bit): text for bit, text in MEANINGS.items()},
+        failed_mask=int(FAILED),
+        pixels=_pixels(store, config, sensor, maps, fit),
+        ensemble=ensemble,
+        ensemble_facts=facts,
+        component_cases=[case_name(case) for case in COMPONENT_CASES],
+        moments=moments,
+        truth={name: store.read(f"truth/{name}") for name in _TRUTH if store.has(f"truth/{name}")},
+        channel_names=sensor.names,
+        percentiles=config.maps.percentiles,
+        outlier_sigmas=config.maps.outlier_sigmas,
+        allowed_failed=config.run.allowed_failed_pixels,
+        config_yaml=dump_config(config),
+        run=_run_facts(store, config, sensor),
+        inputs=[
+            {"name": file.get("name"), "size": file.get("size"), "hash": file.get("xxh3_128", "")}
+            for file in sensor.identity.get("files", [])
+        ],
+        stages=list(stages),
+        missing=_missing(store, sensor, maps, ensemble),
+    )
+
+
+def _group(store: RunStore, group: str, skip: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    return {
+        variable.name: store.read(variable.path)
+        for variable in variables_of(group)
+        if variable.name not in skip and store.has(variable.path)
+    }
+
+
+def _pixels(
+    store: RunStore,
+    config: RunConfig,
+    sensor: SensorInfo,
+    maps: Mapping[str, NDArray[Any]],
+    fit: Mapping[str, NDArray[Any]],
+) -> list[PixelFit]:
+    """Read the histograms of the shown pixels."""
+    chosen: list[Chosen] = [("", y, x) for y, x in config.report.pixels]
+    if not chosen and sensor.names and sensor.nx <= _FEW_CHANNELS:
+        chosen = [(name, 0, x) for x, name in enumerate(sensor.names)]
+    if not chosen:
+        chosen = choose_pixels(maps["read_noise_e"], maps["quanta_exposure"], fit["fit_status"])
+    names = (*PARAMETERS, "read_noise_e")
+    found = []
+    for label, y, x in chosen:
+        word = int(fit["fit_status"][y, x])
+        found.append(
+            PixelFit(
+                label=label,
+                y=y,
+                x=x,
+                origin=int(store.read("histogram/origin", (slice(y, y + 1), slice(x, x + 1)))[0, 0]),
+                counts=store.read("histogram/counts", (slice(y, y + 1), slice(x, x + 1), slice(None)))[0, 0],
+                parameters={name: float(maps[name][y, x]) for name in names},
+                stderr={name: float(maps[f"{name}_stderr"][y, x]) for name in names},
+                status=describe(word) if word else "",
+                goodness_p=float(fit["goodness_p"][y, x]) if "goodness_p" in fit else float("nan"),
+            )
+        )
+    return found
+
+
+def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[str, Any]:
+    record = store.records.read(NAME)
+    facts: dict[str, Any] = {
+        "store": store.path.name,
+        "input": f"{sensor.kind}, {sensor.mode}" if sensor.kind == "frames" else "ready-made histograms",
+        "type of the data": sensor.dtype,
+        "bit depth": sensor.bit_depth,
+        "digest of the input": sensor.identity.get("digest", ""),
+    }
+    if config.simulate is not None:
+        facts["seed of the simulation"] = config.simulate.seed
+    if record is not None:
+        facts["report made (UTC)"] = record.started
+        facts["versions"] = record.versions
+    return facts
+
+
+def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
+    """Return what the table of stages shows, the report itself left out."""
+    from pchem_pipeline.stages.pipeline import STAGES
+
+    records = [(name, context.store.records.read(name)) for name in STAGES if name != NAME]
+    return [_stage_row(context.store, record) for _, record in records if record is not None]
+
+
+def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:
+    done = len(store.records.done(record.stage, record.fingerprint))
+    complete = done >= record.keys > 0
+    return {
+        "stage": record.stage,
+        "state": "complete" if complete else f"{done} of {record.keys} units",
+        "seconds": record.seconds,
+        "cpu_seconds": record.cpu_seconds,
+        "peak_memory_bytes": record.peak_rss_bytes,
+        "started": record.started,
+        "notes": list(record.notes),
+    }
+
+
+def _missing(
+    store: RunStore,
+    sensor: SensorInfo,
+    maps: Mapping[str, NDArray[Any]],
+    ensemble: Mapping[str, NDArray[Any]],
+) -> dict[str, str]:
+    """Say why parts are left out."""
+    found: dict[str, str] = {}
+    if "dark_current" not in maps:
+        found["dark_current"] = (
+            "no dark current, since the integration time is not known; set input.integration_time (s)"
+        )
+    if not any(np.isfinite(values).any() for values in maps.values()):
+        found["maps"] = "no pixel has a value"
+    why = "no pixel has parameters to predict from"
+    if sensor.kind == "histograms" and "maps" not in found:
+        why = "ready-made histograms keep no single frames"
+    for part, name in (
+        ("ensemble", "density"),
+        ("nuced", "nuced_density"),
+        ("electrons", "electron_mass"),
+        ("components", "component_variance"),
+    ):
+        if name not in ensemble:
+            found[part] = f"{_PARTS[part]}: {why}"
+    return found
+
+
+_PARTS = {
+    "ensemble": "no ensemble prediction",
+    "nuced": "no non-uniformity correction",
+    "electrons": "no electron numbers",
+    "components": "no component widths",
+}
