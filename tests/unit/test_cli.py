@@ -1,0 +1,131 @@
+"""The command line translates and calls once; what it calls is tested elsewhere."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pchem_pipeline import cli
+from pchem_pipeline.config.load import load_config, parse_config
+from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.stages import session, start
+from pchem_pipeline.stages.base import Options
+from pchem_pipeline.stages.session import Command, Target
+from pchem_pipeline.stages.start import find_or_start
+
+CONFIG = "input: {files: [a.tif]}\n"
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    seen = []
+    target = Target(parse_config(CONFIG), Path("/x"), Path("/x/run.zarr"))
+    monkeypatch.setattr(session, "find_run", lambda path: target)
+    monkeypatch.setattr(start, "find_run", lambda path: target)
+    monkeypatch.setattr(session, "run_stages", lambda *args: seen.append(args))
+    return seen
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(cli.app, list(arguments), catch_exceptions=False)
+
+
+@pytest.mark.parametrize("name", ["simulate", "histogram", "fit", "maps", "ensemble", "report", "electrons"])
+def test_a_stage_command_runs_its_stage(calls, name):
+    options = ["--force", "--tiles", "0.0", "--roi", "0:8,8:16", "--workers", "3", "--backend", "serial"]
+    result = invoke(name, "run.zarr", *options, "--progress", "off", "--quiet", "--log-json", "l.json")
+    assert result.exit_code == 0
+    [(target, stages, command)] = calls
+    assert stages == [name]
+    assert target.config == parse_config(CONFIG)
+    expected = Options(force=True, dry_run=False, tiles="0.0", roi=(0, 8, 8, 16))
+    assert command == Command(expected, 3, "serial", "off", True, Path("l.json"))
+
+
+def test_ingest_crops_the_input_to_the_region(calls):
+    invoke("ingest", "c.yaml", "--roi", "0:8,8:16")
+    [(target, _, command)] = calls
+    assert target.config.input.roi == (0, 8, 8, 16)
+    assert command.options.roi is None
+
+
+def test_run_does_every_stage_and_prints_the_report(calls):
+    result = invoke("run", "c.yaml")
+    [(_, stages, _)] = calls
+    assert stages == ("ingest", "histogram", "fit", "maps", "ensemble", "report")
+    assert result.stdout == "/x/run.zarr/report.html\n"
+
+
+def test_run_from_camera_files_writes_the_yaml_that_it_uses(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").mkdir()
+    files = [Path("frames") / f"f{number}.tif" for number in range(3)]
+    for path in files:
+        path.touch()
+    target, is_new = find_or_start(files, Path("out/my run.zarr"), {"integration_time": 4.87})
+    assert is_new
+    written = load_config(tmp_path / "out" / "my run.yaml")
+    assert written == target.config
+    assert written.input.files == ("../frames/f0.tif", "../frames/f1.tif", "../frames/f2.tif")
+    assert written.input.integration_time == 4.87
+    again, _ = find_or_start(files, Path("out/my run.zarr"), {"integration_time": 4.87})
+    assert again == target
+    with pytest.raises(ConfigError, match="exists with other settings"):
+        find_or_start(files, Path("out/my run.zarr"), {"integration_time": 2})
+
+
+def test_a_whole_folder_is_written_as_a_pattern(tmp_path):
+    for number in range(30):
+        (tmp_path / f"f{number}.tif").touch()
+    target, _ = find_or_start(sorted(tmp_path.glob("*.tif")), tmp_path / "run.zarr", {})
+    assert target.config.input.files == ("*.tif",)
+
+
+def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
+    with pytest.raises(ConfigError, match="--integration-time: only for camera files"):
+        find_or_start([tmp_path / "c.yaml"], None, {"integration_time": 1})
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="does not exist"):
+        find_or_start([tmp_path / "none.tif"], None, {})
+
+
+@pytest.mark.parametrize("text", ["1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5"])
+def test_wrong_roi_shows_how(text):
+    with pytest.raises(ConfigError, match="y0:y1,x0:x1"):
+        invoke("fit", "run.zarr", "--roi", text)
+
+
+def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert invoke("init", "c.yaml", "x.fits").stdout == "c.yaml\n"
+    assert load_config(tmp_path / "c.yaml").input.files == ("x.fits",)
+    with pytest.raises(ConfigError, match="c.yaml exists"):
+        invoke("init", "c.yaml")
+    invoke("init", "c.yaml", "--simulated", "--force")
+    assert load_config(tmp_path / "c.yaml").simulate is not None
+
+
+def test_errors_are_one_line_with_their_exit_code(monkeypatch, capsys):
+    def fail(**_):
+        raise InputError("frames.tif is truncated;\n copy it again")
+
+    monkeypatch.setattr(cli, "app", fail)
+    with pytest.raises(SystemExit) as caught:
+        cli.main([])
+    assert caught.value.code == 4
+    assert capsys.readouterr().err == "pchem: frames.tif is truncated; copy it again\n"
+
+
+def test_out_of_memory_and_ctrl_c_have_their_codes(monkeypatch, capsys):
+    for error, code in ((MemoryError(), 1), (KeyboardInterrupt(), 130)):
+
+        def fail(error=error, **_):
+            raise error
+
+        monkeypatch.setattr(cli, "app", fail)
+        with pytest.raises(SystemExit) as caught:
+            cli.main([])
+        assert caught.value.code == code
+        assert capsys.readouterr().err.startswith("pchem: ")
