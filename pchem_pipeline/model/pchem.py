@@ -16,7 +16,7 @@ from pchem_pipeline.model.start_numba import regression_basis
 
 __all__ = ["FitResult", "fit_histograms"]
 
-WARM_UP = 2  # EM steps before the first Newton step
+WARM_UP = 1  # EM steps before the first Newton step
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from pchem_pipeline.model.polish_numba import (
     MIN_LOG_EXPOSURE,
     min_log_variance,
     polish,
+    same_maximum,
 )
 from pchem_pipeline.model.start_numba import (
     N_FREQUENCIES_WIDE,
@@ -40,23 +41,17 @@ N_OUT = 3
 
 N_WORK = 9  # rows of scratch
 
-_CLEAR_GAP = 50.0  # nats: a neighbour this far below is not polished to the end
+_CLEAR_GAP = 30.0  # nats: a neighbour this far below is not polished to the end
 _SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
 _SUSPICIOUS_NOISE = 0.42  # e-: above it the side lobe sinks into the noise and the first start errs more often
 _MOST_MOVES = 40
+_MIN_STEP = 1.0  # DN per electron, of a start
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def log_likelihood_gaussian(n: float, variance: float) -> float:
     """Return the log-likelihood of the best single Gaussian, the limit g to infinity."""
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(variance, 1.0 / 12.0)))
-
-
-@nb.njit(nogil=True, cache=True, error_model="numpy")
-def _same(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
-    """Tell whether two maxima are one: bias within 0.3 e-, step within 10 %."""
-    a = left[1]
-    return abs(left[2] - right[2]) < 0.3 * a and abs(left[1] - right[1]) < 0.1 * a
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -94,10 +89,10 @@ def _climb_neighbours(
             trial[3] = best[3]
             outcome, loglik, count = polish(
                 weights, cumulative, n_bins, first, trial, limits, False, best_loglik - _CLEAR_GAP,
-                work, total, score, information,
+                best, best_loglik, work, total, score, information,
             )  # fmt: skip
             used += count
-            if outcome != DEGENERATE and not _same(best, trial):
+            if outcome != DEGENERATE and not same_maximum(best, trial):
                 if loglik > best_loglik and outcome == CONVERGED and moves < _MOST_MOVES:
                     runner_up = best_loglik
                     best[:] = trial
@@ -113,6 +108,44 @@ def _climb_neighbours(
         direction = -direction
         tried += 1
     return best_loglik, runner_up, used
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _first_start(
+    weights: NDArray[np.float64],
+    cumulative: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    n: float,
+    mean: float,
+    variance: float,
+    basis: NDArray[np.float64],
+    work: NDArray[np.float64],
+    total: NDArray[np.float64],
+    score: NDArray[np.float64],
+    information: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> bool:
+    """Fill ``theta`` with the regression's start, or, if that sees no side lobe, the likeliest of three."""
+    usable, clear = start_regression(weights, n_bins, first, n, mean, variance, basis, work, theta)
+    if usable and clear:
+        return True
+    trial = np.empty(4)
+    best = -math.inf
+    if usable:
+        best = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, False)
+    for which in range(2):
+        if which == 0:
+            found = start_peak(weights, n_bins, first, n, mean, variance, work, trial)
+        else:
+            found = start_cumulants(weights, n_bins, first, n, mean, variance, trial)
+        if found and trial[1] > _MIN_STEP:
+            loglik = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+            if loglik > best:
+                best = loglik
+                theta[:] = trial
+                usable = True
+    return usable
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -189,18 +222,21 @@ def fit_pixel(
     best[:] = 0.0
     for attempt in range(-1, 4):
         if attempt < 0:
-            usable = start_regression(weights, n_bins, first, n, mean, variance, basis, work, trial)
+            usable = _first_start(
+                weights, cumulative, n_bins, first, n, mean, variance, basis, work, total, score, scratch, trial
+            )
         else:
             usable = _other_start(attempt, weights, n_bins, first, n, mean, variance, best, work, trial)
         if not usable:
             continue
         outcome, loglik, count = polish(
-            weights, cumulative, n_bins, first, trial, limits, only_em, -math.inf, work, total, score, scratch
-        )
+            weights, cumulative, n_bins, first, trial, limits, only_em, -math.inf,
+            trial, math.inf, work, total, score, scratch,
+        )  # fmt: skip
         used += count
         if outcome == DEGENERATE:
             degenerate = True
-        if outcome != CONVERGED or (best[1] > 0.0 and _same(best, trial)):
+        if outcome != CONVERGED or (best[1] > 0.0 and same_maximum(best, trial)):
             continue
         if loglik <= best_loglik:
             runner_up = max(runner_up, loglik)

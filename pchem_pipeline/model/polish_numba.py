@@ -11,7 +11,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.estep_numba import LOGLIK, SUM_E, SUM_EE, SUM_K, SUM_KE, SUM_KK, evaluate
+from pchem_pipeline.model.estep_numba import N_TOTAL, SUM_E, SUM_EE, SUM_K, SUM_KE, SUM_KK, evaluate
 from pchem_pipeline.model.fisher_numba import back_substitute, cholesky
 
 # outcomes of `polish`
@@ -28,6 +28,8 @@ MIN_ELECTRON_NOISE = 0.03  # below it the polynomials of the E-step overflow
 MAX_ELECTRON_NOISE = 3.0  # above it there is one Gaussian to all intents
 _MIN_STEP = 1.2  # DN per electron: a comb with a tooth at each DN would fit any whole numbers
 MAX_LOG_EXPOSURE = math.log(1e5)
+_LEAST_SHARE = 1e-5  # of the complete-data information in a damped step
+_LARGEST_SHARE = 3.0  # beyond it an EM step is taken
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -86,34 +88,35 @@ def newton_step(
     score: NDArray[np.float64],
     information: NDArray[np.float64],
     bound: float,
+    share: float,
     step: NDArray[np.float64],
-) -> float:
-    """Solve for the Newton step; parameters held by a bound stay.
+) -> tuple[float, float]:
+    """Solve for the damped Newton step; parameters held by a bound stay.
 
-    Where the observed information is not positive definite, a growing share of the complete-data information
-    is added: the step turns from Newton's into that of EM.
+    A share of the complete-data information is added to the observed information, more of it where that is not
+    positive definite: the step turns from Newton's into a shortened EM step.
 
     Returns:
-        Half the squared Newton decrement, the expected rise of the log-likelihood; -1 where the
-        information is not positive definite, so that nothing can be said of the rise.
+        Half the squared Newton decrement, the expected rise of the log-likelihood, and the share used. Only
+        with a share of 0 does the former say how far the maximum is.
     """
     held = np.zeros(4, np.bool_)
     held[0] = theta[0] <= bound + 1e-12 and score[0] <= 0.0
     held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-12 and score[3] <= 0.0
     lower = np.empty((4, 4))
     matrix = information.copy()
-    share = 0.0
+    if share > 0.0:
+        add_complete(n, theta, total, share, matrix)
     while not cholesky(matrix, held, lower):
-        more = 0.01 if share == 0.0 else 2.0 * share
+        more = max(_LEAST_SHARE, 2.0 * share)
         add_complete(n, theta, total, more, matrix)
         share += more
-        if share > 3.0:
+        if share > 3.0 * _LARGEST_SHARE:
             step[:] = 0.0
-            return -1.0
+            return 0.0, share
     for i in range(4):
         step[i] = 0.0 if held[i] else score[i]
-    rise = 0.5 * back_substitute(lower, step)
-    return rise if share == 0.0 else -1.0
+    return 0.5 * back_substitute(lower, step), share
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -132,11 +135,18 @@ def _bounded(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _degenerate(theta: NDArray[np.float64], longest_step: float) -> bool:
+def degenerate(theta: NDArray[np.float64], longest_step: float) -> bool:
+    """Tell whether the parameters left the range in which a PCD can be told from one Gaussian."""
     noise = math.exp(0.5 * theta[3]) / theta[1]
     return not (
         noise < MAX_ELECTRON_NOISE and _MIN_STEP < theta[1] < longest_step and theta[0] < MAX_LOG_EXPOSURE
     )
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def same_maximum(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
+    """Tell whether two points belong to one maximum: bias within 0.3 e-, step within 10 %."""
+    return abs(left[2] - right[2]) < 0.3 * left[1] and abs(left[1] - right[1]) < 0.1 * left[1]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -149,6 +159,8 @@ def polish(
     limits: NDArray[np.float64],
     only_em: bool,
     to_beat: float,
+    known: NDArray[np.float64],
+    known_loglik: float,
     work: NDArray[np.float64],
     total: NDArray[np.float64],
     score: NDArray[np.float64],
@@ -165,57 +177,63 @@ def polish(
         limits: bounds and limits, see the names at the top of this module.
         only_em: take EM steps only.
         to_beat: give up once the log-likelihood cannot rise to this value, judged by twice the expected rise.
+        known: a maximum known already; the climb ends where it heads for that one.
+        known_loglik: its log-likelihood, infinite where there is none.
         work: scratch of `evaluate`.
         total: scratch.
         score: scratch.
         information: scratch.
 
     Returns:
-        Outcome, log-likelihood at the last theta (the rise expected from a last Newton step included),
-        number of evaluations.
+        Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
+        that is trusted), number of evaluations.
     """
     bound, tolerance = limits[MIN_LOG_EXPOSURE], limits[TOLERANCE]
     n = cumulative[n_bins]
-    trial, safe, step = np.empty(4), np.empty(4), np.empty(4)
+    trial, step = np.empty(4), np.empty(4)
+    new_total, new_score, new_information = np.empty(N_TOTAL), np.empty(4), np.empty((4, 4))
     theta[0] = max(bound, theta[0])
     theta[3] = max(min_log_variance(theta[1]), theta[3])
-    if _degenerate(theta, limits[MAX_STEP]):
+    if degenerate(theta, limits[MAX_STEP]):
         return DEGENERATE, -math.inf, 0
     loglik = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, False)
-    used = 1
-    for count in range(int(limits[MAX_EVALUATIONS])):
-        rise = newton_step(n, theta, total, score, information, bound, step)
-        has_em = em_step(n, theta, total, bound, safe)
-        if 0.0 <= rise < tolerance:
-            if only_em:
-                return CONVERGED, loglik, used
-            if _bounded(theta, step, bound, trial) == 1.0:
-                theta[:] = trial
-                return CONVERGED, loglik + rise, used
-        if rise >= 0.0 and loglik + 2.0 * rise + 1.0 < to_beat:
-            return FAR_BELOW, loglik, used
-        newton = not only_em and count >= limits[WARM_UP]
+    used, damping = 1, 0.0
+    warm_up = limits[WARM_UP] if known_loglik == math.inf else 0.0
+    while used < limits[MAX_EVALUATIONS]:
+        rise, share = newton_step(n, theta, total, score, information, bound, damping, step)
+        if share == 0.0 and rise < tolerance:
+            if not only_em:
+                _bounded(theta, step, bound, theta)
+                loglik += rise
+            return CONVERGED, loglik, used
+        if share == 0.0 and loglik + 2.0 * rise + 1.0 < to_beat:
+            return FAR_BELOW, loglik + rise, used
+        if share == 0.0 and loglik + rise > known_loglik - 1.0 and same_maximum(known, theta):
+            return CONVERGED, known_loglik, used
+        newton = not only_em and used > warm_up and share <= _LARGEST_SHARE
+        factor = 1.0
         if newton:
-            _bounded(theta, step, bound, trial)
-        elif has_em:
-            trial[:] = safe
-        else:
+            factor = _bounded(theta, step, bound, trial)
+        elif not em_step(n, theta, total, bound, trial):
             return NOT_CONVERGED, loglik, used
-        if _degenerate(trial, limits[MAX_STEP]):
-            if not newton or not has_em or _degenerate(safe, limits[MAX_STEP]):
-                return DEGENERATE, loglik, used
-            newton = False
-            trial[:] = safe
-        risen = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+        if degenerate(trial, limits[MAX_STEP]):
+            return DEGENERATE, loglik, used
+        risen = evaluate(
+            weights, cumulative, n_bins, first, trial, work, new_total, new_score, new_information, False
+        )
         used += 1
-        if newton and not risen >= loglik - 1e-11 * abs(loglik) and has_em:
-            trial[:] = safe
-            risen = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
-            used += 1
+        expected = (2.0 * factor - factor * factor) * rise
+        if newton and not risen >= loglik - 1e-11 * abs(loglik):
+            damping = max(4.0 * share, 3.0 * _LEAST_SHARE)
+            continue
         if not math.isfinite(risen):
             return NOT_CONVERGED, loglik, used
-        theta[:] = trial
+        if risen - loglik > 0.75 * expected:
+            damping = 0.1 * share if share > 10.0 * _LEAST_SHARE else 0.0
+        elif risen - loglik < 0.25 * expected and rise > 1e-3:
+            damping = max(4.0 * share, _LEAST_SHARE)
+        else:
+            damping = share
+        theta[:], total[:], score[:], information[:, :] = trial, new_total, new_score, new_information
         loglik = risen
-        if used >= limits[MAX_EVALUATIONS]:
-            break
-    return NOT_CONVERGED, total[LOGLIK], used
+    return NOT_CONVERGED, loglik, used

@@ -21,6 +21,7 @@ N_FREQUENCIES_WIDE = 192  # up to 14.4/sd, the lobe of H = 200
 LOBE_STEP = 0.05
 LOBE_FIRST = 0.25  # lowest lobe frequency tried, 1/sd: the step a is at most 4 sd
 N_LOBES = 90
+_HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 
 _TWO_PI = 2.0 * math.pi
 _MIN_VARIANCE = 1.0 / 12.0
@@ -135,15 +136,20 @@ def _assemble(
     a: float,
     exposure: float,
     theta: NDArray[np.float64],
-) -> bool:
-    """Turn a step and a rough H into a start: noise from the lobe's height, bias from its phase."""
+) -> tuple[bool, bool]:
+    """Turn a step and a rough H into a start: noise from the lobe's height, bias from its phase.
+
+    Returns:
+        Whether there is a start, and whether the lobe stands clear of the noise.
+    """
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
-        return False
+        return False, False
     modulus, phase = ecf_at(weights, n_bins, first, 1.0 / a)
     modulus /= n
     s2 = max(variance - exposure * a * a, 0.16 * a * a)
     bias = mean - exposure * a
-    if modulus > 3.0 / math.sqrt(n):
+    clear = modulus > 3.0 / math.sqrt(n)
+    if clear:
         s2 = -math.log(min(modulus, 0.999)) * a * a / (2.0 * math.pi * math.pi)
         from_variance = (variance - s2) / (a * a)
         if from_variance > 0.0:
@@ -160,7 +166,7 @@ def _assemble(
     theta[1] = a
     theta[2] = bias
     theta[3] = math.log(min(max(s2, _MIN_VARIANCE, 0.0025 * a * a), max(variance, _MIN_VARIANCE)))
-    return True
+    return True, clear
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -174,13 +180,18 @@ def start_regression(
     basis: NDArray[np.float64],
     work: NDArray[np.float64],
     theta: NDArray[np.float64],
-) -> bool:
-    """Start from the regression on log|phi|; False where there is none. ``work`` has nine rows."""
+) -> tuple[bool, bool]:
+    """Start from the regression on log|phi|; ``work`` has nine rows.
+
+    Returns:
+        Whether there is a start, and whether the side lobe at its frequency stands clear of the noise.
+    """
     sd = math.sqrt(variance)
-    ecf(weights, n_bins, first, FREQUENCY_STEP / sd, N_FREQUENCIES, work)
-    weight, quadratic, target = work[6, :N_FREQUENCIES], work[7, :N_FREQUENCIES], work[8, :N_FREQUENCIES]
+    n_used = min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP))
+    ecf(weights, n_bins, first, FREQUENCY_STEP / sd, n_used, work)
+    weight, quadratic, target = work[6, :n_used], work[7, :n_used], work[8, :n_used]
     floor = 9.0 / n
-    for m in range(N_FREQUENCIES):
+    for m in range(n_used):
         f = FREQUENCY_STEP * (m + 1)
         power = (work[0, m] * work[0, m] + work[1, m] * work[1, m]) / (n * n)
         quadratic[m] = 0.5 * _TWO_PI * _TWO_PI * f * f
@@ -192,7 +203,7 @@ def start_regression(
             target[m] = 0.0
     lobe, exposure = _regress(basis, weight, quadratic, target)
     if lobe <= 0.0:
-        return False
+        return False, False
     return _assemble(weights, n_bins, first, n, mean, variance, sd / lobe, exposure, theta)
 
 
@@ -214,7 +225,8 @@ def start_peak(
     for m in range(N_FREQUENCIES_WIDE):
         modulus[m] = math.hypot(work[0, m], work[1, m]) / n
     best, place = 3.0 / math.sqrt(n), -1
-    for m in range(1, N_FREQUENCIES_WIDE - 1):
+    highest = min(N_FREQUENCIES_WIDE - 1, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP) - 1)
+    for m in range(1, highest):
         if modulus[m] > best and modulus[m] >= modulus[m - 1] and modulus[m] >= modulus[m + 1]:
             best, place = modulus[m], m
     if place < 0:
@@ -225,7 +237,7 @@ def start_peak(
     a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
     electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
     exposure = max(0.05, variance / (a * a) - electron_noise)
-    return _assemble(weights, n_bins, first, n, mean, variance, a, exposure, theta)
+    return _assemble(weights, n_bins, first, n, mean, variance, a, exposure, theta)[0]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
