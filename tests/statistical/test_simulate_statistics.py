@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from pchem_pipeline.model.pcd import pcd_mass
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -71,6 +72,12 @@ def test_frames_have_the_exact_mass_of_the_model(h, dn_per_electron, mu, sigma, 
     full = expected >= 20
     chi2 = ((counts - expected)[full] ** 2 / expected[full]).sum()
     assert stats.chi2.sf(chi2, full.sum()) > FALSE_ALARM
+
+
+def test_the_mass_used_here_is_that_of_the_model():
+    x = np.arange(400)
+    for h, g, mu, sigma in ((2.0, 1 / 11, 100.3, 0.3), (0.1, 1 / 8, 90.0, 0.2), (1.5, 1.0, 5.2, 0.25)):
+        np.testing.assert_allclose(pcd_mass(x, h, g, mu, sigma), exact_mass(x, h, g, mu, sigma), atol=1e-12)
 
 
 def test_uniforms_are_uniform():
