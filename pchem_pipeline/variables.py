@@ -189,13 +189,26 @@ _ALL: list[Variable] = [
     Variable("ensemble/electron_counts", ("k",), "int64", "1", "histogram of the estimated electron numbers"),
     Variable("ensemble/electron_mass", ("k",), "float64", "1", "histogram of electron numbers, normalised"),
     Variable("ensemble/electron_pmf", ("k",), "float64", "1", "mass predicted from the map of H", "p_Ke"),
+    Variable(
+        "ensemble/electron_pmf_binned",
+        ("k",),
+        "float64",
+        "1",
+        "mass predicted from the histogram of H",
+        "p_Ke",
+    ),
     Variable("ensemble/electron_pmf_map", ("k",), "float64", "1", "mass that the estimator of k should show"),
     Variable(
-        "ensemble/component_mean", ("k",), "float64", "DN", "mean of the EPCD's component k", "E(E|K_e=k)"
+        "ensemble/component_mean",
+        ("component",),
+        "float64",
+        "DN",
+        "mean of the EPCD's component k",
+        "E(E|K_e=k)",
     ),
     Variable(
         "ensemble/component_variance",
-        ("case", "k"),
+        ("case", "component"),
         "float64",
         "DN2",
         "variance of the EPCD's component k, parameters of the case held constant",
@@ -203,12 +216,15 @@ _ALL: list[Variable] = [
     ),
     Variable(
         "ensemble/nuced_component_variance",
-        ("k",),
+        ("component",),
         "float64",
         "e-2",
         "variance of the NUCed EPCD's component k",
         "Var(E'|K_e=k)",
     ),
+    # what each tile adds to the ensemble; kept so that a run can resume
+    Variable("ensemble_tiles/integers", ("tile", "integer"), "int64", "1", "tallies of the tile's data"),
+    Variable("ensemble_tiles/floats", ("tile", "float"), "float64", "1", "sums over the tile's pixels"),
     Variable(
         "electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"
     ),

@@ -124,7 +124,7 @@ def predicted_moments(pixels: PixelParameters) -> EnsembleMoments:
     )
 
 
-def moment_errors(pixels: PixelParameters, n_frames: int) -> MomentErrors:
+def moment_errors(pixels: PixelParameters, n_frames: int | NDArray[np.integer[Any]]) -> MomentErrors:
     """Standard errors of the sample moments of the ensemble, the pixels given.
 
     A pixel's samples have variance v = sigma^2 + H/g^2, third central moment H/g^3 and fourth 3 v^2 + H/g^4.
@@ -133,20 +133,19 @@ def moment_errors(pixels: PixelParameters, n_frames: int) -> MomentErrors:
 
     Args:
         pixels: the pixels.
-        n_frames: frames of each pixel.
+        n_frames: frames of each pixel: a number, or shape (n,) where pixels differ and each counts the same.
 
     Returns:
         Standard errors of mean and variance, raw and NUCed.
     """
     exposure, gain, bias, sigma = pixels.columns()
-    n_samples = n_frames * len(pixels)
     errors = []
     for step, offset, noise in ((1.0 / gain, bias, sigma), (1.0, 0.0, pixels.read_noise_e)):
         v = noise**2 + exposure * step**2
         centre = offset + exposure * step
         d = centre - centre.mean()
         of_square = 2 * v**2 + exposure * step**4 + 4 * d * exposure * step**3 + 4 * d**2 * v
-        errors += [float(np.sqrt(v.mean() / n_samples)), float(np.sqrt(of_square.mean() / n_samples))]
+        errors += [float(np.sqrt(np.mean(part / n_frames) / len(pixels))) for part in (v, of_square)]
     return MomentErrors(*errors)
 
 

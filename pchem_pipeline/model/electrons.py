@@ -62,6 +62,12 @@ class ErrorTally:
     by_size: NDArray[np.int64]
     signed: int
 
+    def __add__(self, other: ErrorTally) -> ErrorTally:
+        """Return the tally of both sets of samples."""
+        return ErrorTally(
+            self.n_samples + other.n_samples, self.by_size + other.by_size, self.signed + other.signed
+        )
+
 
 def thresholds(
     quanta_exposure: FloatArray | float,

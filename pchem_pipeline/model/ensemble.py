@@ -8,7 +8,6 @@ The binned forms of the paper are in :mod:`pchem_pipeline.model.ensemble_binned`
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +25,6 @@ __all__ = [
     "electron_pmf",
     "ensemble_sums",
     "epcd_exact",
-    "merge_sums",
-    "merge_tallies",
     "nuced_axis",
     "tally",
 ]
@@ -171,49 +168,6 @@ def ensemble_sums(pixels: PixelParameters, dn: DnAxis, nuced: NucedAxis | None =
         bins_square,
     )
     return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square)
-
-
-def _exact_sum(parts: Sequence[FloatArray]) -> FloatArray:
-    """Add arrays bin by bin with one rounding, so that the order and number of parts do not matter."""
-    stacked = np.stack(parts)
-    return np.array([math.fsum(column) for column in stacked.T], dtype=np.float64)
-
-
-def merge_sums(parts: Sequence[EnsembleSums]) -> EnsembleSums:
-    """Add the sums of several tiles; the order does not matter.
-
-    Args:
-        parts: at least one, all on the same axes.
-
-    Returns:
-        Their sum.
-    """
-    return EnsembleSums(
-        sum(part.n_pixels for part in parts),
-        *(
-            _exact_sum([getattr(part, name) for part in parts])
-            for name in ("raw", "raw_square", "nuced", "nuced_square")
-        ),
-    )
-
-
-def merge_tallies(parts: Sequence[Tally]) -> Tally:
-    """Add the tallies of several tiles; the order does not matter.
-
-    Args:
-        parts: at least one, all on the same axes.
-
-    Returns:
-        Their sum.
-    """
-    return Tally(
-        raw=np.sum([part.raw for part in parts], axis=0),
-        nuced=np.sum([part.nuced for part in parts], axis=0),
-        outside=sum(part.outside for part in parts),
-        nuced_outside=sum(part.nuced_outside for part in parts),
-        nuced_sum=math.fsum(part.nuced_sum for part in parts),
-        nuced_sum_square=math.fsum(part.nuced_sum_square for part in parts),
-    )
 
 
 def epcd_exact(pixels: PixelParameters, dn: DnAxis) -> FloatArray:

@@ -27,28 +27,6 @@ ORIGIN = RNG.integers(80, 100, N)
 AXIS = nuced_axis(PIXELS, DN)
 
 
-def part(start: int, stop: int) -> PixelParameters:
-    return PixelParameters(*(column[start:stop] for column in PIXELS.columns()))
-
-
-@given(st.sets(st.integers(1, N - 1)))
-@settings(max_examples=30, deadline=None)
-def test_any_tiling_gives_the_same_ensemble(cuts: set[int]) -> None:
-    borders = [0, *sorted(cuts), N]
-    pieces = list(itertools.pairwise(borders))
-    sums = merge_sums([ensemble_sums(part(a, b), DN, AXIS) for a, b in pieces])
-    whole = ensemble_sums(PIXELS, DN, AXIS)
-    for name in ("raw", "raw_square", "nuced", "nuced_square"):
-        np.testing.assert_allclose(getattr(sums, name), getattr(whole, name), rtol=1e-12)
-    tallies = merge_tallies([tally(COUNTS[a:b], ORIGIN[a:b], part(a, b), DN, AXIS) for a, b in pieces])
-    all_of_it = tally(COUNTS, ORIGIN, PIXELS, DN, AXIS)
-    np.testing.assert_array_equal(tallies.raw, all_of_it.raw)
-    np.testing.assert_array_equal(tallies.nuced, all_of_it.nuced)
-    assert (
-        tallies.nuced_sum == all_of_it.nuced_sum or abs(tallies.nuced_sum / all_of_it.nuced_sum - 1) < 1e-12
-    )
-
-
 @given(
     exposure=st.floats(1e-6, 1e3),
     gain=st.floats(0.02, 2.0),

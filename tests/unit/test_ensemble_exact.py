@@ -13,8 +13,6 @@ from pchem_pipeline.model.ensemble import (
     electron_pmf,
     ensemble_sums,
     epcd_exact,
-    merge_sums,
-    merge_tallies,
     nuced_axis,
     tally,
 )
@@ -145,33 +143,6 @@ def test_axis_is_not_stretched_by_one_strange_gain() -> None:
     assert usual.electrons[-1] > 15.0
     assert nuced_axis(pixels, DnAxis(60, 200), steps=3).width == pytest.approx(3 * usual.width)
     assert nuced_axis(pixels, DnAxis(60, 200), width=0.25).width == 0.25
-
-
-def test_merging_tiles_gives_the_whole() -> None:
-    pixels, dn = make_pixels(50), DnAxis(40, 300)
-    axis = nuced_axis(pixels, dn)
-    whole = ensemble_sums(pixels, dn, axis)
-    parts = []
-    for start, stop in ((30, 50), (0, 7), (7, 30)):
-        piece = PixelParameters(*(column[start:stop] for column in pixels.columns()))
-        parts.append(ensemble_sums(piece, dn, axis))
-    merged = merge_sums(parts)
-    assert merged.n_pixels == 50
-    for name in ("raw", "raw_square", "nuced", "nuced_square"):
-        np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
-    np.testing.assert_array_equal(merged.raw, merge_sums(parts[::-1]).raw)
-
-
-def test_merging_tallies() -> None:
-    pixels, dn, axis = make_pixels(2), DnAxis(0, 5), NucedAxis(1.0, -20, 40)
-    parts = []
-    for p in range(2):
-        one = PixelParameters(*(column[p : p + 1] for column in pixels.columns()))
-        parts.append(tally(np.array([[1, 2, 3, 4, 5, 6]]), np.array([p]), one, dn, axis))
-    merged = merge_tallies(parts)
-    np.testing.assert_array_equal(merged.raw, [1, 3, 5, 7, 9])
-    assert merged.outside == 6 + 5 + 6
-    assert merged.nuced_sum == pytest.approx(parts[0].nuced_sum + parts[1].nuced_sum)
 
 
 def test_electron_mass_is_the_mean_of_poisson_masses() -> None:

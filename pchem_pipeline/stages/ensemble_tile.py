@@ -1,0 +1,180 @@
+"""What a tile adds to the ensemble, as two rows of numbers that need only be summed.
+
+Frames give every pixel the same number of samples. Ready-made histograms need not, and there every pixel
+counts the same: its samples are divided by their number before they are added.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
+from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, ensemble_sums, tally
+from pchem_pipeline.model.pixels import FloatArray, PixelParameters
+
+__all__ = ["EnsembleAxes", "PixelHistograms", "ensemble_tile"]
+
+#: Sizes of error of the electron numbers told apart; the last one is: and more.
+ERROR_SIZES = 8
+
+_INTEGERS = (
+    "pixels",
+    "excluded",
+    "outside",
+    "outside_all",
+    "nuced_outside",
+    "electrons_beyond",
+    "compared",
+    "signed_error",
+)
+_FLOATS = ("nuced_sum", "nuced_sum_square", "error", "error_variance")
+
+
+@dataclass(frozen=True)
+class PixelHistograms:
+    """Histograms of some pixels.
+
+    Attributes:
+        counts: samples per bin, shape (n, n_bins).
+        outside: samples outside of the bins, shape (n,).
+    """
+
+    counts: NDArray[np.unsignedinteger[Any]]
+    outside: NDArray[np.integer[Any]]
+
+    def of(self, mask: NDArray[np.bool_]) -> PixelHistograms:
+        """Return those of the chosen pixels."""
+        return PixelHistograms(self.counts[mask], self.outside[mask])
+
+    @property
+    def samples(self) -> NDArray[np.int64]:
+        """Number of samples of each pixel, shape (n,)."""
+        return np.asarray(self.counts.sum(axis=1, dtype=np.int64) + self.outside)
+
+
+@dataclass(frozen=True)
+class EnsembleAxes:
+    """The axes of the ensemble, and where each sum stands in the rows of a tile.
+
+    Attributes:
+        dn: DN of the raw ensemble.
+        nuced: bins of the NUCed ensemble.
+        n_k: number of electron numbers.
+    """
+
+    dn: DnAxis
+    nuced: NucedAxis
+    n_k: int
+
+    @cached_property
+    def integers(self) -> dict[str, slice]:
+        """Place of each tally in the row of integers."""
+        lengths = {"counts": self.dn.size, "counts_all": self.dn.size, "nuced_counts": self.nuced.size}
+        lengths |= {"electron_counts": self.n_k, "error_sizes": ERROR_SIZES}
+        return _places(lengths | dict.fromkeys(_INTEGERS, 1))
+
+    @cached_property
+    def floats(self) -> dict[str, slice]:
+        """Place of each sum in the row of floats."""
+        lengths: dict[str, int] = {}
+        for name in ("pcd", "pcd_variance", "share", "share_all"):
+            lengths[name] = self.dn.size
+        for name in ("nuced", "nuced_variance", "nuced_share"):
+            lengths[name] = self.nuced.size
+        for name in ("electron_share", "electron_expected"):
+            lengths[name] = self.n_k
+        return _places(lengths | dict.fromkeys(_FLOATS, 1))
+
+
+def _places(lengths: dict[str, int]) -> dict[str, slice]:
+    ends = np.cumsum(list(lengths.values())).tolist()
+    return {name: slice(end - size, end) for (name, size), end in zip(lengths.items(), ends, strict=True)}
+
+
+def ensemble_tile(
+    maps: tuple[FloatArray, ...],
+    origin: NDArray[np.integer[Any]],
+    chosen: PixelHistograms,
+    everything: PixelHistograms,
+    axes: EnsembleAxes,
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return what some pixels add to the ensemble.
+
+    Args:
+        maps: (H, g, mu, sigma) of the pixels, each of shape (n,); NaN where the fit failed.
+        origin: DN of bin 0 of their histograms, shape (n,).
+        chosen: histograms of the chosen frames.
+        everything: histograms of all frames, on the same bins.
+        axes: axes of the ensemble.
+
+    Returns:
+        A row of integers and a row of floats, in the places that ``axes`` gives.
+    """
+    integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
+    floats = np.zeros(list(axes.floats.values())[-1].stop)
+    pixels, mask = PixelParameters.from_maps(maps)
+    integers[axes.integers["pixels"]] = len(pixels)
+    integers[axes.integers["excluded"]] = mask.size - len(pixels)
+    chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
+    samples, samples_all = chosen.samples, everything.samples
+    pairs = np.stack([samples, samples_all], axis=1)
+    for n, n_all in np.unique(pairs, axis=0):
+        group = (samples == n) & (samples_all == n_all)
+        part = PixelParameters(*(column[group] for column in pixels.columns()))
+        sets = (chosen.of(group), int(n)), (everything.of(group), int(n_all))
+        if n > 0:
+            _add_group(part, origin[group], *sets, axes, integers, floats)
+    return integers, floats
+
+
+def _add_group(
+    pixels: PixelParameters,
+    origin: NDArray[np.integer[Any]],
+    chosen: tuple[PixelHistograms, int],
+    everything: tuple[PixelHistograms, int],
+    axes: EnsembleAxes,
+    integers: NDArray[np.int64],
+    floats: FloatArray,
+) -> None:
+    """Add pixels that have the same number of samples."""
+    (histograms, n), (histograms_all, n_all) = chosen, everything
+    sums = ensemble_sums(pixels, axes.dn, axes.nuced)
+    data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
+    data_all = tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
+    numbers, beyond = electron_counts(histograms.counts, origin, pixels, axes.n_k)
+    cells = cell_probabilities(pixels, axes.n_k)
+    outside = int(histograms.outside.sum())
+    tallies: dict[str, NDArray[np.int64] | int] = {
+        "counts": data.raw,
+        "counts_all": data_all.raw,
+        "nuced_counts": data.nuced,
+        "electron_counts": numbers,
+        "outside": data.outside + outside,
+        "outside_all": data_all.outside + int(histograms_all.outside.sum()),
+        "nuced_outside": data.nuced_outside + outside,
+        "electrons_beyond": beyond + outside,
+    }
+    parts: dict[str, Any] = {
+        "pcd": sums.raw,
+        "pcd_variance": (sums.raw - sums.raw_square) / n,
+        "share": data.raw / n,
+        "share_all": data_all.raw / n_all,
+        "nuced": sums.nuced,
+        "nuced_variance": (sums.nuced - sums.nuced_square) / n,
+        "nuced_share": data.nuced / n,
+        "electron_share": numbers / n,
+        "electron_expected": cells.estimated,
+        "nuced_sum": data.nuced_sum / n,
+        "nuced_sum_square": data.nuced_sum_square / n,
+        "error": cells.error.sum(),
+        "error_variance": np.sum(cells.error * (1.0 - cells.error)),
+    }
+    for name, tallied in tallies.items():
+        integers[axes.integers[name]] += tallied
+    for name, part in parts.items():
+        floats[axes.floats[name]] += part
