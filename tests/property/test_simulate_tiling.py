@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.effects.base import Effect, Plane
 from pchem_pipeline.effects.context import EffectContext
+from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -131,6 +132,15 @@ def test_threads_give_the_same_frames():
     with ThreadPoolExecutor(4) as pool:
         parts = list(pool.map(lambda block: simulate_block(TRUTH[name], SENSORS[name], block)[0], blocks))
     np.testing.assert_array_equal(np.concatenate(parts), WHOLE[name][0])
+
+
+def test_the_size_of_the_planes_held_at_once_does_not_matter(monkeypatch):
+    for name, sensor in SENSORS.items():
+        for samples in (1, 3 * SHAPE[0] * SHAPE[1]):
+            monkeypatch.setattr(chain, "_SAMPLES_AT_ONCE", samples)
+            dn, electrons = simulate_block(TRUTH[name], sensor, (0, N_FRAMES))
+            np.testing.assert_array_equal(dn, WHOLE[name][0])
+            np.testing.assert_array_equal(electrons, WHOLE[name][1])
 
 
 def test_forgetting_halo_or_history_would_be_noticed():

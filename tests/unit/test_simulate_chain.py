@@ -233,4 +233,3 @@ def test_two_effects_of_one_tag_draw_different_numbers():
 def test_block_size_follows_the_budget():
     assert frames_per_block(sensor(), 6, 8 * 42 * 10) == 10
     assert frames_per_block(sensor(), 6, 1) == 1
-    assert frames_per_block(sensor(effects=NOTHING), 6, 8 * 42 * 10) == 1
