@@ -1,0 +1,88 @@
+"""Running ``pchem`` as a user does, and comparing what it leaves."""
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pchem_pipeline.store.run_store import RunStore
+
+PCHEM = str(Path(sys.executable).with_name("pchem"))
+
+RUN = """
+run: {store: run.zarr, tile: 8}
+input: {files: [frames/*.tif], integration_time: 4.87, bit_depth: 14}
+"""
+
+
+@dataclass
+class Result:
+    """What a finished command left."""
+
+    code: int
+    stdout: str
+    stderr: str
+
+    @property
+    def last(self) -> str:
+        """Last line of stderr."""
+        return self.stderr.strip().splitlines()[-1] if self.stderr.strip() else ""
+
+
+@dataclass
+class Shell:
+    """Runs ``pchem`` in a folder."""
+
+    folder: Path
+    environment: dict[str, str]
+
+    def start(self, *arguments, **options):
+        """Start the command and return the process."""
+        return subprocess.Popen(
+            [PCHEM, *map(str, arguments)],
+            cwd=self.folder,
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **options,
+        )
+
+    def __call__(self, *arguments) -> Result:
+        """Run the command to its end."""
+        process = self.start(*arguments)
+        stdout, stderr = process.communicate(timeout=300)
+        return Result(process.returncode, stdout, stderr)
+
+    def ok(self, *arguments) -> Result:
+        """Run the command, which must succeed."""
+        result = self(*arguments)
+        assert result.code == 0, result.stderr
+        return result
+
+
+def arrays_of(path, groups=("frames", "histogram", "summary", "fit", "maps", "ensemble")):
+    """Return every array of a run by name."""
+    store = RunStore.open(Path(path))
+    found = {}
+    for group in groups:
+        for folder in sorted((Path(path) / group).iterdir()):
+            if (folder / "zarr.json").exists():
+                found[f"{group}/{folder.name}"] = store.read(f"{group}/{folder.name}")
+    return found
+
+
+def assert_same_results(one, other, *, rtol=0.0, groups=("histogram", "summary", "fit", "maps", "ensemble")):
+    """Integers must be equal, floats to ``rtol`` (0: to the bit)."""
+    left, right = arrays_of(one, groups), arrays_of(other, groups)
+    assert left.keys() == right.keys()
+    assert len(left) > 40
+    for name, array in left.items():
+        if rtol and array.dtype.kind == "f":
+            scale = np.nanmax(np.abs(array), initial=0.0)
+            np.testing.assert_allclose(array, right[name], rtol=rtol, atol=rtol * scale, err_msg=name)
+        else:
+            np.testing.assert_array_equal(array, right[name], err_msg=name)

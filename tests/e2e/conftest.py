@@ -1,0 +1,58 @@
+"""The installed command, run as a user runs it: a process of its own, real files, another folder."""
+
+import os
+import shutil
+
+import pytest
+from commands import RUN, Shell
+
+CAMERA = """
+run: {store: truth.zarr, tile: 8}
+simulate:
+  shape: [20, 28]
+  n_frames: 1200
+  seed: 11
+  output: frames
+  frames_per_file: 300
+  integration_time: 4.87
+"""
+
+
+@pytest.fixture(scope="session")
+def kernels(tmp_path_factory):
+    """One cache of compiled kernels for all commands of the session."""
+    return os.environ.get("NUMBA_CACHE_DIR") or str(tmp_path_factory.mktemp("kernels"))
+
+
+@pytest.fixture
+def shell(tmp_path, kernels):
+    """Commands in an empty folder whose name has a space and a letter beyond ASCII."""
+    folder = tmp_path / "mein Labor µ"
+    folder.mkdir()
+    return Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+
+
+@pytest.fixture(scope="session")
+def camera(tmp_path_factory, kernels):
+    """A folder with ``frames/*.tif``, four files of 300 frames of 20 x 28 pixels, and ``truth.zarr``."""
+    folder = tmp_path_factory.mktemp("camera")
+    (folder / "camera.yaml").write_text(CAMERA)
+    Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("simulate", "camera.yaml")
+    return folder
+
+
+@pytest.fixture
+def frames(shell, camera):
+    """The camera's TIFF files in the folder of the shell, as ``frames/``."""
+    shutil.copytree(camera / "frames", shell.folder / "frames")
+    return shell.folder / "frames"
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory, camera, kernels):
+    """An uninterrupted run of the camera's frames, tiles of 8 pixels; do not change it."""
+    folder = tmp_path_factory.mktemp("finished")
+    shutil.copytree(camera / "frames", folder / "frames")
+    (folder / "run.yaml").write_text(RUN)
+    Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml")
+    return folder / "run.zarr"

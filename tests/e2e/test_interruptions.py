@@ -1,0 +1,60 @@
+"""Kill, stop, lock: nothing is lost and the resumed result is the uninterrupted one."""
+
+import random
+import signal
+import time
+
+import pytest
+from commands import RUN, assert_same_results
+from filelock import FileLock
+
+
+@pytest.fixture
+def run(shell, frames):
+    (shell.folder / "run.yaml").write_text(RUN)
+    return shell
+
+
+def test_killed_again_and_again_it_ends_with_the_same_bits(run, finished):
+    rng = random.Random(4)
+    killed = 0
+    for _ in range(12):
+        process = run.start("run", "run.yaml", "--quiet", "--workers", "2")
+        try:
+            process.communicate(timeout=rng.uniform(1.5, 5))
+        except Exception:
+            process.kill()
+            process.communicate()
+            killed += 1
+        else:
+            assert process.returncode == 0
+            break
+    run.ok("run", "run.yaml")
+    assert killed >= 1
+    assert_same_results(finished, run.folder / "run.zarr")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_stops_with_its_code_and_the_run_goes_on_later(run, finished, number, code):
+    process = run.start("run", "run.yaml")
+    store = run.folder / "run.zarr" / ".pchem" / "stages"
+    deadline = time.monotonic() + 120
+    while not (store / "histogram.json").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == code
+    assert stderr.strip().splitlines()[-1].startswith(f"pchem: stopped by {signal.Signals(number).name}")
+    run.ok("run", "run.yaml")
+    assert_same_results(finished, run.folder / "run.zarr")
+
+
+def test_a_second_process_on_the_same_run_is_refused(run, finished):
+    lock = run.folder / "run.zarr" / ".pchem"
+    run.ok("ingest", "run.yaml")
+    with FileLock(lock / "lock"):
+        result = run("run", "run.yaml")
+    assert result.code == 75
+    assert "in use by another pchem process" in result.last
+    run.ok("run", "run.yaml")
+    assert_same_results(finished, run.folder / "run.zarr")

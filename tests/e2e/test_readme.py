@@ -1,0 +1,78 @@
+"""Every command in README is run, in order, in a folder with frames/."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from pchem_pipeline.stages.pipeline import STAGES
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.S)
+
+
+def test_the_commands_in_readme_work(shell, frames):
+    script = "set -e\n" + "\n".join(blocks("bash"))
+    assert script.count("pchem ") >= 10
+    environment = {**shell.environment, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    result = subprocess.run(
+        ["bash", "-c", script], cwd=shell.folder, env=environment, capture_output=True, text=True, timeout=500
+    )
+    assert result.returncode == 0, result.stderr
+    assert (shell.folder / "run.zarr" / "report.html").exists()
+    shown = re.search(r"<!-- output of: (pchem status .*?) -->\n```\n(.*?)```", README, re.S)
+    assert shown is not None
+    assert shell.ok(*shown[1].split()[1:]).stdout == shown[2]
+
+
+def test_the_two_commands_are_there_and_the_demo_runs(shell):
+    [block] = blocks("sh")
+    for line in block.splitlines():
+        script = ROOT / line.split()[0]
+        assert os.access(script, os.X_OK)
+    environment = {
+        **shell.environment,
+        "PCHEM_NO_INSTALL": "1",
+        "PCHEM_VENV": str(Path(sys.executable).parents[1]),
+    }
+    command = [str(ROOT / "scripts" / "demo"), "out", "--size", "16", "--frames", "1500"]
+    result = subprocess.run(
+        command, cwd=shell.folder, env=environment, capture_output=True, text=True, timeout=500
+    )
+    assert result.returncode == 0, result.stderr
+    for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e"):
+        assert name in result.stdout
+    assert f"report: {shell.folder}/out/demo.zarr/report.html" in result.stdout
+
+
+def test_ci_runs_the_test_command_of_readme():
+    assert "./scripts/test" in blocks("sh")[0]
+    assert (ROOT / ".ci" / "run").read_text().strip().endswith("exec ./scripts/test")
+
+
+def test_readme_names_every_stage_and_exit_code():
+    for stage in STAGES:
+        assert stage in README
+    for code in ("0 ", "1 ", "2 ", "3 ", "4 ", "75 ", "130", "143"):
+        assert code in README
+
+
+def test_shipped_configs_named_in_readme_exist():
+    for name in re.findall(r"`(\w+\.yaml)` \(", README):
+        assert (ROOT / "configs" / name).exists()
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; sys.argv=['pchem','--help']\n"
+        "from pchem_pipeline.cli import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "heavy={'numpy','zarr','dask','numba','pydantic','scipy','matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

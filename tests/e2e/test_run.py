@@ -1,0 +1,175 @@
+"""From camera files to the report, through the installed command."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from commands import RUN, arrays_of, assert_same_results
+
+from pchem_pipeline.store.run_store import RunStore
+
+STAGES = ["ingest", "histogram", "fit", "maps", "ensemble", "report"]
+
+
+def record(store, stage):
+    return json.loads((Path(store) / ".pchem" / "stages" / f"{stage}.json").read_text())
+
+
+def test_a_folder_of_tiffs_becomes_a_report(shell, frames):
+    result = shell.ok(
+        "run", *sorted(frames.glob("*.tif")), "--store", "runs/dark.zarr", "--integration-time", "4.87"
+    )
+    report = shell.folder / "runs" / "dark.zarr" / "report.html"
+    assert result.stdout == f"{report}\n"
+    assert report.stat().st_size > 100_000
+    assert (shell.folder / "runs" / "dark.yaml").exists()
+    figures = {path.suffix for path in (report.parent / "figures").iterdir()}
+    assert {".svg", ".png"} <= figures
+    summary = json.loads((report.parent / "report.json").read_text())
+    assert 0.2 < summary["summary"]["read_noise_e"]["median"] < 0.45
+    names = "epcd_exact epcd_dependent epcd_independent nuced_dependent nuced_independent noise_floor"
+    assert set(names.split()) <= summary["ensemble"]["rmse"].keys()
+    assert "fit_status" in summary
+    # without a terminal there is no progress bar, only a line per stage
+    assert "\r" not in result.stderr
+    assert [line.split(":")[0] for line in result.stderr.splitlines() if " units in " in line] == STAGES
+    again = shell.ok("run", "runs/dark.yaml")
+    assert again.stderr.splitlines() == [f"{stage}: up to date" for stage in STAGES]
+
+
+def test_estimates_agree_with_the_truth(finished, camera):
+    truth = arrays_of(camera / "truth.zarr", ("truth",))
+    maps = arrays_of(finished, ("fit", "maps"))
+    good = maps["fit/fit_status"] == 0
+    assert good.mean() > 0.8
+    for name in ("quanta_exposure", "conversion_gain", "bias"):
+        error = (maps[f"maps/{name}"] - truth[f"truth/{name}"])[good]
+        pulls = error / maps[f"maps/{name}_stderr"][good]
+        n = pulls.size
+        assert abs(pulls.mean()) < 5 / np.sqrt(n)
+        # variance of a sample variance of normal deviates is 2/n; finite-sample tails get 10 % more
+        assert abs(pulls.var() - 1) < 5 * np.sqrt(2 / n) + 0.1
+        # the test can fail: a map shifted by one half of its standard error is seen
+        assert abs(pulls.mean() + 0.5) > 5 / np.sqrt(n)
+
+
+def test_xarray_opens_the_groups_with_units(finished):
+    fit = xr.open_zarr(finished, group="fit", consolidated=False)
+    assert fit.quanta_exposure.dims == ("y", "x")
+    assert fit.conversion_gain.attrs["units"] == "e-/DN"
+    assert fit.conversion_gain_stderr.attrs["units"] == "e-/DN"
+    counts = xr.open_zarr(finished, group="histogram", consolidated=False).counts
+    assert int(counts.sum()) == 1200 * 20 * 28
+
+
+def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, finished):
+    shutil.copytree(finished, shell.folder / "run.zarr")
+    (shell.folder / "run.yaml").write_text(RUN + "fit: {gap_threshold: 6}\n")
+    before = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
+    result = shell.ok("status", "run.yaml")
+    rows = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    assert rows["histogram"] == "complete"
+    assert rows["fit"] == "stale - fit.gap_threshold 5.0 -> 6.0"
+    assert rows["report"].startswith("stale")
+    dry = shell.ok("run", "run.yaml", "--dry-run")
+    assert "fit: stale - fit.gap_threshold 5.0 -> 6.0 -> would run" in dry.stderr
+    shell.ok("run", "run.yaml")
+    after = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
+    same = [stage for stage in STAGES if before[stage] == after[stage]]
+    assert same == ["ingest", "histogram"]
+
+
+def test_a_part_is_done_again_from_the_store_alone(shell, frames, finished):
+    shutil.copytree(finished, shell.folder / "run.zarr")
+    store = RunStore.open(shell.folder / "run.zarr", writable=True)
+    good = store.read("fit/bias")
+    store.write("fit/bias", (slice(0, 8), slice(8, 16)), np.zeros((8, 8)))
+    result = shell.ok("fit", "run.zarr", "--tiles", "0.1", "--force")
+    assert "fit: 12 of 12 units" in result.stderr
+    np.testing.assert_array_equal(store.read("fit/bias"), good)
+
+
+@pytest.mark.parametrize(
+    ("tile", "backend", "mode"),
+    [(16, "serial", "reference"), (64, "processes", "copy"), (8, "distributed", "reference")],
+)
+def test_neither_tiling_nor_backend_nor_mode_changes_the_answer(shell, frames, finished, tile, backend, mode):
+    text = RUN.replace("tile: 8", f"tile: {tile}").replace("bit_depth", f"mode: {mode}, bit_depth")
+    (shell.folder / "run.yaml").write_text(text)
+    shell.ok("run", "run.yaml", "--backend", backend, "--workers", "2")
+    assert_same_results(finished, shell.folder / "run.zarr", rtol=1e-12)
+
+
+def test_formats_of_the_same_frames_give_the_same_maps(shell, frames, finished):
+    import tifffile
+
+    stack = np.concatenate([tifffile.imread(path) for path in sorted(frames.glob("*.tif"))])
+    np.save(shell.folder / "stack.npy", stack)
+    shell.ok("run", "stack.npy", "--integration-time", "4.87", "--bit-depth", "14", "--store", "npy.zarr")
+    assert_same_results(finished, shell.folder / "npy.zarr", rtol=1e-12)
+
+
+def test_a_region_of_interest_is_that_part_of_the_sensor(shell, frames, finished):
+    shell.ok("run", "frames", "--roi", "4:12,8:28", "--bit-depth", "14", "--store", "roi.zarr")
+    whole, part = (
+        arrays_of(finished, ("histogram",)),
+        arrays_of(shell.folder / "roi.zarr", ("histogram", "fit")),
+    )
+    assert part["fit/bias"].shape == (8, 20)
+    np.testing.assert_array_equal(part["histogram/minimum"], whole["histogram/minimum"][4:12, 8:28])
+
+
+def test_export_and_electrons(shell, frames, finished):
+    import tifffile
+    from astropy.io import fits
+
+    shutil.copytree(finished, shell.folder / "run.zarr")
+    result = shell.ok("export", "run.zarr", "--format", "fits,tiff,npz,csv", "-o", "out")
+    written = [Path(line) for line in result.stdout.splitlines()]
+    assert {path.suffix for path in written} == {".fits", ".tif", ".npz", ".csv"}
+    expected = RunStore.open(finished).read("maps/read_noise_e")
+    found = 0
+    for path in (shell.folder / path for path in written):
+        if (
+            path.suffix == ".tif"
+            and "read_noise_e" in path.stem
+            and "stderr" not in path.stem
+            and "analog" not in path.stem
+        ):
+            np.testing.assert_allclose(tifffile.imread(path), expected, rtol=1e-6)
+            found += 1
+        if path.suffix == ".fits":
+            with fits.open(path) as units:
+                found += any(np.shape(unit.data) == expected.shape for unit in units)
+    assert found >= 2
+    shell.ok("electrons", "run.zarr")
+    electrons = RunStore.open(shell.folder / "run.zarr").read("electrons/electron_number")
+    assert electrons.shape == (1200, 20, 28)
+    assert 1 < electrons.mean() < 4
+
+
+def test_electron_numbers_are_mostly_the_true_ones(shell, camera, frames, finished):
+    shutil.copytree(finished, shell.folder / "run.zarr")
+    shell.ok("electrons", "run.zarr")
+    truth = RunStore.open(camera / "truth.zarr").read("truth/electron_number")
+    found = RunStore.open(shell.folder / "run.zarr").read("electrons/electron_number")[: len(truth)]
+    # read noise of 0.3 e-: an error every tenth or twentieth sample
+    assert 0.02 < np.mean(found != truth) < 0.2
+
+
+def test_json_log_and_quiet(shell, frames):
+    result = shell.ok("run", "frames", "--quiet", "--log-json", "log.jsonl")
+    assert not [line for line in result.stderr.splitlines() if "units in" in line]
+    events = [json.loads(line) for line in (shell.folder / "log.jsonl").read_text().splitlines()]
+    assert [event["stage"] for event in events if event["event"] == "start"] == STAGES
+
+
+def test_without_home_and_without_integration_time(shell, frames):
+    shell.environment = {**shell.environment, "HOME": "/nonexistent", "XDG_CACHE_HOME": "/nonexistent"}
+    del shell.environment["NUMBA_CACHE_DIR"]
+    shell.ok("run", "frames", "--roi", "0:8,0:8", "--quiet")
+    summary = json.loads((shell.folder / "run.zarr" / "report.json").read_text())
+    assert summary["summary"]["read_noise_e"]["median"] > 0
