@@ -6,7 +6,7 @@ Names are recorded without folders, so that a run can be moved together with its
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,12 @@ def _parts(path: Path) -> list[Path]:
     return [path]
 
 
-def hash_file(path: Path) -> str:
+def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:
     """Return the xxh3_128 of a file's content, streamed; of a folder: names and contents of all its files.
+
+    Args:
+        path: the file or folder.
+        advance: told of the number of bytes of each block, for a progress bar.
 
     Raises:
         InputError: the file cannot be read.
@@ -42,6 +46,8 @@ def hash_file(path: Path) -> str:
             with part.open("rb", buffering=0) as stream:
                 while count := stream.readinto(buffer):
                     hasher.update(view[:count])
+                    if advance is not None:
+                        advance(count)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
@@ -71,13 +77,17 @@ def digest_of(record: object) -> str:
     return xxhash.xxh3_128(json.dumps(record, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def content_identity(paths: Iterable[Path]) -> dict[str, Any]:
+def content_identity(paths: Iterable[Path], advance: Callable[[int], None] | None = None) -> dict[str, Any]:
     """Return ``{"files": [{"name", "size", "xxh3_128"}, ...], "digest"}``; reads every byte.
+
+    Args:
+        paths: the files, in reading order.
+        advance: told of the number of bytes of each block, for a progress bar.
 
     Raises:
         InputError: a file cannot be read.
     """
-    files = [{"name": path.name, "size": _size(path), "xxh3_128": hash_file(path)} for path in paths]
+    files = [{"name": path.name, "size": _size(path), "xxh3_128": hash_file(path, advance)} for path in paths]
     return {"files": files, "digest": digest_of(files)}
 
 

@@ -6,10 +6,11 @@ import re
 from pathlib import Path
 
 from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.frames.raw import RawReader, find_sidecar
 from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["HISTOGRAM_SUFFIXES", "natural_key", "resolve_files"]
+__all__ = ["HISTOGRAM_SUFFIXES", "input_paths", "natural_key", "resolve_files"]
 
 HISTOGRAM_SUFFIXES = {".csv": "histogram", ".npy": "histogram", ".npz": "histogram", ".txt": "histogram"}
 _GLOB = re.compile(r"[*?\[]")
@@ -49,6 +50,22 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         else:
             raise InputError(f"{path}: no such file or folder; correct input.files")
     return sorted(found, key=natural_key)
+
+
+def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
+    """Return all files that decide what is read: those of `resolve_files`, each with its sidecar.
+
+    Raises:
+        ConfigError: no files are named.
+        InputError: as in `resolve_files`.
+    """
+    paths: list[Path] = []
+    for path in resolve_files(settings, base_dir):
+        paths.append(path)
+        if settings.format == "raw" or path.suffix.lower() in RawReader.suffixes:
+            sidecar = find_sidecar(path)
+            paths += [sidecar] if sidecar is not None else []
+    return paths
 
 
 def _is_zarr(path: Path) -> bool:

@@ -25,6 +25,7 @@ class FrameSequence(FrameReader):
 
     Attributes:
         report: what was found in the files and what was done about it.
+        stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
 
     format_name = "sequence"
@@ -75,11 +76,13 @@ class FrameSequence(FrameReader):
                 "shifted by "
                 f"{self.bit_shift}; correct input.bit_depth or input.bit_shift"
             )
+        times = {reader.integration_time for reader in readers}
+        self.stated_integration_time = times.pop() if len(times) == 1 else None
         time = settings.integration_time
         self.integration_time = _agreed(readers, "integration_time") if time is None else time
-        times = [reader.timestamps for reader in readers]
-        if all(each is not None for each in times):
-            self.timestamps = np.concatenate([each for each in times if each is not None])[self._first : end]
+        stamps = [reader.timestamps for reader in readers]
+        if all(each is not None for each in stamps):
+            self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
         self.notes = tuple(dict.fromkeys(note for reader in readers for note in reader.notes))
 
     @classmethod

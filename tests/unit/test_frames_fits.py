@@ -141,7 +141,7 @@ def test_truncated_compressed_cube(tmp_path: Path) -> None:
     fits.CompImageHDU(STACK).writeto(path)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) - 2880 * 2])
-    with pytest.raises(InputError, match=r"cut\.fits: .*(truncated|cannot be decoded)"):
+    with pytest.raises(InputError, match=r"cut\.fits: .*truncated: "):
         read(path)
 
 

@@ -113,7 +113,7 @@ def test_twelve_bits_packed(tmp_path: Path) -> None:
 
 
 def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
-    """ImageJ writes stacks above 4 GB with a single directory and says the number of images in the description."""
+    """ImageJ writes stacks above 4 GB with one directory, the number of images in its description."""
     path = tmp_path / "big_imagej.tif"
     description = f"ImageJ=1.53t\nimages={len(STACK)}\nframes={len(STACK)}\nhyperstack=true\n"
     tifffile.imwrite(

@@ -1,0 +1,233 @@
+"""Stage ``ingest``: look at the camera files, record what they are, and copy their frames into the store.
+
+With ``input.mode: copy`` the frames go into ``frames/dn``, by units of whole chunks. With ``reference``, and
+with ready-made histograms, nothing is copied: the next stage reads the files themselves.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
+from pchem_pipeline.frames.identity import digest_of
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.stages.base import WHOLE, StageContext, open_store
+from pchem_pipeline.stages.input_identity import known_identity, shortened
+from pchem_pipeline.stages.sensor import SensorInfo
+
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.base import FrameReader
+
+__all__ = [
+    "NAME",
+    "READS",
+    "SETTINGS",
+    "UPSTREAM",
+    "VERSION",
+    "WRITES",
+    "CopyUnit",
+    "frames_tile",
+    "identity",
+    "run",
+]
+
+NAME = "ingest"
+VERSION = 1
+UPSTREAM: tuple[str, ...] = ()
+#: not files: their content counts, see `identity`; not integration_time: it changes no frame
+SETTINGS: tuple[str, ...] = tuple(
+    f"input.{name}"
+    for name in (
+        "format",
+        "mode",
+        "shape",
+        "dtype",
+        "byte_order",
+        "header_bytes",
+        "frame_padding_bytes",
+        "dataset",
+        "bit_shift",
+        "bit_depth",
+        "roi",
+        "frame_range",
+        "on_bad_file",
+    )
+)
+READS: tuple[str, ...] = ()
+WRITES: tuple[str, ...] = ("frames",)
+
+#: frames, rows, columns: streams in the order of time and by tile alike
+_CHUNK = (256, 128, 128)
+#: bytes of frames that a worker holds at once
+_UNIT_BYTES = 128 << 20
+
+
+@dataclass(frozen=True)
+class CopyUnit:
+    """Frames t0..t1 and rows y0..y1: whole chunks of ``frames/dn``."""
+
+    t0: int
+    t1: int
+    y0: int
+    y1: int
+
+    @property
+    def key(self) -> str:
+        """What messages call it, and its marker."""
+        return f"frames-{self.t0}-{self.t1 - 1}-rows-{self.y0}-{self.y1 - 1}"
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The one marker that it sets."""
+        return (self.key,)
+
+
+def identity(context: StageContext) -> dict[str, Any]:
+    """Return what the content of the input is, for the fingerprint.
+
+    The files are hashed once; afterwards names, sizes and times of change are compared first, and they are
+    hashed again only where these differ. Where the files are gone, the last known content counts: what was
+    made of them stays valid.
+
+    Raises:
+        InputError: files are missing or bad, and nothing is known of them from before.
+    """
+    return {"content": digest_of([file["xxh3_128"] for file in known_identity(context, _inspect)["files"]])}
+
+
+def frames_tile(reader: FrameReader, unit: CopyUnit) -> NDArray[Any]:
+    """Return the frames of a unit (frame, y, x)."""
+    return reader.read(unit.t0, unit.t1, unit.y0, unit.y1)
+
+
+def run(context: StageContext) -> None:
+    """Record the input, and copy the frames if ``input.mode`` says so.
+
+    Raises:
+        InputError: the input is bad, vanished or changed; the message lists all bad files.
+        StoreError: the store refuses.
+    """
+    if is_histogram_input(context.config.input, context.base_dir):
+        _record_histograms(context)
+        return
+    settings = context.config.input
+    reader = open_frames(settings, context.base_dir)
+    if message := reader.report.message():
+        context.note(message)
+    n_frames, ny, nx = reader.shape
+    sensor = SensorInfo(
+        kind="frames",
+        n_frames=n_frames,
+        ny=ny,
+        nx=nx,
+        dtype=reader.dtype.name,
+        bit_depth=reader.bit_depth,
+        integration_time=reader.stated_integration_time,
+        mode=settings.mode,
+        identity=shortened(known_identity(context, _inspect)),
+    )
+    sensor.write(context.store)
+    if settings.mode == "reference":
+        _run_whole(context)
+        return
+    chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
+    context.create("frames/dn", reader.shape, chunks=chunk, dtype=reader.dtype)
+    _warn_of_a_small_disk(context, n_frames * ny * nx * reader.dtype.itemsize)
+    task = functools.partial(_copy, store=context.store.path, reader=reader)
+    units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
+    context.n_keys = len(units)
+    _all_tiles(context).run_units(units, task, unit_name="block")
+    if context.failed:
+        raise InputError(next(iter(context.failed.values())))
+
+
+def chunk_shape(shape: tuple[int, int, int], itemsize: int) -> tuple[int, int, int]:
+    """Return the chunks of ``frames/dn``: fewer frames where a row of chunks would not fit into memory."""
+    frames, rows, columns = _CHUNK
+    while frames > 16 and frames * min(rows, shape[1]) * shape[2] * itemsize > _UNIT_BYTES:
+        frames //= 2
+    return min(frames, shape[0]), min(rows, shape[1]), min(columns, shape[2])
+
+
+def copy_units(shape: tuple[int, int, int], itemsize: int, chunk: tuple[int, int, int]) -> Iterator[CopyUnit]:
+    """Yield units of whole chunks over the full width, in the order of time."""
+    n_frames, ny, nx = shape
+    band = chunk[0] * chunk[1] * nx * itemsize
+    rows = chunk[1] * max(1, _UNIT_BYTES // band)
+    for t0 in range(0, n_frames, chunk[0]):
+        for y0 in range(0, ny, rows):
+            yield CopyUnit(t0, min(t0 + chunk[0], n_frames), y0, min(y0 + rows, ny))
+
+
+def _copy(unit: CopyUnit, *, store: Path, reader: FrameReader) -> dict[str, Any]:
+    """Read the frames of a unit and write them into the store."""
+    region = (slice(unit.t0, unit.t1), slice(unit.y0, unit.y1), slice(None))
+    open_store(store).write("frames/dn", region, frames_tile(reader, unit))
+    return {}
+
+
+def _all_tiles(context: StageContext) -> StageContext:
+    """Tiles and regions of the command line mean later stages; the input is taken as it is."""
+    return replace(context, options=replace(context.options, tiles=None, roi=None))
+
+
+def _inspect(context: StageContext) -> None:
+    """Look at the input for mistakes, without reading it."""
+    settings = context.config.input
+    if is_histogram_input(settings, context.base_dir):
+        read_histograms(settings, context.base_dir)
+    else:
+        open_frames(settings, context.base_dir).close()
+
+
+def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
+    """Say beforehand that the frames may not fit; how well they compress is not known."""
+    free = context.store.free_bytes()
+    if context.fresh and n_bytes > free:
+        context.note(
+            f"{n_bytes / 1e9:.1f} GB of frames are copied, {free / 1e9:.1f} GB are free; they compress about "
+            "1.8-fold: if that does not fit, set input.mode: reference"
+        )
+
+
+def _nothing(unit: Any) -> dict[str, Any]:
+    return {}
+
+
+def _run_whole(context: StageContext) -> None:
+    """Finish the stage where nothing is copied."""
+    context.n_keys = 1
+    _all_tiles(context).run_units([WHOLE], _nothing, unit_name="input")
+
+
+# -- ready-made histograms ----------------------------------------------------------------------
+
+
+def _record_histograms(context: StageContext) -> None:
+    """Record ready-made histograms: each channel is a pixel of a sensor of one row."""
+    given = read_histograms(context.config.input, context.base_dir)
+    for note in given.notes:
+        context.note(note)
+    lowest, highest = int(given.origin.min()), int(given.origin.max()) + given.counts.shape[2] - 1
+    dtype = "int32" if lowest < 0 else np.min_scalar_type(highest).name
+    SensorInfo(
+        kind="histograms",
+        n_frames=int(given.counts.sum(axis=2).max()),
+        ny=given.shape[0],
+        nx=given.shape[1],
+        dtype=dtype,
+        bit_depth=context.config.input.bit_depth,
+        integration_time=None,
+        mode="reference",
+        identity=shortened(known_identity(context, _inspect)),
+        names=given.names,
+    ).write(context.store)
+    _run_whole(context)

@@ -1,0 +1,79 @@
+"""What the input of a run is: a content hash taken once, and compared cheaply ever after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from pchem_pipeline.errors import InputError, StoreError
+from pchem_pipeline.frames.identity import content_identity, quick_identity
+from pchem_pipeline.frames.resolve import input_paths
+from pchem_pipeline.stages.base import StageContext
+from pchem_pipeline.store.files import read_json, write_json
+
+__all__ = ["known_identity", "shortened"]
+
+_LISTED_FILES = 64
+
+
+def known_identity(context: StageContext, inspect: Callable[[StageContext], None]) -> dict[str, Any]:
+    """Return the content identity of the input, see `content_identity`.
+
+    It is kept in the store with names, sizes and times of change; where these are as they were, it is not
+    taken
+    again. Where the files cannot be found any more, the last known identity is returned.
+
+    Args:
+        context: of the stage.
+        inspect: looks at the input for mistakes before it is hashed for the first time.
+
+    Raises:
+        InputError: files are missing or bad, and nothing is known of them from before.
+    """
+    place = context.store.path / ".pchem" / "input.json"
+    settings = context.config.input
+    known: dict[str, Any] = read_json(place) or {}
+    same_files = known.get("files") == list(settings.files)
+    try:
+        paths = input_paths(settings, context.base_dir)
+        quick = quick_identity(paths)
+    except InputError:
+        if same_files:
+            return dict(known["identity"])
+        raise
+    if known.get("quick") == quick:
+        return dict(known["identity"])
+    if not same_files:
+        inspect(context)
+    with context.reporter.progress("ingest: hash", _mebibytes(quick["files"]), "MiB") as advance:
+        identity = content_identity(paths, _Advance(context, advance))
+    with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
+        write_json(place, {"files": list(settings.files), "quick": quick, "identity": identity})
+    return identity
+
+
+def shortened(identity: dict[str, Any]) -> dict[str, Any]:
+    """Return the identity with the first files only, for the attributes of the store."""
+    files = identity["files"]
+    return {**identity, "files": files[:_LISTED_FILES], "n_files": len(files)}
+
+
+def _mebibytes(files: list[dict[str, Any]]) -> int:
+    return sum(int(file["size"]) for file in files) >> 20
+
+
+class _Advance:
+    """Turns bytes into whole MiB of progress; lets a signal stop the hashing."""
+
+    def __init__(self, context: StageContext, advance: Callable[[int], None]) -> None:
+        self._stop, self._advance = context.stop, advance
+        self._done = self._shown = 0
+
+    def __call__(self, count: int) -> None:
+        self._stop.check()
+        self._done += count
+        whole = self._done >> 20
+        if whole > self._shown:
+            self._advance(whole - self._shown)
+            self._shown = whole
