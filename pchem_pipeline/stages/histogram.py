@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.model.histogram import (
     HistogramAccumulator,
     RangeAccumulator,
@@ -74,6 +75,9 @@ WRITES: tuple[str, ...] = ("histogram", "summary")
 
 _MAPS = ("origin", "under", "over", "minimum", "maximum")
 _COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
+#: samples that one process looks through in a second or so
+_FEW_SAMPLES = 1 << 31
+
 Emit = Callable[[str, NDArray[Any]], None]
 
 
@@ -170,18 +174,23 @@ def run(context: StageContext) -> None:
         source=source,
         bins=bins,
         settings=settings,
-        threads=max(1, context.executor.workers // len(bands)),
+        threads=max(1, context.executor.workers // max(1, len(context.pending(bands)))),
     )
     done = context.run_units(bands, task, unit_name="band")
     if len(done) < context.n_keys:
         return
-    outside = {each["rows"]: each["pixels_outside"] for each in done.values()}
-    if number := sum(outside.values()):
+    if number := sum(_pixels_outside(context, band) for band in bands):
         context.note(
             f"{number} pixels have DN outside of their {bins} bins; they are counted as under or over"
         )
     if settings.summaries:
         _write_frame_statistics(context, source.shape)
+
+
+def _pixels_outside(context: StageContext, band: Band) -> int:
+    region = (slice(band.y0, band.y1), slice(None))
+    under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
+    return int(np.count_nonzero(under | over))
 
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:
@@ -196,7 +205,10 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     most = (settings.band_memory << 20) // row
     bands = plan_bands(tiles, {tile.key for tile in tiles}, most, context.executor.workers)
     context.stop.check()
-    context.executor.map(task, bands, lambda band, outcome: outcomes.append(outcome))
+    # starting other processes takes longer than this does on all but huge sensors
+    few = settings.window_frames * math.prod(source.shape[1:]) < _FEW_SAMPLES
+    executor = SerialExecutor() if few and not context.executor.shares_memory else context.executor
+    executor.map(task, bands, lambda band, outcome: outcomes.append(outcome))
     for outcome in outcomes:
         if outcome.error is not None:
             raise outcome.error
@@ -271,7 +283,7 @@ class _AlongTime:
 
 def _do_band(
     band: Band, *, store: Path, source: FrameSource, bins: int, settings: HistogramSettings, threads: int
-) -> dict[str, Any]:
+) -> None:
     """Count a band and write its chunks."""
     n_frames, _, columns = source.shape
     rows = slice(band.y0, band.y1)
@@ -295,8 +307,6 @@ def _do_band(
     if covariances is not None:
         for name, values in vars(covariances).items():
             opened.write(f"summary/{name}", (rows, slice(None)), values)
-    outside = np.count_nonzero(histograms.under | histograms.over)
-    return {"rows": band.key, "pixels_outside": int(outside)}
 
 
 def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
@@ -332,7 +342,7 @@ def _copy_histograms(context: StageContext) -> None:
     context.run_units(context.tiles(), task)
 
 
-def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> dict[str, Any]:
+def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
     counts, origin = given.counts[tile.region], given.origin[tile.region]
     occupied = counts > 0
     last = counts.shape[2] - 1
@@ -346,4 +356,3 @@ def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> dict[str, A
     )
     for name, part in vars(values).items():
         open_store(store).write(f"histogram/{name}", tile.region, part)
-    return {}
