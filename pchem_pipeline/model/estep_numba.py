@@ -31,7 +31,6 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 # Places in `sums`, the sums over one block of values; c count, d offset from the block's lowest component,
 # m1 and m2 posterior moments of i, v11 var(i), v12 cov(i, i^2), v22 var(i^2), i counted from that component
-N_SUMS = 13
 # Places in `total`, what an evaluation leaves besides score and information
 LOGLIK, SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(6)
 N_TOTAL = 6
@@ -116,19 +115,20 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int) -
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def _fill_prior(
-    prior: NDArray[np.float64], nearest: int, low: int, width: int, exposure: float, separation: float
+    prior: NDArray[np.float64], nearest: int, low: int, width: int, exposure: float, overlap: float
 ) -> None:
-    """Fill the polynomial's coefficients, relative to the nearest component; ``separation = a^2/2 sigma^2``."""
+    """Fill the polynomial's coefficients, relative to the nearest component; ``overlap = exp(-a^2/2 sigma^2)``."""
     place = nearest - low
-    square = math.exp(-2.0 * separation)
+    square = overlap * overlap
     prior[place] = 1.0
-    factor = math.exp(-separation)
+    factor = overlap
     for step in range(1, width - place):
         prior[place + step] = prior[place + step - 1] * factor * exposure / (nearest + step)
         factor *= square
-    factor = math.exp(-separation)
+    factor = overlap
+    inverse = 1.0 / exposure
     for step in range(1, place + 1):
-        prior[place - step] = prior[place - step + 1] * factor * (nearest - step + 1) / exposure
+        prior[place - step] = prior[place - step + 1] * factor * (nearest - step + 1) * inverse
         factor *= square
 
 
@@ -175,11 +175,10 @@ def _finish(
     theta: NDArray[np.float64],
     n: float,
     total: NDArray[np.float64],
-    cov: NDArray[np.float64],
     score: NDArray[np.float64],
     information: NDArray[np.float64],
 ) -> None:
-    """Turn the totals into the score and Louis' observed information."""
+    """Turn the totals and conditional covariances into the score and Louis' observed information."""
     exposure, a, s2 = math.exp(theta[0]), theta[1], math.exp(theta[3])
     t = a / s2
     sum_k, sum_kk, sum_ke = total[SUM_K], total[SUM_KK], total[SUM_KE]
@@ -188,16 +187,17 @@ def _finish(
     score[1] = sum_ke / s2
     score[2] = sum_e / s2
     score[3] = 0.5 * (sum_ee / s2 - n)
-    information[0, 0] = n * exposure - cov[0, 0]
-    information[0, 1] = -cov[0, 1]
-    information[0, 2] = t * cov[0, 0]
-    information[0, 3] = -cov[0, 3]
-    information[1, 1] = sum_kk / s2 - cov[1, 1]
-    information[1, 2] = sum_k / s2 + t * cov[0, 1]
-    information[1, 3] = sum_ke / s2 - cov[1, 3]
-    information[2, 2] = n / s2 - t * t * cov[0, 0]
-    information[2, 3] = sum_e / s2 + t * cov[0, 3]
-    information[3, 3] = 0.5 * sum_ee / s2 - cov[3, 3]
+    cov00, cov01, cov03 = information[0, 0], information[0, 1], information[0, 3]
+    information[0, 0] = n * exposure - cov00
+    information[0, 1] = -cov01
+    information[0, 2] = t * cov00
+    information[0, 3] = -cov03
+    information[1, 1] = sum_kk / s2 - information[1, 1]
+    information[1, 2] = sum_k / s2 + t * cov01
+    information[1, 3] = sum_ke / s2 - information[1, 3]
+    information[2, 2] = n / s2 - t * t * cov00
+    information[2, 3] = sum_e / s2 + t * cov03
+    information[3, 3] = 0.5 * sum_ee / s2 - information[3, 3]
     for row in range(1, 4):
         for column in range(row):
             information[row, column] = information[column, row]
@@ -252,7 +252,7 @@ def evaluate(
         n_bins: number of DN in use.
         first: first DN minus the centre.
         theta: (log H, a, m, log sigma^2).
-        work: scratch, shape (3, at least n_bins + 1).
+        work: scratch, shape (at least 4, at least n_bins + 1 and 16).
         total: out, log-likelihood and the sums over frames of E[k], E[k^2], E[k e], E[e], E[e^2].
         score: out, gradient of the log-likelihood in theta.
         information: out, observed information in theta.
@@ -267,12 +267,12 @@ def evaluate(
     last = max(j, int(math.floor((first + n_bins - 1 - origin) / a + 0.5)))
     half = _half_width(math.sqrt(s2) / a, exposure, j, last)
     width = min(2 * half + 1, prior.size)
-    separation = 0.5 * a * a / s2
+    overlap = math.exp(-0.5 * a * a / s2)
     decay = math.exp(-a / s2)
     filled = 1
     powers[0] = 1.0
-    sums = np.empty(N_SUMS)
-    cov = np.zeros((4, 4))
+    sums = work[3]
+    information[:, :] = 0.0
     total[:] = 0.0
     log_prior = j * theta[0] - exposure - math.lgamma(j + 1.0)
     loglik = -0.5 * cumulative[n_bins] * (theta[3] + LOG_2PI)
@@ -286,7 +286,7 @@ def evaluate(
                 powers[filled] = powers[filled - 1] * decay
                 filled += 1
             low = max(0, j - half)
-            _fill_prior(prior, j, low, width, exposure, separation)
+            _fill_prior(prior, j, low, width, exposure, overlap)
             nearest = first + start - origin - j * a
             shift = (j - low) * a
             top = math.exp((nearest + stop - 1 - start) * a / s2)
@@ -297,7 +297,7 @@ def evaluate(
             d1 = sums[1] - shift * sums[0]
             d2 = sums[2] - shift * (2.0 * sums[1] - shift * sums[0])
             loglik += logs + sums[0] * log_prior - 0.5 * d2 / s2 - shift * d1 / s2
-            _add_block(sums, float(low), a, s2, total, cov)
+            _add_block(sums, float(low), a, s2, total, information)
             if want_density:
                 level = log_prior - 0.5 * (theta[3] + LOG_2PI)
                 for i in range(start, stop):
@@ -309,5 +309,5 @@ def evaluate(
         j += 1
         log_prior += theta[0] - math.log(j)
     total[LOGLIK] = loglik
-    _finish(theta, cumulative[n_bins], total, cov, score, information)
+    _finish(theta, cumulative[n_bins], total, score, information)
     return loglik

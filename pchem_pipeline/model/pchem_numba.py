@@ -43,7 +43,7 @@ N_WORK = 9  # rows of scratch
 
 _CLEAR_GAP = 30.0  # nats: a neighbour this far below is not polished to the end
 _SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
-_SUSPICIOUS_NOISE = 0.42  # e-: above it the side lobe sinks into the noise and the first start errs more often
+_SUSPICIOUS_NOISE = 0.45  # e-: above it the side lobe sinks into the noise and the first start errs more often
 _MOST_MOVES = 40
 _MIN_STEP = 1.0  # DN per electron, of a start
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 _REORDER = {"reassoc", "nsz", "contract", "arcp"}
 
-FREQUENCY_STEP = 0.075  # 1/sd: half the width of a lobe
-N_FREQUENCIES = 64  # up to 4.8/sd, the lobe of H = 22
-N_FREQUENCIES_WIDE = 192  # up to 14.4/sd, the lobe of H = 200
+FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a lobe
+N_FREQUENCIES = 48  # up to 4.8/sd, the lobe of H = 22
+N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the lobe of H = 200
 LOBE_STEP = 0.05
 LOBE_FIRST = 0.25  # lowest lobe frequency tried, 1/sd: the step a is at most 4 sd
 N_LOBES = 90
