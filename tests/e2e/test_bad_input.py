@@ -1,0 +1,198 @@
+"""Bad input: one line with what, where and the cure, its exit code, and nothing lost."""
+
+import os
+import subprocess
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from commands import RUN
+
+from pchem_pipeline.store.run_store import RunStore
+
+GOOD = np.random.default_rng(2).integers(90, 130, (40, 8, 9), dtype=np.uint16)
+
+
+def tiff(path, data=GOOD, **options):
+    tifffile.imwrite(path, data, photometric=options.pop("photometric", "minisblack"), **options)
+
+
+def truncated(path, write):
+    write(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 2 // 3])
+
+
+def write_hdf5(path, data=GOOD):
+    with h5py.File(path, "w") as file:
+        file["data"] = data
+
+
+CASES = {
+    "missing folder": ("nowhere", lambda p: None, 2, "does not exist"),
+    "empty folder": ("d", lambda p: (p / "d").mkdir(), 4, ""),
+    "mixed shapes": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD[:, :4])), 4, "b.tif"),
+    "mixed types": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD.astype("u1"))), 4, "b.tif"),
+    "duplicates": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif")), 4, "b.tif"),
+    "truncated tiff": ("a.tif", lambda p: truncated(p / "a.tif", tiff), 4, "a.tif"),
+    "truncated fits": (
+        "a.fits",
+        lambda p: truncated(p / "a.fits", lambda q: fits.writeto(q, GOOD)),
+        4,
+        "a.fits",
+    ),
+    "truncated hdf5": ("a.h5", lambda p: truncated(p / "a.h5", write_hdf5), 4, "a.h5"),
+    "truncated npy": ("a.npy", lambda p: truncated(p / "a.npy", lambda q: np.save(q, GOOD)), 4, "a.npy"),
+    "raw without shape": ("a.raw", lambda p: (p / "a.raw").write_bytes(bytes(100)), 4, "shape"),
+    "not an image": ("a.tif", lambda p: (p / "a.tif").write_bytes(b"hello"), 4, "a.tif"),
+    "empty file": ("a.tif", lambda p: (p / "a.tif").touch(), 4, "a.tif"),
+    "float": ("a.npy", lambda p: np.save(p / "a.npy", GOOD / 2), 4, "float64"),
+    "signed negative": ("a.npy", lambda p: np.save(p / "a.npy", GOOD.astype("i2") - 100), 4, "int16"),
+    "colour": (
+        "a.tif",
+        lambda p: tiff(p / "a.tif", np.zeros((40, 8, 9, 3), "u1"), photometric="rgb"),
+        4,
+        "a.tif",
+    ),
+    "pickle": (
+        "a.npy",
+        lambda p: np.save(p / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True),
+        4,
+        "object",
+    ),
+    "one frame": ("a.npy", lambda p: np.save(p / "a.npy", GOOD[:1]), 4, "frame"),
+    "no frames": ("a.npy", lambda p: np.save(p / "a.npy", GOOD[:0]), 4, "frame"),
+}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.replace(" ", "-"))
+def test_bad_files_are_one_clear_line(shell, case):
+    name, make, code, word = CASES[case]
+    make(shell.folder)
+    files = sorted(shell.folder.glob(name)) if "*" in name else [shell.folder / name]
+    result = shell("run", *files, "--quiet")
+    assert result.code == code, result.stderr
+    assert word in result.last
+    assert result.stderr.startswith("pchem: ")
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+
+
+def test_bad_files_can_be_skipped(shell):
+    tiff(shell.folder / "a.tif", np.tile(GOOD, (10, 1, 1)))
+    tiff(shell.folder / "b.tif", GOOD[:, :4])
+    (shell.folder / "c.tif").write_bytes(b"no image")
+    (shell.folder / "run.yaml").write_text("input: {files: ['*.tif'], on_bad_file: skip}\n")
+    result = shell("ingest", "run.yaml")
+    assert result.code == 0
+    assert "b.tif" in result.stderr
+    assert "c.tif" in result.stderr
+
+
+def test_degenerate_pixels_get_a_word_and_stop_nothing(shell):
+    rng = np.random.default_rng(8)
+    stack = np.rint(rng.poisson(2, (3000, 8, 8)) * 10 + rng.normal(100, 3, (3000, 8, 8))).astype(np.uint16)
+    stack[:, 0, 0] = 100
+    stack[:, 0, 1] = rng.integers(100, 102, 3000)
+    stack[:, 0, 2] = 16383
+    stack[:, 0, 3] = 0
+    stack[:, 0, 4] = np.minimum(stack[:, 0, 4], 120)
+    np.save(shell.folder / "a.npy", stack)
+    shell.ok("run", "a.npy", "--bit-depth", "14")
+    store = RunStore.open(shell.folder / "run.zarr")
+    words, gain = store.read("fit/fit_status"), store.read("fit/conversion_gain")
+    assert (words[0, :5] != 0).all()
+    assert np.isnan(gain[0, [0, 1, 2, 3]]).all()
+    assert np.isfinite(gain[1:]).all()
+    assert (words[1:] == 0).mean() > 0.8
+
+
+def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
+    rng = np.random.default_rng(8)
+    stack = np.rint(rng.poisson(2, (2000, 8, 8)) * 10 + rng.normal(100, 3, (2000, 8, 8))).astype(np.uint16)
+    stack[:, :3] = 100
+    np.save(shell.folder / "a.npy", stack)
+    result = shell("run", "a.npy")
+    assert result.code == 3
+    assert "24 of 64 pixels have no value" in result.last
+    assert (shell.folder / "run.zarr" / "report.html").exists()
+
+
+def test_a_corrupt_chunk_fails_its_tile_and_is_named(shell, frames):
+    (shell.folder / "run.yaml").write_text(RUN)
+    shell.ok("ingest", "run.yaml")
+    shell.ok("histogram", "run.yaml")
+    chunk = shell.folder / "run.zarr" / "histogram" / "counts" / "c" / "1" / "1" / "0"
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    result = shell("fit", "run.yaml")
+    assert result.code == 3
+    assert "histogram/counts" in result.last
+    assert "1.1" in result.last
+    shell.ok("histogram", "run.yaml", "--tiles", "1.1", "--force")
+    shell.ok("fit", "run.yaml")
+
+
+def test_another_schema_version_is_refused(shell, frames):
+    (shell.folder / "run.yaml").write_text(RUN)
+    shell.ok("ingest", "run.yaml")
+    root = shell.folder / "run.zarr" / "zarr.json"
+    root.write_text(root.read_text().replace('"pchem_schema": 1', '"pchem_schema": 7'))
+    result = shell("run", "run.yaml")
+    assert result.code == 4
+    assert "schema version 7" in result.last
+
+
+def test_changed_camera_files_make_the_run_stale(shell, frames):
+    (shell.folder / "run.yaml").write_text(RUN)
+    shell.ok("ingest", "run.yaml")
+    path = sorted(frames.glob("*.tif"))[0]
+    data = tifffile.imread(path)
+    data[0, 0, 0] += 1
+    tiff(path, data)
+    rows = shell.ok("status", "run.yaml").stdout
+    assert "ingest     stale - the content of the input changed" in rows
+    os.utime(sorted(frames.glob("*.tif"))[1])
+    shell.ok("ingest", "run.yaml")
+    assert "ingest     complete" in shell.ok("status", "run.yaml").stdout
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 300 kB that can be made read-only."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", place], capture_output=True
+    ).returncode:
+        pytest.skip("mounting needs privileges")
+    yield place
+    subprocess.run(["umount", "-l", place], check=True)
+
+
+def test_a_full_disk_stops_with_its_cure_and_the_run_goes_on_elsewhere(shell, frames, small_disk):
+    (shell.folder / "run.yaml").write_text(RUN.replace("run.zarr", str(small_disk / "run.zarr")))
+    result = shell("run", "run.yaml", "--quiet")
+    assert result.code == 4
+    assert "the disk is full: free some space and run again" in result.last
+    subprocess.run(["mount", "-o", "remount,size=200m", small_disk], check=True)
+    shell.ok("run", "run.yaml", "--quiet")
+
+
+def test_a_read_only_folder(shell, frames, small_disk):
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    (shell.folder / "run.yaml").write_text(RUN.replace("run.zarr", str(small_disk / "run.zarr")))
+    result = shell("run", "run.yaml", "--quiet")
+    assert result.code == 4
+    assert "choose another place for the store" in result.last
+
+
+def test_usage_errors_are_exit_code_2(shell):
+    assert shell("fit").code == 2
+    assert shell("no-such-command").code == 2
+    assert shell("fit", "run.zarr", "--workers", "0").code == 2
+    (shell.folder / "c.yaml").write_text("input: {files: [a], integration_time: 0}")
+    assert shell("run", "c.yaml").code == 2
