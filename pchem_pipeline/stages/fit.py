@@ -1,0 +1,89 @@
+"""Stage ``fit``: PCH-EM on the histogram of every pixel."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS
+from pchem_pipeline.model.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.variables import PARAMETERS, variables_of
+
+if TYPE_CHECKING:
+    from pchem_pipeline.store.tiles import Tile
+
+__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "fit_tile", "identity", "run"]
+
+NAME = "fit"
+VERSION = 1
+UPSTREAM: tuple[str, ...] = ("histogram",)
+SETTINGS: tuple[str, ...] = ("fit", "run.tile")
+READS: tuple[str, ...] = ("histogram/counts", "histogram/origin", "histogram/under", "histogram/over")
+WRITES: tuple[str, ...] = ("fit",)
+
+
+def identity(context: StageContext) -> dict[str, Any]:
+    """Return what the files may say and the settings do not: the limits of the ADC."""
+    limits = context.adc_limits
+    return {"adc_limits": None if limits is None else list(limits)}
+
+
+def fit_tile(
+    histogram: Mapping[str, NDArray[Any]], settings: FitSettings, adc_limits: tuple[int, int] | None
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the group ``fit`` of a tile, by name.
+
+    Args:
+        histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of the tile.
+        settings: of the fit.
+        adc_limits: first and last code of the ADC, DN, or None where they are not known.
+    """
+    counts = histogram["counts"]
+    shape = counts.shape[:2]
+    flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
+    result: FitResult = fit_histograms(
+        counts.reshape(-1, counts.shape[2]), **flat, settings=settings, adc_limits=adc_limits
+    )
+    variances = np.diagonal(result.covariance, axis1=1, axis2=2)
+    arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
+    arrays |= {v.name: getattr(result, v.name) for v in variables_of("fit") if v.name not in arrays}
+    return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
+
+
+def run(context: StageContext) -> None:
+    """Fit every tile whose histograms are there.
+
+    Raises:
+        StoreError: the histograms are missing, or the store refuses.
+    """
+    context.create_maps([v.path for v in variables_of("fit") if v.name != "fit_status"])
+    context.create_maps(
+        ["fit/fit_status"],
+        flag_masks=[int(bit) for bit in MEANINGS],
+        flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
+        flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
+    )
+    task = functools.partial(
+        _do_tile, store=context.store.path, settings=context.config.fit, adc_limits=context.adc_limits
+    )
+    context.run_units(context.tiles(), task, needs="histogram")
+
+
+def _do_tile(
+    tile: Tile, *, store: Path, settings: FitSettings, adc_limits: tuple[int, int] | None
+) -> dict[str, Any]:
+    """Fit one tile of the store; the summary counts its pixels."""
+    run_store = open_store(store)
+    histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
+    arrays = fit_tile(histogram, settings, adc_limits)
+    for name, array in arrays.items():
+        run_store.write(f"fit/{name}", tile.region, array)
+    words = arrays["fit_status"]
+    return {"pixels": int(words.size), "failed": int(np.count_nonzero(words & np.uint16(int(FAILED))))}
