@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.errors import InputError
 from pchem_pipeline.model.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
-from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.frame_source import open_source, read_ahead
+from pchem_pipeline.stages.tile_bands import tile_bands
 from pchem_pipeline.variables import PARAMETERS
 
 if TYPE_CHECKING:
@@ -78,11 +78,8 @@ def run(context: StageContext) -> None:
             largest_value=LARGEST_NUMBER,
         )
     depth = context.store.array("electrons/electron_number").chunks[0]
-    tiles = context.tiles()
-    rows = max(tile, _BLOCK_BYTES // (depth * nx * 2))
-    pending = {each.key for each in context.pending(tiles)}
-    together = int(getattr(source, "rows_per_read", 1))
-    bands = plan_bands(tiles, pending, rows, context.executor.workers, together)
+    rows = _BLOCK_BYTES // (depth * nx * 2)
+    bands = tile_bands(context, "fit", rows, int(getattr(source, "rows_per_read", 1)))
     task = functools.partial(_do_band, store=context.store.path, source=source, depth=depth)
     context.run_units(bands, task, unit_name="band", needs="fit")
 

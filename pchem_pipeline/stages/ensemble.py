@@ -21,11 +21,11 @@ from pchem_pipeline.model.electrons import ErrorTally, compare_electron_numbers,
 from pchem_pipeline.model.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.histogram_numba import count_frames
 from pchem_pipeline.model.pixels import PixelParameters
-from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.ensemble_result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble_tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
 from pchem_pipeline.stages.frame_source import open_source
+from pchem_pipeline.stages.tile_bands import tile_bands
 from pchem_pipeline.variables import PARAMETERS
 
 if TYPE_CHECKING:
@@ -103,9 +103,7 @@ def run(context: StageContext) -> None:
     )
     bins = context.store.array("histogram/counts").shape[2]
     rows = max(1, _BAND_BYTES // (context.sensor.nx * bins * 4))
-    pending = {tile.key for tile in context.pending(tiles)}
-    together = int(getattr(source, "rows_per_read", 1))
-    bands = plan_bands(tiles, pending, rows, context.executor.workers, together)
+    bands = tile_bands(context, "fit", rows, int(getattr(source, "rows_per_read", 1)))
     done = context.run_units(bands, functools.partial(_do_band, job=job), unit_name="band", needs="fit")
     finished = [tile for tile in tiles if tile.key in done]
     if finished:

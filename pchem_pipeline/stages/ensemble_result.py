@@ -29,6 +29,7 @@ from pchem_pipeline.model.ensemble_settings import EnsembleSettings
 from pchem_pipeline.model.pixels import FloatArray, PixelParameters
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.stages.ensemble_tile import EnsembleAxes
+from pchem_pipeline.stages.plain import plain
 from pchem_pipeline.variables import PARAMETERS
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def write_result(
 ) -> None:
     """Write the arrays of the group ``ensemble`` and its numbers (attributes of the group).
 
-    The attributes are ``facts`` (RMSEs, counts, error rates), ``moments`` (rows of Appendix A),
+    The attributes are the facts (``rmse``, counts, error rates), ``moments`` (rows of Appendix A),
     ``component_cases`` (parameters held constant, a list for each row of ``component_variance``) and
     ``missing`` (part to reason).
 
@@ -124,12 +125,14 @@ def write_result(
         per_pixel = pixels_of(context.store, "histogram/counts", tiles).sum(axis=1, dtype=np.int64)[mask]
     context.store.set_attributes(
         "ensemble",
-        {
-            "facts": facts,
-            "moments": moment_rows(totals, pixels, per_pixel),
-            "component_cases": [list(case) for case in COMPONENT_CASES],
-            "missing": _missing(context, totals, frames),
-        },
+        plain(
+            facts
+            | {
+                "moments": moment_rows(totals, pixels, per_pixel),
+                "component_cases": COMPONENT_CASES,
+                "missing": _missing(context, totals, frames),
+            }
+        ),
     )
 
 

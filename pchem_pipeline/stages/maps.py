@@ -8,11 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps import derived_maps, quality_map, status_counts, summarise
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.plain import plain
 from pchem_pipeline.variables import PARAMETERS
 
 if TYPE_CHECKING:
@@ -90,15 +90,7 @@ def _summarise(context: StageContext, names: list[str]) -> None:
     for name in names:
         values = context.store.read(f"maps/{name}")
         summary = summarise(values, percentiles=settings.percentiles, outlier_sigmas=settings.outlier_sigmas)
-        content = asdict(summary)
-        content["percentiles"] = {f"{p:g}": value for p, value in summary.percentiles.items()}
-        found[name] = {key: _plain(value) for key, value in content.items()}
+        percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
+        found[name] = plain(asdict(summary) | {"percentiles": percentiles})
     status = context.store.read("fit/fit_status")
     context.store.set_attributes("maps", {"summary": found, "fit_status": status_counts(status)})
-
-
-def _plain(value: Any) -> Any:
-    """Return JSON data: NaN, which JSON has not, becomes None."""
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value

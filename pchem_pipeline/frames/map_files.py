@@ -1,0 +1,112 @@
+"""Files of parameter maps for other programs: FITS, TIFF and npz."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.registry import require
+
+__all__ = ["MapImage", "write_fits", "write_npz", "write_tiff"]
+
+
+@dataclass(frozen=True)
+class MapImage:
+    """A map and what it is.
+
+    Attributes:
+        name: as in the store.
+        values: (y, x).
+        unit: physical unit; ``"1"`` where there is none.
+        long_name: one sentence.
+    """
+
+    name: str
+    values: NDArray[Any]
+    unit: str
+    long_name: str
+
+
+def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) -> list[Path]:
+    """Write one FITS file with an image extension for each map.
+
+    Args:
+        path: the file.
+        maps: the maps; floating point and integers stay as they are.
+        header: keywords of the primary header (at most 8 characters each); None is left out.
+
+    Returns:
+        The file written.
+
+    Raises:
+        InputError: the folder cannot be written.
+        MissingDependencyError: astropy is not installed.
+    """
+    require("astropy.io.fits", "fits", "FITS files")
+    from astropy.io import fits
+
+    primary = fits.PrimaryHDU()
+    for key, value in header.items():
+        if value is not None:
+            primary.header[key] = value
+    units = [primary]
+    for image in maps:
+        hdu = fits.ImageHDU(image.values, name=image.name.upper())
+        hdu.header["BUNIT"] = image.unit
+        hdu.header["COMMENT"] = image.long_name
+        units.append(hdu)
+    with temporary(path) as part:
+        fits.HDUList(units).writeto(part)
+    return [path]
+
+
+def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
+    """Write one TIFF file for each map: float32 for parameters, integers as they are.
+
+    Args:
+        folder: where to write ``<name>.tif``.
+        maps: the maps.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    import tifffile
+
+    written = []
+    for image in maps:
+        path = folder / f"{image.name}.tif"
+        values = image.values.astype(np.float32) if image.values.dtype.kind == "f" else image.values
+        words = {"name": image.name, "unit": image.unit, "long_name": image.long_name}
+        with temporary(path) as part:
+            tifffile.imwrite(part, values, description=json.dumps(words), photometric="minisblack")
+        written.append(path)
+    return written
+
+
+def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
+    """Write all maps into one npz file, each under its name.
+
+    Args:
+        path: the file.
+        maps: the maps.
+
+    Returns:
+        The file written.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    arrays: dict[str, Any] = {image.name: image.values for image in maps}
+    with temporary(path) as part:
+        np.savez_compressed(part, allow_pickle=False, **arrays)
+    return [path]

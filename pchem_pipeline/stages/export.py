@@ -1,0 +1,120 @@
+"""``pchem export``: the maps as FITS, TIFF or npz for other programs, and their summary as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.frames.map_files import MapImage, write_fits, write_npz, write_tiff
+from pchem_pipeline.model.fit_status import MEANINGS
+from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.stages.session import Target
+from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.variables import Variable, variables_of
+
+__all__ = ["FORMATS", "export_run"]
+
+#: Formats that maps can be exported to, and their CSV summary.
+FORMATS = ("fits", "tiff", "npz", "csv")
+
+_FROM_FIT = ("fit_status", "likelihood_gap", "goodness_p")
+_COLUMNS = (
+    "n_valid",
+    "n_missing",
+    "median",
+    "median_stderr",
+    "robust_sd",
+    "minimum",
+    "maximum",
+    "n_low",
+    "n_high",
+)
+
+
+def export_run(target: Target, folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Write the maps of a run to files.
+
+    Args:
+        target: the run.
+        folder: where to write; made if needed.
+        formats: any of ``FORMATS``.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ConfigError: an unknown format, or none.
+        StoreError: the run has no maps, or the folder cannot be written.
+    """
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        raise ConfigError(
+            f"--format: {', '.join(unknown) or 'nothing'} cannot be written; choose from {', '.join(FORMATS)}"
+        )
+    store = RunStore.open(target.store)
+    if "summary" not in store.attributes("maps"):
+        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {store.path}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(error, folder) from error
+    written: list[Path] = []
+    images = _images(store) if set(formats) - {"csv"} else []
+    for name in dict.fromkeys(formats):
+        if name == "fits":
+            written += write_fits(folder / "maps.fits", images, _header(target, store))
+        elif name == "tiff":
+            written += write_tiff(folder, images)
+        elif name == "npz":
+            written += write_npz(folder / "maps.npz", images)
+        else:
+            written += _write_csv(folder, store)
+    return written
+
+
+def _images(store: RunStore) -> list[MapImage]:
+    chosen: list[Variable] = [v for v in variables_of("maps") if store.has(v.path)]
+    chosen += [v for v in variables_of("fit") if v.name in _FROM_FIT and store.has(v.path)]
+    return [MapImage(v.name, store.read(v.path), v.unit, v.long_name) for v in chosen]
+
+
+def _header(target: Target, store: RunStore) -> dict[str, Any]:
+    """Return the keywords of a FITS file."""
+    sensor = SensorInfo.read(store)
+    time = target.config.input.integration_time or sensor.integration_time
+    frames = sensor.n_frames if sensor.kind == "frames" else None
+    return {"CREATOR": "pchem-pipeline", "RUN": store.path.name, "NFRAMES": frames, "EXPTIME": time}
+
+
+def _write_csv(folder: Path, store: RunStore) -> list[Path]:
+    """Write the summaries of the maps, and how many pixels bear each word of the status."""
+    attributes = store.attributes("maps")
+    units = {v.name: v.unit for v in variables_of("maps")}
+    summary: dict[str, dict[str, Any]] = attributes["summary"]
+    percentiles = list(next(iter(summary.values()))["percentiles"])
+    rows: list[list[Any]] = [["map", "unit", *_COLUMNS, *(f"percentile_{p}" for p in percentiles)]]
+    for name, content in summary.items():
+        rows.append(
+            [
+                name,
+                units[name],
+                *(content[c] for c in _COLUMNS),
+                *(content["percentiles"][p] for p in percentiles),
+            ]
+        )
+    meanings = {"ok": "good fit", **{str(bit.name).lower(): text for bit, text in MEANINGS.items()}}
+    reasons = [["fit_status", "pixels", "meaning"]]
+    reasons += [[name, n, meanings.get(name, "")] for name, n in attributes["fit_status"].items()]
+    return [_table(folder / "summary.csv", rows), _table(folder / "fit_status.csv", reasons)]
+
+
+def _table(path: Path, rows: list[list[Any]]) -> Path:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_atomic(path, text.getvalue().encode())
+    return path

@@ -1,0 +1,399 @@
+"""The stages maps, ensemble and electrons on a simulated sensor; the fit is its truth."""
+
+from __future__ import annotations
+
+import csv
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.errors import ConfigError, InputError, StoreError
+from pchem_pipeline.model.components import COMPONENT_CASES
+from pchem_pipeline.model.electrons import NO_NUMBER, electron_numbers
+from pchem_pipeline.model.fit_status import FitStatus
+from pchem_pipeline.stages import ensemble as ensemble_stage
+from pchem_pipeline.stages.base import Options, StageContext
+from pchem_pipeline.stages.export import export_run
+from pchem_pipeline.stages.interrupt import StopRequest
+from pchem_pipeline.stages.pipeline import execute
+from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.stages.session import Target
+from pchem_pipeline.store.records import StageRecord
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.variables import PARAMETERS, variables_of
+
+NY, NX, FRAMES = 40, 48, 400
+FAILED_PIXEL = (3, 5)
+
+
+def make_context(
+    folder: Path,
+    *,
+    tile: int = 16,
+    executor: Executor | None = None,
+    options: Options | None = None,
+    store: str = "run.zarr",
+    input: dict[str, object] | None = None,
+    **ensemble: object,
+) -> StageContext:
+    config = RunConfig.model_validate(
+        {
+            "run": {"tile": tile, "store": store},
+            "simulate": {"shape": [NY, NX], "n_frames": FRAMES, "truth_frames": 120, "format": "npy"},
+            "input": input or {},
+            "ensemble": ensemble,
+        }
+    )
+    return StageContext(
+        config,
+        folder,
+        RunStore.create(folder / store),
+        executor or SerialExecutor(),
+        Reporter("off", quiet=True),
+        StopRequest(),
+        options=options or Options(),
+    )
+
+
+def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: bool = True) -> None:
+    """What the fit stage leaves behind, with the truth as its estimate."""
+    store, shape = context.store, context.sensor.shape
+    y0, _, x0, _ = context.config.input.roi or (0, 0, 0, 0)
+    region = (slice(y0, y0 + shape[0]), slice(x0, x0 + shape[1]))
+    status = np.zeros(shape, dtype=np.uint16)
+    bad = np.zeros(shape, dtype=bool)
+    if failed:
+        bad[FAILED_PIXEL] = True
+    status[bad] = int(FitStatus.NOT_CONVERGED)
+    status[0, 0] = int(FitStatus.POOR_FIT)
+    chosen = [tile for tile in context.tiles() if tiles is None or tile.key in tiles]
+    there = np.zeros(shape, dtype=bool)
+    for tile in chosen:
+        there[tile.region] = True
+    for name in PARAMETERS:
+        values = np.where(bad | ~there, np.nan, store.read(f"truth/{name}", region))
+        store.write_array(f"fit/{name}", values)
+        store.write_array(f"fit/{name}_stderr", 0.01 * np.abs(values))
+    diagonal = [store.read(f"fit/{name}_stderr") ** 2 for name in PARAMETERS]
+    store.write_array("fit/covariance", np.stack(diagonal, axis=-1)[..., None] * np.eye(4))
+    store.write_array("fit/fit_status", status)
+    store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
+    for tile in chosen:
+        store.records.mark("fit", "truth", tile.key, {})
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run up to the histograms, at tiles of 16."""
+    folder = tmp_path_factory.mktemp("sensor")
+    context = make_context(folder)
+    for stage in ("simulate", "ingest", "histogram"):
+        assert execute(stage, context).state == "complete"
+    return folder
+
+
+def fresh_copy(prepared: Path, folder: Path) -> None:
+    shutil.copytree(prepared, folder, dirs_exist_ok=True)
+
+
+@pytest.fixture(scope="module")
+def finished(prepared: Path, tmp_path_factory: pytest.TempPathFactory) -> StageContext:
+    folder = tmp_path_factory.mktemp("finished")
+    fresh_copy(prepared, folder)
+    context = make_context(folder, frames=250)
+    write_fit(context)
+    for stage in ("maps", "ensemble", "electrons"):
+        assert execute(stage, context).state == "complete"
+    return context
+
+
+def ensemble_of(store: RunStore) -> dict[str, np.ndarray]:
+    return {v.name: store.read(v.path) for v in variables_of("ensemble")}
+
+
+def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    for name, values in expected.items():
+        if values.dtype.kind == "f":
+            # far tails of a curve are sums of numbers below rounding
+            np.testing.assert_allclose(found[name], values, rtol=1e-12, atol=1e-17, err_msg=name)
+        else:
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
+    store = finished.store
+    truth = {name: store.read(f"truth/{name}") for name in PARAMETERS}
+    for name in PARAMETERS:
+        found = store.read(f"maps/{name}")
+        assert np.isnan(found[FAILED_PIXEL])
+        np.testing.assert_array_equal(np.delete(found, 3, 0), np.delete(truth[name], 3, 0))
+    np.testing.assert_allclose(
+        np.delete(store.read("maps/dark_current"), 3, 0), np.delete(truth["quanta_exposure"] / 4.87, 3, 0)
+    )
+    quality = store.read("maps/quality")
+    assert (quality[0, 0], quality[FAILED_PIXEL], quality[1, 1]) == (1, 2, 0)
+    attributes = store.attributes("maps")
+    assert attributes["summary"]["read_noise_e"]["n_missing"] == 1
+    assert attributes["fit_status"]["not_converged"] == 1
+    assert attributes["fit_status"]["ok"] == NY * NX - 2
+    assert store.array("maps/dark_current").attrs["units"] == "e-/px/s"
+
+
+def test_no_integration_time_means_no_dark_current(prepared: Path, tmp_path: Path) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path)
+    write_fit(context)
+    sensor = context.sensor
+    type(sensor)(**{**vars(sensor), "integration_time": None}).write(context.store)
+    context.config = context.config.model_copy(
+        update={"input": context.config.input.model_copy(update={"integration_time": None})}
+    )
+    assert execute("maps", context).state == "complete"
+    assert not context.store.has("maps/dark_current")
+    assert "integration_time" in context.notes[0]
+
+
+def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
+    frames = np.load(finished.base_dir / "frames" / "frames.npy")
+    use = np.ones((NY, NX), dtype=bool)
+    use[FAILED_PIXEL] = False
+    found = ensemble_of(finished.store)
+    for name, part in (("counts", frames[:250]), ("counts_all", frames)):
+        expected = np.bincount(part[:, use].ravel(), minlength=found["dn"][-1] + 1)[found["dn"][0] :]
+        np.testing.assert_array_equal(found[name], expected[: found["dn"].size])
+    facts = finished.store.attributes("ensemble")
+    assert (facts["n_frames"], facts["n_frames_all"]) == (250, FRAMES)
+    assert (facts["n_pixels"], facts["n_pixels_without_value"]) == (NY * NX - 1, 1)
+    assert facts["samples_beyond_dn"] == 0
+    assert found["counts"].sum() == 250 * (NY * NX - 1)
+    np.testing.assert_allclose(found["density"], found["counts"] / found["counts"].sum(), rtol=1e-12)
+    assert found["nuced_counts"].sum() + facts["samples_beyond_electrons"] == found["counts"].sum()
+    step = facts["nuced_bin_width"]
+    assert found["nuced_density"].sum() * step == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_true_parameters_predict_to_the_noise(finished: StageContext) -> None:
+    facts = finished.store.attributes("ensemble")
+    error = facts["rmse"]
+    # the mean square has some tens of independent terms: its root scatters by about a tenth
+    assert 0.6 < error["epcd_exact"] / error["noise_floor"] < 1.5
+    assert 0.6 < error["nuced_exact"] / error["nuced_noise_floor"] < 1.5
+    assert set(error) >= {"epcd_dependent", "epcd_independent", "nuced_dependent", "nuced_independent"}
+    assert facts["rmse_all_frames"]["noise_floor"] == pytest.approx(error["noise_floor"] * np.sqrt(250 / 400))
+    for row in facts["moments"]:
+        if row["observed"] is not None:
+            assert abs(row["observed"] - row["predicted"]) < 5 * row["stderr"], row
+    assert facts["component_cases"] == [list(case) for case in COMPONENT_CASES]
+
+
+def test_error_rate_against_the_truth(finished: StageContext) -> None:
+    store = finished.store
+    facts = store.attributes("ensemble")
+    true = store.read("truth/electron_number")
+    estimated = store.read("electrons/electron_number")[:120]
+    use = estimated != NO_NUMBER
+    assert facts["samples_compared"] == use.sum() == 120 * (NY * NX - 1)
+    assert facts["error_rate"] == pytest.approx(np.mean(estimated[use] != true[use]))
+    assert abs(facts["error_rate"] - facts["expected_error_rate"]) < 5 * facts["error_rate_stderr"]
+    assert sum(facts["error_sizes"]) == facts["samples_compared"]
+
+
+def test_electron_stack(finished: StageContext) -> None:
+    frames = np.load(finished.base_dir / "frames" / "frames.npy")
+    maps = [finished.store.read(f"fit/{name}") for name in PARAMETERS]
+    found = finished.store.read("electrons/electron_number")
+    np.testing.assert_array_equal(found, electron_numbers(frames, *maps))
+    assert (found[:, *FAILED_PIXEL] == NO_NUMBER).all()
+    attributes = dict(finished.store.array("electrons/electron_number").attrs)
+    assert attributes["missing_value"] == NO_NUMBER
+    ensemble = ensemble_of(finished.store)
+    use = found[:250][found[:250] != NO_NUMBER]
+    np.testing.assert_array_equal(ensemble["electron_counts"], np.bincount(use, minlength=ensemble["k"].size))
+
+
+class _PickledTasks(SerialExecutor):
+    """Sends tasks and units through pickle, as a backend of other processes does."""
+
+    def map(self, function, items, on_result):
+        super().map(pickle.loads(pickle.dumps(function)), pickle.loads(pickle.dumps(list(items))), on_result)
+
+
+@pytest.mark.parametrize(("tile", "backend"), [(8, "serial"), (64, "threads"), (16, "pickled")])
+def test_result_depends_on_neither_tile_nor_backend(
+    finished: StageContext, tmp_path: Path, tile: int, backend: str
+) -> None:
+    shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
+    executor = _PickledTasks() if backend == "pickled" else None
+    if backend == "threads":
+        executor = make_executor(ComputeSettings(backend="threads", workers=3))
+    context = make_context(tmp_path, tile=tile, executor=executor, frames=250)
+    for stage in ("simulate", "ingest", "histogram"):
+        execute(stage, context)
+    write_fit(context)
+    for stage in ("maps", "ensemble", "electrons"):
+        assert execute(stage, context).state == "complete"
+    assert_same(ensemble_of(context.store), ensemble_of(finished.store))
+    for name in ("maps/read_noise_e", "maps/quality", "electrons/electron_number"):
+        np.testing.assert_array_equal(context.store.read(name), finished.store.read(name))
+
+
+def test_tiles_come_in_any_order_and_the_axes_follow(
+    finished: StageContext, prepared: Path, tmp_path: Path
+) -> None:
+    fresh_copy(prepared, tmp_path)
+    some = make_context(tmp_path, frames=250, options=Options(tiles="0.0,0.1,0.2"))
+    write_fit(some)
+    assert execute("ensemble", some).state == "partial"
+    facts = some.store.attributes("ensemble")
+    assert facts["n_pixels"] + facts["n_pixels_without_value"] == 16 * NX
+    assert facts["tiles_missing"] == 6
+    context = make_context(tmp_path, frames=250)
+    assert execute("ensemble", context).state == "complete"
+    assert_same(ensemble_of(context.store), ensemble_of(finished.store))
+
+
+def test_tiles_that_the_fit_finishes_later_are_added(
+    finished: StageContext, prepared: Path, tmp_path: Path
+) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path, frames=250)
+    write_fit(context, tiles=["0.0", "0.1", "0.2"])
+    state = execute("ensemble", context)
+    assert state.state == "failed"
+    assert "fit has not finished" in state.why
+    assert context.store.attributes("ensemble")["n_pixels"] == 16 * NX - 1
+    write_fit(context)
+    again = make_context(tmp_path, frames=250)
+    assert execute("ensemble", again).state == "complete"
+    assert_same(ensemble_of(again.store), ensemble_of(finished.store))
+
+
+def test_all_frames_need_no_frames(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path, frames="all")
+    write_fit(context)
+    context.store.delete("truth/electron_number")
+    monkeypatch.setattr(ensemble_stage, "open_source", lambda *_: pytest.fail("frames were opened"))
+    assert execute("ensemble", context).state == "complete"
+    found = ensemble_of(context.store)
+    np.testing.assert_array_equal(found["counts"], found["counts_all"])
+    facts = context.store.attributes("ensemble")
+    assert facts["rmse"]["epcd_exact"] == facts["rmse_all_frames"]["epcd_exact"]
+    assert "error_rate" not in facts
+    assert "truth" in facts["missing"]
+
+
+def test_region_and_range_of_frames_find_their_truth(finished: StageContext, tmp_path: Path) -> None:
+    shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
+    crop = {"roi": [8, 32, 4, 48], "frame_range": [20, 300]}
+    context = make_context(tmp_path, input=crop, frames=150, first_frame=10)
+    for stage in ("simulate", "ingest", "histogram"):
+        execute(stage, context)
+    write_fit(context, failed=False)
+    assert execute("ensemble", context).state == "complete"
+    facts = context.store.attributes("ensemble")
+    # frames 30 to 180 of the simulation, of which 120 have their truth
+    assert facts["samples_compared"] == 90 * 24 * 44
+    assert abs(facts["error_rate"] - facts["expected_error_rate"]) < 5 * facts["error_rate_stderr"]
+
+
+def test_frames_that_do_not_exist(prepared: Path, tmp_path: Path) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path, first_frame=1000)
+    write_fit(context)
+    with pytest.raises(ConfigError, match="first_frame: 1000, but the run has frames 0 to 399"):
+        execute("ensemble", context)
+
+
+def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path)
+    write_fit(context)
+    for name in PARAMETERS:
+        context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
+    state = execute("ensemble", context)
+    assert state.state == "failed"
+    assert "no pixel has a value" in state.why
+
+
+@pytest.mark.parametrize("n_samples", [(20_000, 20_000), (5_000, 80_000)])
+def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> None:
+    rng = np.random.default_rng(8)
+    truth = np.array([[0.8, 0.1, 100.0, 3.0], [2.5, 0.1, 104.0, 3.2]])
+    counts = np.zeros((2, 250), dtype=np.int64)
+    for row, n, (h, g, mu, sigma) in zip(counts, n_samples, truth, strict=True):
+        dn = np.rint(mu + rng.poisson(h, n) / g + np.sqrt(sigma**2 - 1 / 12) * rng.standard_normal(n))
+        row += np.bincount(dn.astype(int), minlength=250)
+    np.savez(tmp_path / "spectra.npz", dn=np.arange(250), counts=counts)
+    config = RunConfig.model_validate({"input": {"files": ["spectra.npz"], "format": "histogram"}})
+    context = StageContext(
+        config,
+        tmp_path,
+        RunStore.create(tmp_path / "run.zarr"),
+        SerialExecutor(),
+        Reporter("off", quiet=True),
+        StopRequest(),
+    )
+    for stage in ("ingest", "histogram"):
+        assert execute(stage, context).state == "complete"
+    for i, name in enumerate(PARAMETERS):
+        context.store.write_array(f"fit/{name}", truth[None, :, i])
+    context.store.records.write(StageRecord("fit", 1, "truth", {}, keys=1))
+    context.store.records.mark("fit", "truth", "0.0", {})
+    assert execute("ensemble", context).state == "complete"
+    found = ensemble_of(context.store)
+    shares = counts / np.array(n_samples)[:, None]
+    first = found["dn"][0]
+    expected = shares.mean(axis=0)[first : first + found["dn"].size]
+    np.testing.assert_allclose(found["density"], expected, atol=1e-15)
+    facts = context.store.attributes("ensemble")
+    assert 0.5 < facts["rmse"]["epcd_exact"] / facts["rmse"]["noise_floor"] < 1.6
+    assert "histograms" in facts["missing"]["frames"]
+    for row in facts["moments"]:
+        if row["observed"] is not None:
+            assert abs(row["observed"] - row["predicted"]) < 5 * row["stderr"], row
+    with pytest.raises(InputError, match="camera files"):
+        execute("electrons", context)
+
+
+def test_export(finished: StageContext, tmp_path: Path) -> None:
+    from astropy.io import fits
+    from tifffile import imread
+
+    target = Target(finished.config, finished.base_dir, finished.store.path)
+    written = export_run(target, tmp_path / "out", ("fits", "tiff", "npz", "csv"))
+    assert all(path.exists() for path in written)
+    gain = finished.store.read("maps/conversion_gain")
+    with fits.open(tmp_path / "out" / "maps.fits") as file:
+        np.testing.assert_array_equal(file["CONVERSION_GAIN"].data, gain)
+        assert file["CONVERSION_GAIN"].header["BUNIT"] == "e-/DN"
+        assert file[0].header["NFRAMES"] == FRAMES
+        assert file["FIT_STATUS"].data[FAILED_PIXEL] == int(FitStatus.NOT_CONVERGED)
+    np.testing.assert_allclose(imread(tmp_path / "out" / "conversion_gain.tif"), gain, rtol=1e-7)
+    with np.load(tmp_path / "out" / "maps.npz") as file:
+        np.testing.assert_array_equal(file["quality"], finished.store.read("maps/quality"))
+    with (tmp_path / "out" / "summary.csv").open() as file:
+        rows = {row["map"]: row for row in csv.DictReader(file)}
+    assert float(rows["conversion_gain"]["median"]) == pytest.approx(np.nanmedian(gain))
+    assert rows["dark_current"]["unit"] == "e-/px/s"
+    assert rows["bias"]["n_missing"] == "1"
+    with (tmp_path / "out" / "fit_status.csv").open() as file:
+        assert {row["fit_status"]: row["pixels"] for row in csv.DictReader(file)}["poor_fit"] == "1"
+
+
+def test_export_says_what_is_wrong(finished: StageContext, tmp_path: Path) -> None:
+    target = Target(finished.config, finished.base_dir, finished.store.path)
+    with pytest.raises(ConfigError, match="xlsx cannot be written; choose from fits, tiff, npz, csv"):
+        export_run(target, tmp_path, ("fits", "xlsx"))
+    RunStore.create(tmp_path / "empty.zarr")
+    with pytest.raises(StoreError, match="no maps yet"):
+        export_run(Target(finished.config, tmp_path, tmp_path / "empty.zarr"), tmp_path, ("csv",))
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError, match="cannot use"):
+        export_run(target, tmp_path / "file", ("csv",))
