@@ -24,7 +24,7 @@ class FitStatus(IntFlag):
     ADC_LIMIT = 128
     OUTSIDE_WINDOW = 256
     POOR_FIT = 512
-    NOISE_AT_BOUND = 1024
+    COARSE_STEPS = 1024
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -48,7 +48,7 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.ADC_LIMIT: "values at the limits of the ADC",
     FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window were left out",
     FitStatus.POOR_FIT: "poor goodness of fit: the model does not describe the pixel",
-    FitStatus.NOISE_AT_BOUND: "read noise at the floor set by quantisation, 1/sqrt(12) DN",
+    FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
 }
 
 

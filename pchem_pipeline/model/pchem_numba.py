@@ -22,6 +22,7 @@ from pchem_pipeline.model.polish_numba import (
 )
 from pchem_pipeline.model.start_numba import (
     N_FREQUENCIES_WIDE,
+    assemble,
     start_cumulants,
     start_peak,
     start_regression,
@@ -29,7 +30,7 @@ from pchem_pipeline.model.start_numba import (
 
 # bits of fit_status; a test compares them with FitStatus
 NO_DATA, TOO_FEW_BINS, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, EXPOSURE_AT_BOUND = 1, 2, 4, 8, 16
-BIAS_AMBIGUOUS, NOT_INFORMATIVE, NOISE_AT_BOUND = 32, 64, 1024
+BIAS_AMBIGUOUS, NOT_INFORMATIVE, COARSE_STEPS = 32, 64, 1024
 
 # places in `limits`, after those of `polish`
 GAP_THRESHOLD, NOISE_LIMIT, ONLY_EM = 5, 6, 7
@@ -46,6 +47,9 @@ _SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other
 _SUSPICIOUS_NOISE = 0.45  # e-: above it the side lobe sinks into the noise and the first start errs more often
 _MOST_MOVES = 40
 _MIN_STEP = 1.0  # DN per electron, of a start
+_COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
+_COARSE_STEP = 2.5
+_N_SCAN = 25  # steps of the scan over the gain, from a fifth of the sd to 2.5 sd
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -149,9 +153,41 @@ def _first_start(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
+def _scan(
+    weights: NDArray[np.float64],
+    cumulative: NDArray[np.float64],
+    n_bins: int,
+    first: float,
+    n: float,
+    mean: float,
+    variance: float,
+    work: NDArray[np.float64],
+    total: NDArray[np.float64],
+    score: NDArray[np.float64],
+    information: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> bool:
+    """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
+    trial = np.empty(4)
+    best = -math.inf
+    for place in range(_N_SCAN):
+        a = math.sqrt(variance) * 0.2 * 12.5 ** (place / (_N_SCAN - 1.0))
+        exposure = variance / (a * a) - 0.1225
+        if exposure > 0.0 and a > _MIN_STEP:
+            assemble(weights, n_bins, first, n, mean, variance, a, exposure, trial)
+            trial[3] = math.log(max(0.1225 * a * a, 1.0 / 12.0))
+            loglik = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+            if loglik > best:
+                best = loglik
+                theta[:] = trial
+    return best > -math.inf
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
 def _other_start(
     which: int,
     weights: NDArray[np.float64],
+    cumulative: NDArray[np.float64],
     n_bins: int,
     first: float,
     n: float,
@@ -159,6 +195,9 @@ def _other_start(
     variance: float,
     best: NDArray[np.float64],
     work: NDArray[np.float64],
+    total: NDArray[np.float64],
+    score: NDArray[np.float64],
+    information: NDArray[np.float64],
     theta: NDArray[np.float64],
 ) -> bool:
     """Fill ``theta`` with one of the starts kept for suspicious pixels."""
@@ -166,9 +205,13 @@ def _other_start(
         return start_peak(weights, n_bins, first, n, mean, variance, work, theta)
     if which == 1:
         return start_cumulants(weights, n_bins, first, n, mean, variance, theta)
+    if which == 2:
+        return _scan(
+            weights, cumulative, n_bins, first, n, mean, variance, work, total, score, information, theta
+        )
     if not best[1] > 0.0:
         return False
-    scale = 2.0 if which == 2 else 0.5  # the maxima at half and at twice the gain
+    scale = 2.0 if which == 3 else 0.5  # the maxima at half and at twice the gain
     exposure = math.exp(best[0]) / scale
     theta[0] = math.log(exposure)
     theta[1] = best[1] * scale
@@ -220,13 +263,16 @@ def fit_pixel(
     used = freedom = 0
     degenerate = False
     best[:] = 0.0
-    for attempt in range(-1, 4):
+    for attempt in range(-1, 5):
         if attempt < 0:
             usable = _first_start(
                 weights, cumulative, n_bins, first, n, mean, variance, basis, work, total, score, scratch, trial
             )
         else:
-            usable = _other_start(attempt, weights, n_bins, first, n, mean, variance, best, work, trial)
+            usable = _other_start(
+                attempt, weights, cumulative, n_bins, first, n, mean, variance, best,
+                work, total, score, scratch, trial,
+            )  # fmt: skip
         if not usable:
             continue
         outcome, loglik, count = polish(
@@ -274,8 +320,8 @@ def _judge(
         status |= NOT_INFORMATIVE
     if best[0] <= limits[MIN_LOG_EXPOSURE] + 1e-9:
         status |= EXPOSURE_AT_BOUND
-    if best[3] <= min_log_variance(best[1]) + 1e-9:
-        status |= NOISE_AT_BOUND
+    if math.exp(0.5 * best[3]) < _COARSE_NOISE or best[1] < _COARSE_STEP:
+        status |= COARSE_STEPS
     return status
 
 
@@ -367,7 +413,7 @@ def fit_tile(
         )  # fmt: skip
         if theta[1] > 0.0:
             held[0] = status & EXPOSURE_AT_BOUND != 0
-            held[3] = status & NOISE_AT_BOUND != 0
+            held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-9
             centre = origin[pixel] + low + middle
             if not to_natural(theta, centre, information, held, parameters[pixel], covariance[pixel]):
                 status |= FIT_NOT_CONVERGED

@@ -126,7 +126,7 @@ def _regress(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _assemble(
+def assemble(
     weights: NDArray[np.float64],
     n_bins: int,
     first: float,
@@ -204,7 +204,7 @@ def start_regression(
     lobe, exposure = _regress(basis, weight, quadratic, target)
     if lobe <= 0.0:
         return False, False
-    return _assemble(weights, n_bins, first, n, mean, variance, sd / lobe, exposure, theta)
+    return assemble(weights, n_bins, first, n, mean, variance, sd / lobe, exposure, theta)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -237,7 +237,7 @@ def start_peak(
     a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
     electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
     exposure = max(0.05, variance / (a * a) - electron_noise)
-    return _assemble(weights, n_bins, first, n, mean, variance, a, exposure, theta)[0]
+    return assemble(weights, n_bins, first, n, mean, variance, a, exposure, theta)[0]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
