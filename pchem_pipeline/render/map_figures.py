@@ -32,6 +32,7 @@ from pchem_pipeline.render.style import (
     YELLOW,
     new_figure,
     note,
+    plain,
     styled,
 )
 from pchem_pipeline.render.wording import count, percent, short, symbol
@@ -270,7 +271,7 @@ def fit_status_map(
         (palette[min(i + 1, len(_STATUS_COLOURS))], f"{text}: {_share(n, status.size)}")
         for i, (_, text, n) in enumerate(rows)
     ]
-    legend = [(colour_, textwrap.fill(text, int(width_mm * 0.62))) for colour_, text in legend]
+    legend = [(colour_, plain(textwrap.fill(text, int(width_mm * 0.62)))) for colour_, text in legend]
     legend_mm = 3.6 * sum(1 + text.count("\n") for _, text in legend) + 5.0
     if is_strip(status.shape):
         figure = new_figure(width_mm, 30.0 + legend_mm)

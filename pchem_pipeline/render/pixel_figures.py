@@ -23,6 +23,7 @@ from pchem_pipeline.render.style import (
     VERMILION,
     new_figure,
     note,
+    plain,
     styled,
 )
 from pchem_pipeline.render.wording import measured, symbol
@@ -219,7 +220,7 @@ def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) 
 
 
 def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
-    head = f"({letter}) {pixel.label}" if pixel.label else f"({letter})"
+    head = f"({letter}) {plain(_cut(pixel.label))}" if pixel.label else f"({letter})"
     lines = [f"{head}: pixel y = {pixel.y}, x = {pixel.x}"]
     if has_fit(pixel.parameters):
         words = []
@@ -231,5 +232,9 @@ def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
                 )
         lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
     if pixel.status:
-        lines += textwrap.wrap(f"status: {pixel.status}", max(20, int(width_mm * 0.72)))[:2]
+        lines += textwrap.wrap(f"status: {plain(pixel.status)}", max(20, int(width_mm * 0.72)))[:2]
     return "\n".join(lines)
+
+
+def _cut(text: str, most: int = 40) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"

@@ -6,9 +6,11 @@ Colours of lines are those of Okabe and Ito (2008); maps use ``viridis``, whose 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
@@ -35,6 +37,7 @@ __all__ = [
     "inches",
     "new_figure",
     "note",
+    "plain",
     "styled",
 ]
 
@@ -98,17 +101,36 @@ _METADATA: dict[str, dict[str, Any]] = {
 P = ParamSpec("P")
 
 
+@contextlib.contextmanager
+def _style() -> Iterator[None]:
+    """Hold the style of this package, whatever the user's settings; characters no font has are boxes."""
+    with mpl.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield
+
+
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorate a drawing function: it draws in the style of this package, whatever the user's settings."""
+    """Decorate a drawing function: it draws in the style of this package and lays out once.
+
+    The layout is then fixed, so that saving in several formats does not compute it again.
+    """
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with mpl.rc_context():
-            mpl.rcdefaults()
-            mpl.rcParams.update(_STYLE)
-            return draw(*args, **kwargs)
+        with _style():
+            figure = draw(*args, **kwargs)
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
+            return figure
 
     return wrapper
+
+
+def plain(text: str) -> str:
+    """Return a text of others so that it is shown as it is, not read as a formula."""
+    return text.replace("$", r"\$")
 
 
 def inches(millimetres: float) -> float:
@@ -148,8 +170,6 @@ def figure_bytes(figure: Figure, kind: str, *, dpi: int = 300, title: str = "") 
     if title:
         metadata["Title"] = title
     buffer = io.BytesIO()
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE)
+    with _style():
         figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata)
     return buffer.getvalue()

@@ -249,10 +249,11 @@ def _electrons(data: ReportData) -> Table:
     ]
     words = ""
     if facts.get("error_rate") is not None:
-        words += f" Against the true electron numbers, {percent(float(facts['error_rate']), 1.0)} are wrong."
+        rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
+        words += f" Against the true electron numbers, {measured(rate, error)} % are wrong."
     if facts.get("expected_error_rate") is not None:
         expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
-        words += f" The fitted parameters lead one to expect {expected_errors} wrong numbers."
+        words += f" The fitted parameters lead one to expect {expected_errors} wrong."
     return Table(
         "electron-table",
         "Electron numbers",

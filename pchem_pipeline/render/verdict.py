@@ -238,7 +238,12 @@ def _conditions(data: ReportData) -> list[Flag]:
                     f"Stage {stage.get('stage')} is {stage['state']}: the report shows a part only.",
                 )
             )
-        found += [Flag("note", f"{stage.get('stage')}: {remark}") for remark in stage.get("notes", ())]
+        # why there is no dark current is said once, with what is missing
+        found += [
+            Flag("note", _as_sentence(f"{stage.get('stage')}: {remark}"))
+            for remark in stage.get("notes", ())
+            if not ("dark_current" in data.missing and "no dark current" in remark)
+        ]
     return list(dict.fromkeys(found))
 
 

@@ -171,7 +171,8 @@ def gather(
     fit = {name: store.read(f"fit/{name}") for name in _FIT_MAPS if store.has(f"fit/{name}")}
     ensemble = _group(store, "ensemble")
     facts = dict(store.attributes("ensemble"))
-    moments = facts.pop("moments", [])
+    moments, _ = facts.pop("moments", []), facts.pop("missing", {})
+    cases = facts.pop("component_cases", COMPONENT_CASES)
     return ReportData(
         title=config.run.title or store.path.name,
         shape=sensor.shape,
@@ -184,7 +185,7 @@ def gather(
         pixels=_pixels(store, config, sensor, maps, fit),
         ensemble=ensemble,
         ensemble_facts=facts,
-        component_cases=[case_name(case) for case in COMPONENT_CASES],
+        component_cases=[case_name(case) for case in cases],
         moments=moments,
         truth={name: store.read(f"truth/{name}") for name in _TRUTH if store.has(f"truth/{name}")},
         channel_names=sensor.names,
@@ -198,7 +199,7 @@ def gather(
             for file in sensor.identity.get("files", [])
         ],
         stages=list(stages),
-        missing=_missing(store, sensor, maps, ensemble),
+        missing=_missing(maps, ensemble),
     )
 
 
@@ -282,12 +283,7 @@ def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:
     }
 
 
-def _missing(
-    store: RunStore,
-    sensor: SensorInfo,
-    maps: Mapping[str, NDArray[Any]],
-    ensemble: Mapping[str, NDArray[Any]],
-) -> dict[str, str]:
+def _missing(maps: Mapping[str, NDArray[Any]], ensemble: Mapping[str, NDArray[Any]]) -> dict[str, str]:
     """Say why parts are left out."""
     found: dict[str, str] = {}
     if "dark_current" not in maps:
@@ -296,9 +292,7 @@ def _missing(
         )
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"
-    why = "no pixel has parameters to predict from"
-    if sensor.kind == "histograms" and "maps" not in found:
-        why = "ready-made histograms keep no single frames"
+    why = "no pixel has parameters" if "maps" in found else "the stage ensemble has no result"
     for part, name in (
         ("ensemble", "density"),
         ("nuced", "nuced_density"),

@@ -20,7 +20,9 @@ def true_maps(shape: tuple[int, int], seed: int = 1) -> dict[str, np.ndarray]:
     exposure = np.exp(rng.normal(np.log(2.0), 0.25, shape) + 0.2 * np.sin(5 * x))
     hot = rng.random(shape) < 0.004
     exposure[hot] *= rng.uniform(3, 25, int(hot.sum()))
-    read_noise_e = 0.3 * np.exp(rng.normal(0, 0.1, shape)) + (rng.random(shape) < 0.02) * rng.exponential(0.06, shape)
+    read_noise_e = 0.3 * np.exp(rng.normal(0, 0.1, shape)) + (rng.random(shape) < 0.02) * rng.exponential(
+        0.06, shape
+    )
     gain = 0.095 * (1 + 0.02 * rng.standard_normal(shape) + 0.01 * y)
     bias = 100 + 1.5 * rng.standard_normal(shape) + 2 * rng.standard_normal(nx)[None, :]
     return {
@@ -40,7 +42,9 @@ def draw_dn(maps: dict[str, np.ndarray], n: int, seed: int = 2) -> tuple[np.ndar
     return np.rint(k / g + mu + analog * rng.standard_normal(k.shape)).astype(np.int64), k
 
 
-def pixel_fit(maps: dict[str, np.ndarray], y: int, x: int, label: str, n: int = 17_750, seed: int = 3) -> PixelFit:
+def pixel_fit(
+    maps: dict[str, np.ndarray], y: int, x: int, label: str, n: int = 17_750, seed: int = 3
+) -> PixelFit:
     one = {name: values[y : y + 1, x : x + 1] for name, values in maps.items()}
     dn = draw_dn(one, n, seed + 1000 * y + x)[0].ravel()
     origin = int(dn.min())
@@ -63,7 +67,9 @@ def gaussian_mixture(x: np.ndarray, maps: dict[str, np.ndarray], n_k: int = 80) 
     return total / min(columns[0].size, 400)
 
 
-def ensemble_arrays(maps: dict[str, np.ndarray], n: int = 50) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+def ensemble_arrays(
+    maps: dict[str, np.ndarray], n: int = 50
+) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     dn, _ = draw_dn(maps, n)
     axis = np.arange(dn.min(), dn.max() + 1)
     counts = np.bincount((dn - dn.min()).ravel(), minlength=axis.size)
@@ -109,7 +115,12 @@ def ensemble_arrays(maps: dict[str, np.ndarray], n: int = 50) -> tuple[dict[str,
         "nuced_component_variance": np.full(13, np.mean(maps["read_noise_e"] ** 2)),
     }
     rmse = {"epcd_exact": 1.3e-4, "epcd_dependent": 1.5e-4, "epcd_independent": 8.3e-4, "noise_floor": 1.2e-4}
-    rmse |= {"nuced_exact": 2.1e-4, "nuced_dependent": 2.3e-4, "nuced_independent": 2.7e-4, "nuced_noise_floor": 2e-4}
+    rmse |= {
+        "nuced_exact": 2.1e-4,
+        "nuced_dependent": 2.3e-4,
+        "nuced_independent": 2.7e-4,
+        "nuced_noise_floor": 2e-4,
+    }
     return arrays, {"rmse": rmse, "n_frames": n, "error_rate": 0.107}
 
 
@@ -124,7 +135,13 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
     truth = true_maps(shape, seed)
     bad = rng.random(shape) < failed
     maps: dict[str, np.ndarray] = {}
-    relative = {"quanta_exposure": 0.006, "conversion_gain": 0.003, "bias": 6e-4, "read_noise_dn": 0.008, "read_noise_e": 0.008}
+    relative = {
+        "quanta_exposure": 0.006,
+        "conversion_gain": 0.003,
+        "bias": 6e-4,
+        "read_noise_dn": 0.008,
+        "read_noise_e": 0.008,
+    }
     for name, values in truth.items():
         error = relative[name] * np.abs(values)
         maps[name] = np.where(bad, np.nan, values + error * rng.standard_normal(shape))
@@ -145,8 +162,11 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
         n_frames=17_750,
         integration_time=4.87,
         maps=maps,
-        fit={"fit_status": status, "goodness_p": np.where(bad, np.nan, rng.random(shape)),
-             "likelihood_gap": np.where(bad, np.nan, 300.0)},  # fmt: skip
+        fit={
+            "fit_status": status,
+            "goodness_p": np.where(bad, np.nan, rng.random(shape)),
+            "likelihood_gap": np.where(bad, np.nan, 300.0),
+        },
         status_words={int(bit): text for bit, text in MEANINGS.items()},
         failed_mask=int(FAILED),
         pixels=pixels,
@@ -155,11 +175,22 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
         component_cases=CASES,
         moments=[
             {"quantity": "mean, raw", "unit": "DN", "predicted": 121.34, "observed": 121.32, "stderr": 0.02},
-            {"quantity": "variance, raw", "unit": "DN2", "predicted": 251.3, "observed": 250.9, "stderr": 0.4},
+            {
+                "quantity": "variance, raw",
+                "unit": "DN2",
+                "predicted": 251.3,
+                "observed": 250.9,
+                "stderr": 0.4,
+            },
         ],
         truth=truth,
         config_yaml="input:\n  files: [frames/*.tif]\nfit:\n  algorithm: newton\n",
-        run={"name": "demo.zarr", "started": "2026-01-02T03:04:05Z", "seed": 1, "versions": {"numpy": np.__version__}},
+        run={
+            "name": "demo.zarr",
+            "started": "2026-01-02T03:04:05Z",
+            "seed": 1,
+            "versions": {"numpy": np.__version__},
+        },
         inputs=[{"name": "frame_0001.tif", "size": 524_288, "hash": "xxh3_128:0123456789abcdef"}],
         stages=[
             {"stage": "histogram", "state": "complete", "seconds": 12.3, "peak_memory_bytes": 512_000_000},

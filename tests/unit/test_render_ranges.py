@@ -1,0 +1,91 @@
+"""Axes that a few odd pixels cannot wreck, and colours by rank."""
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.render.ranges import histogram_edges, robust_range
+from pchem_pipeline.render.stretch import stretch_map
+
+
+def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.normal(0.3, 0.02, 10_000)
+    values[:7] = 50.0
+    values[7:9] = np.nan
+    shown = robust_range(values)
+    assert shown.high < 0.5
+    assert shown.n_above == 7 + int((values[9:] > shown.high).sum())
+    assert shown.n_missing == 2
+    assert f"{shown.n_outside} outside the axis" in shown.words()
+    assert "2 without a value" in shown.words()
+
+
+def test_all_values_are_drawn_where_none_is_odd() -> None:
+    shown = robust_range(np.linspace(1.0, 2.0, 500))
+    assert (shown.low, shown.high, shown.n_outside) == (1.0, 2.0, 0)
+    assert shown.words() == ""
+
+
+def test_decades_make_a_logarithmic_axis_but_not_for_signed_data() -> None:
+    values = np.exp(np.random.default_rng(2).normal(0.0, 2.0, 2000))
+    assert robust_range(values).logarithmic
+    assert not robust_range(values, allow_log=False).logarithmic
+    assert not robust_range(values - values.mean()).logarithmic
+
+
+@pytest.mark.parametrize(
+    "values", [np.full(5, np.nan), np.empty(0), np.zeros(4), np.full(3, -7.5), np.array([1.0])]
+)
+def test_degenerate_values_give_an_axis(values: np.ndarray) -> None:
+    shown = robust_range(values)
+    assert shown.low < shown.high
+    edges = histogram_edges(values, shown)
+    assert np.all(np.diff(edges) > 0)
+
+
+def test_edges_cover_the_range_with_a_bounded_number_of_bins() -> None:
+    values = np.random.default_rng(3).normal(size=200_000)
+    shown = robust_range(values)
+    edges = histogram_edges(values, shown, most=50)
+    assert edges.size - 1 == 50
+    np.testing.assert_allclose([edges[0], edges[-1]], [shown.low, shown.high])
+
+
+def test_the_colour_bar_of_the_stretch_tells_the_physical_value() -> None:
+    """At a labelled level the colour of a pixel is that level: Appendix C, F_beta(level) is its rank."""
+    values = np.random.default_rng(4).gamma(2.0, size=(200, 200))
+    drawn = stretch_map(values, "beta")
+    for level, share in zip(drawn.levels, (0.0, 0.15625, 0.5, 0.84375, 1.0), strict=True):
+        at = np.quantile(values, share)
+        nearest = np.unravel_index(np.argmin(np.abs(values - at)), values.shape)
+        assert drawn.colour[nearest] == pytest.approx(level, abs=0.005)
+    assert float(drawn.labels[2]) == pytest.approx(float(np.median(values)), rel=0.01)
+
+
+def test_the_stretch_keeps_order_and_gaps() -> None:
+    values = np.array([[3.0, 1.0, np.nan], [2.0, 1000.0, 2.0]])
+    drawn = stretch_map(values)
+    assert np.isnan(drawn.colour[0, 2])
+    assert drawn.colour[1, 0] == drawn.colour[1, 2]
+    order = [drawn.colour[0, 1], drawn.colour[1, 0], drawn.colour[0, 0], drawn.colour[1, 1]]
+    assert order == sorted(order)
+
+
+def test_the_linear_stretch_is_linear_and_clipped() -> None:
+    values = np.linspace(0.0, 100.0, 1001).reshape(7, 143)
+    drawn = stretch_map(values, "linear")
+    assert drawn.colour.ravel()[500] == pytest.approx(0.5)
+    assert drawn.colour.ravel()[0] == 0.0
+    assert drawn.labels[0].startswith("≤")
+    assert drawn.labels[-1].startswith("≥")
+
+
+def test_nothing_to_stretch() -> None:
+    drawn = stretch_map(np.full((3, 3), np.nan))
+    assert np.isnan(drawn.colour).all()
+    assert drawn.levels == ()
+
+
+def test_labels_tell_close_values_apart() -> None:
+    drawn = stretch_map(np.linspace(100.001, 100.009, 99).reshape(9, 11))
+    assert len(set(drawn.labels)) == 5

@@ -1,0 +1,78 @@
+"""Numbers in words."""
+
+import pytest
+
+from pchem_pipeline.render.wording import count, measured, percent, short, symbol, unit_text
+from pchem_pipeline.variables import VARIABLES
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (0.0, 3, "0"),
+        (0.30512, 3, "0.305"),
+        (-2.5, 2, "−2.5"),
+        (1.9e-4, 2, "1.9×10⁻⁴"),
+        (9.996e-5, 3, "1.00×10⁻⁴"),
+        (0.00123, 2, "0.0012"),
+        (123456.0, 3, "1.23×10⁵"),
+        (17750.0, 3, "17750"),
+        (99.96, 3, "100"),
+        (float("nan"), 3, "not known"),
+    ],
+)
+def test_short(value: float, digits: int, text: str) -> None:
+    assert short(value, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (2.01344, 0.01234, "2.013 ± 0.012 e⁻"),
+        (0.0953671, 0.000024, "0.095367 ± 0.000024 e⁻"),
+        (100.04, 12.3, "100 ± 12 e⁻"),
+        (-0.5, 0.0996, "−0.50 ± 0.10 e⁻"),
+        (2.0, float("nan"), "2.000 e⁻"),
+        (2.0, 0.0, "2.000 e⁻"),
+        (float("nan"), 1.0, "not known"),
+    ],
+)
+def test_measured_rounds_to_two_digits_of_the_error(value: float, error: float, text: str) -> None:
+    assert measured(value, error, "e⁻") == text
+
+
+@pytest.mark.parametrize(
+    ("part", "whole", "text"),
+    [
+        (0, 10, "0 %"),
+        (1, 1_000_000, "< 0.01 %"),
+        (5, 1000, "0.50 %"),
+        (1, 3, "33 %"),
+        (999, 1000, "99.9 %"),
+        (999_999, 1_000_000, "> 99.99 %"),
+        (7, 7, "100 %"),
+        (0, 0, "0 %"),
+    ],
+)
+def test_percent_never_rounds_some_to_none_or_all(part: int, whole: int, text: str) -> None:
+    assert percent(part, whole) == text
+
+
+def test_count_and_units() -> None:
+    assert count(1, "pixel") == "1 pixel"
+    assert count(17_750, "frame") == "17,750 frames"
+    assert unit_text("e-/DN") == "e⁻/DN"
+    assert unit_text("1") == ""
+    assert unit_text("furlong") == "furlong"
+
+
+def test_the_units_of_maps_are_those_of_the_store() -> None:
+    for name in (
+        "quanta_exposure",
+        "conversion_gain",
+        "bias",
+        "read_noise_dn",
+        "read_noise_e",
+        "dark_current",
+    ):
+        assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit)
