@@ -12,7 +12,7 @@ from pchem_pipeline.errors import ConfigError, StoreError
 from pchem_pipeline.frames.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit_status import MEANINGS
 from pchem_pipeline.stages.sensor import SensorInfo
-from pchem_pipeline.stages.session import Target
+from pchem_pipeline.stages.session import Target, find_run
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.variables import Variable, variables_of
@@ -36,11 +36,11 @@ _COLUMNS = (
 )
 
 
-def export_run(target: Target, folder: Path, formats: Sequence[str]) -> list[Path]:
+def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Write the maps of a run to files.
 
     Args:
-        target: the run.
+        path: the run's store, or the YAML that made it.
         folder: where to write; made if needed.
         formats: any of ``FORMATS``.
 
@@ -56,6 +56,7 @@ def export_run(target: Target, folder: Path, formats: Sequence[str]) -> list[Pat
         raise ConfigError(
             f"--format: {', '.join(unknown) or 'nothing'} cannot be written; choose from {', '.join(FORMATS)}"
         )
+    target = find_run(path)
     store = RunStore.open(target.store)
     if "summary" not in store.attributes("maps"):
         raise StoreError(f"{store.path} has no maps yet; run: pchem maps {store.path}")

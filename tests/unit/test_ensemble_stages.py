@@ -12,6 +12,7 @@ import pytest
 
 from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.model.components import COMPONENT_CASES
@@ -23,7 +24,6 @@ from pchem_pipeline.stages.export import export_run
 from pchem_pipeline.stages.interrupt import StopRequest
 from pchem_pipeline.stages.pipeline import execute
 from pchem_pipeline.stages.reporting import Reporter
-from pchem_pipeline.stages.session import Target
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.variables import PARAMETERS, variables_of
@@ -366,8 +366,8 @@ def test_export(finished: StageContext, tmp_path: Path) -> None:
     from astropy.io import fits
     from tifffile import imread
 
-    target = Target(finished.config, finished.base_dir, finished.store.path)
-    written = export_run(target, tmp_path / "out", ("fits", "tiff", "npz", "csv"))
+    finished.store.write_config(dump_config(finished.config))
+    written = export_run(finished.store.path, tmp_path / "out", ("fits", "tiff", "npz", "csv"))
     assert all(path.exists() for path in written)
     gain = finished.store.read("maps/conversion_gain")
     with fits.open(tmp_path / "out" / "maps.fits") as file:
@@ -388,12 +388,14 @@ def test_export(finished: StageContext, tmp_path: Path) -> None:
 
 
 def test_export_says_what_is_wrong(finished: StageContext, tmp_path: Path) -> None:
-    target = Target(finished.config, finished.base_dir, finished.store.path)
+    run = finished.store.path
+    finished.store.write_config(dump_config(finished.config))
     with pytest.raises(ConfigError, match="xlsx cannot be written; choose from fits, tiff, npz, csv"):
-        export_run(target, tmp_path, ("fits", "xlsx"))
-    RunStore.create(tmp_path / "empty.zarr")
+        export_run(run, tmp_path, ("fits", "xlsx"))
+    empty = RunStore.create(tmp_path / "empty.zarr")
+    empty.write_config(dump_config(finished.config))
     with pytest.raises(StoreError, match="no maps yet"):
-        export_run(Target(finished.config, tmp_path, tmp_path / "empty.zarr"), tmp_path, ("csv",))
+        export_run(empty.path, tmp_path, ("csv",))
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StoreError, match="cannot use"):
-        export_run(target, tmp_path / "file", ("csv",))
+        export_run(run, tmp_path / "file", ("csv",))
