@@ -28,7 +28,7 @@ from pchem_pipeline.render.style import (
     note,
     styled,
 )
-from pchem_pipeline.render.wording import short
+from pchem_pipeline.render.wording import scientific
 
 __all__ = ["component_widths", "electron_numbers", "ensemble"]
 
@@ -147,11 +147,11 @@ def _ensemble_bulk(top: Axes, half: _Half, rmse: Mapping[str, float], n_frames: 
     for suffix, model in half.models.items():
         words, colour, line = _PREDICTIONS[suffix]
         name = ("epcd_" if half.raw else "nuced_") + suffix
-        label = f"{words}, RMSE {short(rmse[name], 2)}" if name in rmse else words
+        label = f"{words}, RMSE {scientific(rmse[name])}" if name in rmse else words
         top.plot(half.x[where], model[where], color=colour, linestyle=line, label=label)
     floor = rmse.get("noise_floor" if half.raw else "nuced_noise_floor")
     if floor is not None:
-        top.plot([], [], color="none", label=f"sampling noise alone, RMSE {short(floor, 2)}")
+        top.plot([], [], color="none", label=f"sampling noise alone, RMSE {scientific(floor)}")
     top.set(ylabel=f"density (1/{half.unit})", xlim=(edges[0], edges[-1]))
     top.set_title("raw ensemble" if half.raw else "after non-uniformity correction")
     top.legend(loc="upper right")
@@ -221,6 +221,7 @@ def electron_numbers(
         )
         strip.plot(k, 1e3 * (mass - expected), "x", color=VERMILION, markersize=4.0)
     strip.axhline(0.0, color=BLACK, linewidth=0.5)
+    strip.margins(y=0.15)
     top.set(ylabel="probability", ylim=(0.0, 1.4 * max(float(np.nanmax(mass, initial=0.0)), 1e-12)))
     strip.set(xlabel="electron number k (e⁻)", ylabel="difference\n(10⁻³)", xlim=(-0.6, last + 0.6))
     strip.xaxis.set_major_locator(MaxNLocator(8, integer=True))

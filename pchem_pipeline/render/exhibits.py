@@ -17,7 +17,7 @@ from pchem_pipeline.render.data import MAP_NAMES, PixelFit, ReportData
 from pchem_pipeline.render.ranges import finite
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM
-from pchem_pipeline.render.wording import count, measured, percent, short, symbol
+from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol
 
 __all__ = ["EXHIBIT_NAMES", "Exhibit", "exhibits"]
 
@@ -202,7 +202,7 @@ def _ensemble(data: ReportData, _: ReportSettings) -> list[Exhibit]:
     if "density" not in data.ensemble and "nuced_density" not in data.ensemble:
         return []
     rmse = dict(data.ensemble_facts.get("rmse", {}))
-    numbers = ", ".join(f"{name.replace('_', ' ')} {short(value, 2)}" for name, value in rmse.items())
+    numbers = ", ".join(f"{name.replace('_', ' ')} {scientific(value)}" for name, value in rmse.items())
     return [
         Exhibit(
             "ensemble",

@@ -12,7 +12,7 @@ from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.map_figures import status_counts
 from pchem_pipeline.render.ranges import finite
 from pchem_pipeline.render.verdict import summaries
-from pchem_pipeline.render.wording import measured, percent, short, symbol, unit_text
+from pchem_pipeline.render.wording import measured, percent, scientific, short, symbol, unit_text
 
 __all__ = ["Table", "provenance_tables", "result_tables", "size_words"]
 
@@ -52,9 +52,8 @@ def size_words(size: float) -> str:
 
 def _parameters(data: ReportData) -> Table:
     rows = []
-    for name, summary in summaries(data).items():
-        if name not in _ORDER:
-            continue
+    found = summaries(data)
+    for name, summary in ((name, found[name]) for name in _ORDER if name in found):
         _, words, unit = symbol(name)
         errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
         values = [short(value, 4) for value in summary.percentiles.values()]
@@ -69,7 +68,6 @@ def _parameters(data: ReportData) -> Table:
                 f"{summary.n_valid:,}",
             )
         )
-    rows.sort(key=lambda row: row[0])
     return Table(
         "parameters",
         "Parameters",
@@ -180,8 +178,8 @@ def _rmse(data: ReportData) -> Table:
         rows.append(
             (
                 words,
-                f"{short(rmse[name])} {unit}",
-                f"{short(floor)} {unit}" if floor else "not known",
+                f"{scientific(rmse[name], 3)} {unit}",
+                f"{scientific(floor, 3)} {unit}" if floor else "not known",
                 short(rmse[name] / floor) if floor else "not known",
             )
         )

@@ -12,7 +12,7 @@ from pchem_pipeline.model.maps import MapSummary, summarise
 from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.map_figures import status_counts
 from pchem_pipeline.render.ranges import finite
-from pchem_pipeline.render.wording import count, measured, percent, short, symbol
+from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol
 
 __all__ = [
     "Flag",
@@ -137,7 +137,7 @@ def sentence(data: ReportData) -> str:
     if "epcd_exact" in rmse and rmse.get("noise_floor"):
         text += (
             f" The fitted {data.noun}s predict the raw ensemble histogram with an RMSE of "
-            f"{short(rmse['epcd_exact'], 2)}; sampling noise alone gives {short(rmse['noise_floor'], 2)}."
+            f"{scientific(rmse['epcd_exact'])}; sampling noise alone gives {scientific(rmse['noise_floor'])}."
         )
     return text
 
@@ -205,13 +205,13 @@ def _agreement(data: ReportData) -> list[Flag]:
         if name not in rmse or not rmse.get(floor):
             continue
         ratio = rmse[name] / rmse[floor]
-        text = f"The prediction of the {words} misses the data by {short(ratio, 2)} times the sampling noise"
+        text = f"The RMSE of the predicted {words} is {short(ratio, 2)} times that of sampling noise alone"
         if ratio <= _RMSE_GOOD:
-            found.append(Flag("good", f"{text}: the model explains it."))
+            found.append(Flag("good", f"{text}: the model explains the data."))
         elif ratio <= _RMSE_BAD:
             found.append(Flag("caution", f"{text}: small differences are left."))
         else:
-            found.append(Flag("serious", f"{text}: the model does not explain it."))
+            found.append(Flag("serious", f"{text}: the model does not explain the data."))
     return found
 
 

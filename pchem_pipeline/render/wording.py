@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["count", "measured", "percent", "short", "stored_unit", "symbol", "unit_text"]
+__all__ = ["count", "measured", "percent", "scientific", "short", "stored_unit", "symbol", "unit_text"]
 
 _UNITS = {
     "e-": "e⁻",
@@ -61,6 +61,16 @@ def short(value: float, digits: int = 3) -> str:
         return f"{value:.{max(digits - 1 - exponent, 0)}f}".replace("-", "−")
     mantissa = value / 10.0**exponent
     return f"{mantissa:.{digits - 1}f}×10{str(exponent).translate(_SUPERSCRIPT)}".replace("-", "−")
+
+
+def scientific(value: float, digits: int = 2) -> str:
+    """Return a number as ``1.9×10⁻⁴``, for numbers that are compared over powers of ten."""
+    if not math.isfinite(value):
+        return "not known"
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    if int(exponent) == 0:
+        return mantissa.replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}".replace("-", "−")
 
 
 def measured(value: float, error: float, unit: str = "") -> str:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pchem_pipeline.render.wording import count, measured, percent, short, symbol, unit_text
+from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol, unit_text
 from pchem_pipeline.variables import VARIABLES
 
 
@@ -56,6 +56,20 @@ def test_measured_rounds_to_two_digits_of_the_error(value: float, error: float, 
 )
 def test_percent_never_rounds_some_to_none_or_all(part: int, whole: int, text: str) -> None:
     assert percent(part, whole) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.00115, "1.1×10⁻³"),
+        (9.34e-4, "9.3×10⁻⁴"),
+        (-2.0, "−2.0"),
+        (1234.0, "1.2×10³"),
+        (float("inf"), "not known"),
+    ],
+)
+def test_scientific(value: float, text: str) -> None:
+    assert scientific(value) == text
 
 
 def test_count_and_units() -> None:

@@ -293,7 +293,7 @@ def test_settings_refuse_doubles() -> None:
     [
         ({"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}, "serious", "does not explain"),
         ({"rmse": {"epcd_exact": 2e-4, "noise_floor": 1e-4}}, "caution", "small differences"),
-        ({"rmse": {"epcd_exact": 1.1e-4, "noise_floor": 1e-4}}, "good", "explains it"),
+        ({"rmse": {"epcd_exact": 1.1e-4, "noise_floor": 1e-4}}, "good", "explains the data"),
     ],
 )
 def test_flags_of_the_ensemble(
