@@ -150,7 +150,8 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
         wanted = settings.dataset.strip()
         images = [(n, hdu) for n, hdu in images if wanted in (str(n), hdu.name)]
     if len(images) != 1:
-        names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images) or "none"
+        names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
+        names += f" and {len(images) - 12} more" if len(images) > 12 else ""
         raise InputError(
             f"{path}: images in the file{' of that name' * (settings.dataset is not None)}: {names}; "
             "choose one by its number in input.dataset"

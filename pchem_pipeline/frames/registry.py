@@ -6,6 +6,7 @@ reader.
 
 from __future__ import annotations
 
+import functools
 import importlib
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -29,6 +30,7 @@ _OURS = {
 }
 
 
+@functools.cache
 def _plugins() -> dict[str, EntryPoint]:
     """Return others' readers by format name, not loaded; refuse doubles."""
     found: dict[str, EntryPoint] = {}

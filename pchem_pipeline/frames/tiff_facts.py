@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -49,8 +50,18 @@ def images_behind_one_page(file: Any) -> int:
 
 
 def _shaped(file: Any) -> dict[str, Any]:
-    """Return the JSON record in the description, from tifffile or our writer; else empty."""
-    return dict(file.shaped_metadata[0]) if file.is_shaped and file.shaped_metadata else {}
+    """Return the JSON record in the description, from tifffile or our writer; else empty.
+
+    Not ``shaped_metadata``: the library would look for series through all pages.
+    """
+    text = file.pages[0].description
+    if not text.startswith("{") or '"shape"' not in text:
+        return {}
+    try:
+        record = json.loads(text)
+    except ValueError:
+        return {}
+    return record if isinstance(record, dict) else {}
 
 
 def _ome(file: Any) -> str:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import builtins
 import importlib
+import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -52,9 +55,17 @@ class NoReader:
     """Not a reader at all."""
 
 
+@pytest.fixture(autouse=True)
+def _forget_plug_ins() -> Iterator[None]:
+    """Readers are looked up once per process."""
+    yield
+    registry._plugins.cache_clear()
+
+
 def plug_in(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
     found = [EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in points]
     monkeypatch.setattr(registry, "entry_points", lambda group: found)
+    registry._plugins.cache_clear()
 
 
 def test_reader_from_a_plug_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,3 +152,28 @@ def test_settings_and_registry_import_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_real_package_beside_ours(tmp_path: Path) -> None:
+    """Another distribution, found on the path of a fresh process by its metadata alone."""
+    info = tmp_path / "site" / "textframes-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: textframes\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        f"[{registry.ENTRY_POINT_GROUP}]\ntextframes = textframes_package:TextReader\n"
+    )
+    shutil.copy(__file__, tmp_path / "site" / "textframes_package.py")
+    (tmp_path / "a.txf").write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
+    code = (
+        "from pathlib import Path\n"
+        "from pchem_pipeline.frames.open import open_frames\n"
+        "from pchem_pipeline.frames.settings import InputSettings\n"
+        f"reader = open_frames(InputSettings(files=('a.txf',)), Path({str(tmp_path)!r}))\n"
+        "print(reader.read().ravel().tolist())"
+    )
+    paths = [str(tmp_path / "site"), *sys.path]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
+    assert done.stdout.strip() == "[1, 2, 3, 4, 5, 6, 7, 8]"
