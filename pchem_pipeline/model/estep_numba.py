@@ -25,7 +25,6 @@ _REORDER = {"reassoc", "nsz", "contract", "arcp"}
 
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
 _LARGEST_RATIO = 1e145  # keeps r^2 finite when the peaks are needles
-_LONGEST = 11  # longest polynomial with a compiled loop of its own
 
 LOG_2PI = math.log(2.0 * math.pi)
 
@@ -98,7 +97,6 @@ block_sums_3 = _block_kernel(3)
 block_sums_5 = _block_kernel(5)
 block_sums_7 = _block_kernel(7)
 block_sums_9 = _block_kernel(9)
-block_sums_11 = _block_kernel(11)
 block_sums_any = _block_kernel(0)
 
 
@@ -225,8 +223,6 @@ def _sum_block(
         block_sums_7(weights, start, stop, offset, top_ratio, powers, prior, 7, densities, sums)
     elif width == 9:
         block_sums_9(weights, start, stop, offset, top_ratio, powers, prior, 9, densities, sums)
-    elif width == _LONGEST:
-        block_sums_11(weights, start, stop, offset, top_ratio, powers, prior, 11, densities, sums)
     else:
         block_sums_any(weights, start, stop, offset, top_ratio, powers, prior, width, densities, sums)
 
@@ -242,7 +238,7 @@ def evaluate(
     total: NDArray[np.float64],
     score: NDArray[np.float64],
     information: NDArray[np.float64],
-    want_density: bool,
+    frames: float,
 ) -> float:
     """Evaluate log-likelihood, E-step sums, score and observed information of one pixel.
 
@@ -256,7 +252,7 @@ def evaluate(
         total: out, log-likelihood and the sums over frames of E[k], E[k^2], E[k e], E[e], E[e^2].
         score: out, gradient of the log-likelihood in theta.
         information: out, observed information in theta.
-        want_density: leave the density of each DN in ``work[0]``.
+        frames: leave the counts of each DN expected in so many frames in ``work[0]``; nothing if 0.
 
     Returns:
         The log-likelihood, nats.
@@ -272,11 +268,14 @@ def evaluate(
     filled = 1
     powers[0] = 1.0
     sums = work[3]
-    information[:, :] = 0.0
-    total[:] = 0.0
+    for i in range(4):
+        for k in range(4):
+            information[i, k] = 0.0
+    for i in range(N_TOTAL):
+        total[i] = 0.0
     log_prior = j * theta[0] - exposure - math.lgamma(j + 1.0)
     loglik = -0.5 * cumulative[n_bins] * (theta[3] + LOG_2PI)
-    start = 0
+    start = n_bins - n_bins  # 0 as a variable, lest a constant have its own compilation
     while start < n_bins:
         stop = min(n_bins, int(math.ceil(origin + (j + 0.5) * a - first)))
         if j == last:
@@ -298,13 +297,14 @@ def evaluate(
             d2 = sums[2] - shift * (2.0 * sums[1] - shift * sums[0])
             loglik += logs + sums[0] * log_prior - 0.5 * d2 / s2 - shift * d1 / s2
             _add_block(sums, float(low), a, s2, total, information)
-            if want_density:
-                level = log_prior - 0.5 * (theta[3] + LOG_2PI)
+            if frames > 0.0:
+                level = math.log(frames) + log_prior - 0.5 * (theta[3] + LOG_2PI)
                 for i in range(start, stop):
                     d = nearest + (i - start)
                     densities[i] *= math.exp(level - (0.5 * d + shift) * d / s2)
-        elif want_density:
-            densities[start:max(start, stop)] = 0.0
+        elif frames > 0.0:
+            for i in range(start, stop):
+                densities[i] = 0.0
         start = max(start, stop)
         j += 1
         log_prior += theta[0] - math.log(j)

@@ -53,14 +53,16 @@ def invert(information: NDArray[np.float64], held: NDArray[np.bool_], covariance
     """Fill the inverse; NaN for held parameters, and everywhere (answer False) unless positive definite."""
     lower = np.zeros((4, 4))
     column = np.empty(4)
-    covariance[:, :] = math.nan
+    for i in range(4):
+        for j in range(4):
+            covariance[i, j] = math.nan
     if not cholesky(information, held, lower):
         return False
     for i in range(4):
         if held[i]:
             continue
-        column[:] = 0.0
-        column[i] = 1.0
+        for j in range(4):
+            column[j] = 1.0 if j == i else 0.0
         back_substitute(lower, column)
         for j in range(4):
             if not held[j]:

@@ -14,11 +14,11 @@ FITTED_PARAMETERS = 4
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def pearson(
-    weights: NDArray[np.float64], densities: NDArray[np.float64], n_bins: int, n: float
+    weights: NDArray[np.float64], expectations: NDArray[np.float64], n_bins: int, n: float
 ) -> tuple[float, int]:
-    """Compare counts with ``n`` times the density, adjacent DN merged until 5 counts are expected.
+    """Compare counts with what is expected of each DN, adjacent DN merged until 5 are expected.
 
-    What the density leaves outside the window belongs to the last group, so that the expectations sum to ``n``.
+    What is expected outside the window belongs to the last group, so that the expectations sum to ``n``.
 
     Returns:
         Chi-square and its degrees of freedom, groups - 1 - 4; (NaN, 0) where none are left.
@@ -29,7 +29,7 @@ def pearson(
     remaining = n
     for i in range(n_bins):
         seen += weights[i]
-        expected += n * densities[i]
+        expected += expectations[i]
         if expected >= SMALLEST_EXPECTATION and remaining - expected >= SMALLEST_EXPECTATION:
             chi2 += (seen - expected) ** 2 / expected
             groups += 1

@@ -65,8 +65,8 @@ def fit_histograms(
     settings = settings or FitSettings()
     counts = np.ascontiguousarray(counts)
     n = counts.shape[0]
-    parameters, covariance = np.empty((n, 4)), np.empty((n, 4, 4))
-    out, words = np.empty((n, pchem_numba.N_OUT)), np.empty((n, 5), np.int64)
+    parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
+    out, words = np.full((n, pchem_numba.N_OUT), np.nan), np.zeros((n, 5), np.int64)
     pchem_numba.fit_tile(
         counts, np.asarray(origin, np.int64), regression_basis(), _limits(settings), parameters, covariance, out, words
     )
@@ -107,5 +107,5 @@ def _limits(settings: FitSettings) -> NDArray[np.float64]:
     limits[polish_numba.MAX_EVALUATIONS] = settings.em_max_iterations if em else settings.max_iterations
     limits[pchem_numba.GAP_THRESHOLD] = settings.gap_threshold
     limits[pchem_numba.NOISE_LIMIT] = settings.read_noise_limit
-    limits[pchem_numba.ONLY_EM] = em
+    limits[polish_numba.ONLY_EM] = em
     return limits

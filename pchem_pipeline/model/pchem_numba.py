@@ -16,10 +16,12 @@ from pchem_pipeline.model.polish_numba import (
     DEGENERATE,
     MAX_STEP,
     MIN_LOG_EXPOSURE,
+    copy,
     min_log_variance,
     polish,
     same_maximum,
 )
+from pchem_pipeline.model.polish_numba import N_LIMITS as POLISH_LIMITS
 from pchem_pipeline.model.start_numba import (
     N_FREQUENCIES_WIDE,
     assemble,
@@ -33,8 +35,8 @@ NO_DATA, TOO_FEW_BINS, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, EXPOSURE_AT_BOUND
 BIAS_AMBIGUOUS, NOT_INFORMATIVE, COARSE_STEPS = 32, 64, 1024
 
 # places in `limits`, after those of `polish`
-GAP_THRESHOLD, NOISE_LIMIT, ONLY_EM = 5, 6, 7
-N_LIMITS = 8
+GAP_THRESHOLD, NOISE_LIMIT = POLISH_LIMITS, POLISH_LIMITS + 1
+N_LIMITS = POLISH_LIMITS + 2
 
 # columns of `out`
 LOG_LIKELIHOOD, GAP, CHI2 = 0, 1, 2
@@ -92,14 +94,14 @@ def _climb_neighbours(
             trial[2] = best[2] - direction * best[1]
             trial[3] = best[3]
             outcome, loglik, count = polish(
-                weights, cumulative, n_bins, first, trial, limits, False, best_loglik - _CLEAR_GAP,
+                weights, cumulative, n_bins, first, trial, limits, best_loglik - _CLEAR_GAP,
                 best, best_loglik, work, total, score, information,
             )  # fmt: skip
             used += count
             if outcome != DEGENERATE and not same_maximum(best, trial):
                 if loglik > best_loglik and outcome == CONVERGED and moves < _MOST_MOVES:
                     runner_up = best_loglik
-                    best[:] = trial
+                    copy(trial, best)
                     best_loglik = loglik
                     came_from = -direction
                     moves += 1
@@ -107,7 +109,7 @@ def _climb_neighbours(
                     continue
                 runner_up = max(runner_up, loglik)
             elif loglik > best_loglik and outcome == CONVERGED:
-                best[:] = trial
+                copy(trial, best)
                 best_loglik = loglik
         direction = -direction
         tried += 1
@@ -137,17 +139,17 @@ def _first_start(
     trial = np.empty(4)
     best = -math.inf
     if usable:
-        best = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, False)
+        best = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, 0.0)
     for which in range(2):
         if which == 0:
             found = start_peak(weights, n_bins, first, n, mean, variance, work, trial)
         else:
             found = start_cumulants(weights, n_bins, first, n, mean, variance, trial)
         if found and trial[1] > _MIN_STEP:
-            loglik = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+            loglik = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, 0.0)
             if loglik > best:
                 best = loglik
-                theta[:] = trial
+                copy(trial, theta)
                 usable = True
     return usable
 
@@ -176,10 +178,10 @@ def _scan(
         if exposure > 0.0 and a > _MIN_STEP:
             assemble(weights, n_bins, first, n, mean, variance, a, exposure, trial)
             trial[3] = math.log(max(0.1225 * a * a, 1.0 / 12.0))
-            loglik = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, False)
+            loglik = evaluate(weights, cumulative, n_bins, first, trial, work, total, score, information, 0.0)
             if loglik > best:
                 best = loglik
-                theta[:] = trial
+                copy(trial, theta)
     return best > -math.inf
 
 
@@ -257,12 +259,12 @@ def fit_pixel(
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
     trial, score, total, scratch = np.empty(4), np.empty(4), np.empty(N_TOTAL), np.empty((4, 4))
-    only_em = limits[ONLY_EM] > 0.0
     best_loglik, runner_up = -math.inf, -math.inf
     gaussian = log_likelihood_gaussian(n, variance)
     used = freedom = 0
     degenerate = False
-    best[:] = 0.0
+    for i in range(4):
+        best[i] = 0.0
     for attempt in range(-1, 5):
         if attempt < 0:
             usable = _first_start(
@@ -276,7 +278,7 @@ def fit_pixel(
         if not usable:
             continue
         outcome, loglik, count = polish(
-            weights, cumulative, n_bins, first, trial, limits, only_em, -math.inf,
+            weights, cumulative, n_bins, first, trial, limits, -math.inf,
             trial, math.inf, work, total, score, scratch,
         )  # fmt: skip
         used += count
@@ -288,13 +290,13 @@ def fit_pixel(
             runner_up = max(runner_up, loglik)
             continue
         runner_up = best_loglik
-        best[:] = trial
+        copy(trial, best)
         loglik, beside, count = _climb_neighbours(
             weights, cumulative, n_bins, first, best, loglik, limits, work, total, score, scratch
         )
         used += count + 1
         runner_up = max(beside, runner_up)
-        best_loglik = evaluate(weights, cumulative, n_bins, first, best, work, total, score, information, True)
+        best_loglik = evaluate(weights, cumulative, n_bins, first, best, work, total, score, information, n)
         out[CHI2], freedom = pearson(weights, work[0], n_bins, n)
         noise = math.exp(0.5 * best[3]) / best[1]
         if normal_score(out[CHI2], freedom) < _SUSPICIOUS and noise < _SUSPICIOUS_NOISE:
@@ -383,10 +385,11 @@ def fit_tile(
         origin: DN of bin 0, shape (n,).
         basis: of the regression on the ECF.
         limits: bounds and limits, shape (N_LIMITS,).
-        parameters: out, (H, g, mu, sigma), shape (n, 4).
-        covariance: out, shape (n, 4, 4).
-        out: out, shape (n, N_OUT); NaN where there is nothing.
-        words: out, per pixel: status, evaluations, degrees of freedom, first and last DN seen; shape (n, 5).
+        parameters: out, (H, g, mu, sigma), shape (n, 4); comes as NaN.
+        covariance: out, shape (n, 4, 4); comes as NaN.
+        out: out, shape (n, N_OUT); comes as NaN.
+        words: out, per pixel: status, evaluations, degrees of freedom, first and last DN seen; shape (n, 5);
+            comes as 0.
     """
     n_most = counts.shape[1]
     work = np.empty((N_WORK, max(n_most + 2, N_FREQUENCIES_WIDE)))
@@ -395,17 +398,13 @@ def fit_tile(
     held = np.zeros(4, np.bool_)
     own_limits = limits.copy()
     for pixel in range(counts.shape[0]):
-        parameters[pixel, :] = math.nan
-        covariance[pixel, :, :] = math.nan
-        out[pixel, :] = math.nan
-        words[pixel, :] = 0
         low, n_bins, occupied = load_pixel(counts[pixel], weights, cumulative, summary)
         words[pixel, 3] = origin[pixel] + low
         words[pixel, 4] = origin[pixel] + low + n_bins - 1
         if occupied < 3:
             words[pixel, 0] = NO_DATA if occupied == 0 else TOO_FEW_BINS
             continue
-        middle = math.floor(summary[1])
+        middle = float(math.floor(summary[1]))
         own_limits[MAX_STEP] = 4.0 * n_bins + 10.0
         status, words[pixel, 1], words[pixel, 2] = fit_pixel(
             weights, cumulative, n_bins, -middle, summary[0], summary[1] - middle, summary[2],
@@ -414,7 +413,7 @@ def fit_tile(
         if theta[1] > 0.0:
             held[0] = status & EXPOSURE_AT_BOUND != 0
             held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-9
-            centre = origin[pixel] + low + middle
+            centre = float(origin[pixel] + low) + middle
             if not to_natural(theta, centre, information, held, parameters[pixel], covariance[pixel]):
                 status |= FIT_NOT_CONVERGED
         words[pixel, 0] = status

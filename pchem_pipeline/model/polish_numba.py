@@ -21,7 +21,8 @@ DEGENERATE = 2  # ran towards one Gaussian: g to infinity, or an empty second pe
 FAR_BELOW = 3  # given up: too far below the likelihood to beat
 
 # places in `limits`
-MIN_LOG_EXPOSURE, MAX_STEP, TOLERANCE, WARM_UP, MAX_EVALUATIONS = range(5)
+MIN_LOG_EXPOSURE, MAX_STEP, TOLERANCE, WARM_UP, MAX_EVALUATIONS, ONLY_EM = range(6)
+N_LIMITS = 6
 
 MIN_LOG_VARIANCE = math.log(1.0 / 12.0)  # rounding alone
 MIN_ELECTRON_NOISE = 0.03  # below it the polynomials of the E-step overflow
@@ -30,6 +31,13 @@ _MIN_STEP = 1.2  # DN per electron: a comb with a tooth at each DN would fit any
 MAX_LOG_EXPOSURE = math.log(1e5)
 _LEAST_SHARE = 1e-5  # of the complete-data information in a damped step
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def copy(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    """Copy a vector; a plain loop, since slice assignment compiles slowly."""
+    for i in range(source.size):
+        target[i] = source[i]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -104,7 +112,9 @@ def newton_step(
     held[0] = theta[0] <= bound + 1e-12 and score[0] <= 0.0
     held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-12 and score[3] <= 0.0
     lower = np.empty((4, 4))
-    matrix = information.copy()
+    matrix = np.empty((4, 4))
+    for i in range(4):
+        copy(information[i], matrix[i])
     if share > 0.0:
         add_complete(n, theta, total, share, matrix)
     while not cholesky(matrix, held, lower):
@@ -112,7 +122,6 @@ def newton_step(
         add_complete(n, theta, total, more, matrix)
         share += more
         if share > 3.0 * _LARGEST_SHARE:
-            step[:] = 0.0
             return 0.0, share
     for i in range(4):
         step[i] = 0.0 if held[i] else score[i]
@@ -157,7 +166,6 @@ def polish(
     first: float,
     theta: NDArray[np.float64],
     limits: NDArray[np.float64],
-    only_em: bool,
     to_beat: float,
     known: NDArray[np.float64],
     known_loglik: float,
@@ -175,10 +183,10 @@ def polish(
         first: first DN minus the centre.
         theta: start; out: the maximum.
         limits: bounds and limits, see the names at the top of this module.
-        only_em: take EM steps only.
         to_beat: give up once the log-likelihood cannot rise to this value, judged by twice the expected rise.
         known: a maximum known already; the climb ends where it heads for that one.
-        known_loglik: its log-likelihood, infinite where there is none.
+        known_loglik: its log-likelihood; infinite where there is none, as for the climb from a start, which alone
+            warms up by EM steps, or takes nothing else where the limits say so.
         work: scratch of `evaluate`.
         total: scratch.
         score: scratch.
@@ -196,9 +204,10 @@ def polish(
     theta[3] = max(min_log_variance(theta[1]), theta[3])
     if degenerate(theta, limits[MAX_STEP]):
         return DEGENERATE, -math.inf, 0
-    loglik = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, False)
+    loglik = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, 0.0)
     used, damping = 1, 0.0
     warm_up = limits[WARM_UP] if known_loglik == math.inf else 0.0
+    only_em = limits[ONLY_EM] > 0.0 and known_loglik == math.inf
     while used < limits[MAX_EVALUATIONS]:
         rise, share = newton_step(n, theta, total, score, information, bound, damping, step)
         if share == 0.0 and rise < tolerance:
@@ -219,7 +228,7 @@ def polish(
         if degenerate(trial, limits[MAX_STEP]):
             return DEGENERATE, loglik, used
         risen = evaluate(
-            weights, cumulative, n_bins, first, trial, work, new_total, new_score, new_information, False
+            weights, cumulative, n_bins, first, trial, work, new_total, new_score, new_information, 0.0
         )
         used += 1
         expected = (2.0 * factor - factor * factor) * rise
@@ -234,6 +243,10 @@ def polish(
             damping = max(4.0 * share, _LEAST_SHARE)
         else:
             damping = share
-        theta[:], total[:], score[:], information[:, :] = trial, new_total, new_score, new_information
+        copy(trial, theta)
+        copy(new_total, total)
+        copy(new_score, score)
+        for i in range(4):
+            copy(new_information[i], information[i])
         loglik = risen
     return NOT_CONVERGED, loglik, used
