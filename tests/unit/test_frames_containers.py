@@ -116,6 +116,24 @@ def test_hdf5_truncated(tmp_path: Path, kept: float) -> None:
         read(path)
 
 
+def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        dataset = file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
+        place = dataset.id.get_chunk_info(3).byte_offset
+    reader = open_frames(InputSettings(files=("a.h5",)), tmp_path)
+    data = bytearray(path.read_bytes())
+    data[place : place + 60] = bytes(60)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(reader.read(0, 3), STACK[:3])
+    with pytest.raises(InputError, match=r"a\.h5: frames cannot be read"):
+        reader.read()
+    with h5py.File(path, "w") as file:
+        file["frames"] = STACK[:4]
+    with pytest.raises(InputError, match="changed its shape while it was being read"):
+        reader.read(0, 2)
+
+
 def test_hdf5_bad_types(tmp_path: Path) -> None:
     path = tmp_path / "t.h5"
     for data, words in [(STACK.astype(float), "floating-point"), (STACK.astype(np.int32), "signed samples")]:

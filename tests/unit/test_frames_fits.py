@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,17 @@ def read(path: Path, **settings: Any) -> NDArray[Any]:
         return reader.read()
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-@pytest.mark.parametrize("place", ["primary", "extension", "RICE_1", "GZIP_2", "HCOMPRESS_1"])
+@pytest.mark.parametrize(
+    ("dtype", "place"),
+    [
+        *itertools.product([np.uint8, np.uint16, np.uint32], ["primary", "extension", "RICE_1", "GZIP_2"]),
+        # lossless to 16 bits only
+        *itertools.product([np.uint8, np.uint16], ["HCOMPRESS_1"]),
+    ],
+)
 def test_cube(tmp_path: Path, dtype: type, place: str) -> None:
     top = np.iinfo(dtype).max if place != "HCOMPRESS_1" else 60_000 % (np.iinfo(dtype).max + 1)
     stack = np.random.default_rng(1).integers(0, top, STACK.shape, dtype=dtype, endpoint=True)
-    if place == "HCOMPRESS_1" and dtype is np.uint32:
-        pytest.skip("the standard has no lossless HCOMPRESS of 32 bits")
     stack[0, 0, :2] = 0, top
     path = tmp_path / "cube.fits"
     if place == "primary":
