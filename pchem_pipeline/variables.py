@@ -159,6 +159,13 @@ _ALL: list[Variable] = [
     Variable(
         "ensemble/epcd_independent", ("dn",), "float64", "1/DN", "EPCD: product of four histograms", "f_E"
     ),
+    Variable(
+        "ensemble/residual",
+        ("dn",),
+        "float64",
+        "1",
+        "(density - epcd_exact) / its standard deviation by counting",
+    ),
     # after two-point non-uniformity correction: axis `electrons`
     Variable("ensemble/electrons", ("electrons",), "float64", "e-", "centre of the bin of NUCed data"),
     Variable("ensemble/nuced_counts", ("electrons",), "int64", "1", "ensemble histogram of NUCed frames"),
@@ -183,6 +190,13 @@ _ALL: list[Variable] = [
         "1/e-",
         "NUCed EPCD: product of histograms",
         "f_E'",
+    ),
+    Variable(
+        "ensemble/nuced_residual",
+        ("electrons",),
+        "float64",
+        "1",
+        "(nuced_density - nuced_exact) / its standard deviation by counting",
     ),
     # electron numbers: axis `k`
     Variable("ensemble/k", ("k",), "int32", "e-", "electron number", "k"),

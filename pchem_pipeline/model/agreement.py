@@ -120,22 +120,26 @@ def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArr
 
 
 def chi_square(
-    counts: NDArray[np.integer[Any]], expected: FloatArray, expected_square: FloatArray, least: float = 10.0
+    data: FloatArray,
+    model: FloatArray,
+    variance: FloatArray,
+    counts: NDArray[np.integer[Any]],
+    least: int = 10,
 ) -> ChiSquare:
     """Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
 
-    Bins are taken where enough samples are expected. The bins of one pixel are slightly
+    Bins are taken where there are enough samples. The bins of one pixel are slightly
     anticorrelated, so the sum is not exactly chi-square; with many bins the difference is small.
 
     Args:
+        data: density of the data, shape (n,).
+        model: predicted density, shape (n,).
+        variance: variance of the data's density, shape (n,).
         counts: samples in each bin, shape (n,).
-        expected: ``m sum_p p_p``, expected samples, shape (n,).
-        expected_square: ``m sum_p p_p^2``, shape (n,).
-        least: expected samples below which a bin is left out.
+        least: samples below which a bin is left out.
 
     Returns:
         Chi-square and the number of bins.
     """
-    use = expected >= least
-    variance = expected[use] - expected_square[use]
-    return ChiSquare(float(np.sum((counts[use] - expected[use]) ** 2 / variance)), int(use.sum()))
+    use = (counts >= least) & (variance > 0)
+    return ChiSquare(float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum()))

@@ -74,8 +74,9 @@ def run(context: StageContext) -> None:
             "electrons/electron_number",
             (n_frames, ny, nx),
             chunks=(depth, tile, max(_CHUNK_COLUMNS, tile)),
-            missing_value=NO_NUMBER,
-            largest_value=LARGEST_NUMBER,
+            # not missing_value: xarray would turn the integers into floats
+            no_number=NO_NUMBER,
+            largest_number=LARGEST_NUMBER,
         )
     depth = context.store.array("electrons/electron_number").chunks[0]
     rows = _BLOCK_BYTES // (depth * nx * 2)

@@ -108,7 +108,7 @@ def run(context: StageContext) -> None:
     finished = [tile for tile in tiles if tile.key in done]
     if finished:
         numbers = [number for key, (number, _) in job.tiles.items() if key in done]
-        write_result(context, axes, finished, numbers, frames)
+        write_result(context, axes, finished, numbers, frames, truth)
 
 
 def _chosen_frames(context: StageContext) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
 from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, ensemble_sums, tally
 from pchem_pipeline.model.pixels import FloatArray, PixelParameters
 
-__all__ = ["EnsembleAxes", "PixelHistograms", "ensemble_tile"]
+__all__ = ["ERROR_SIZES", "EnsembleAxes", "EnsembleTotals", "PixelHistograms", "ensemble_tile"]
 
 #: Sizes of error of the electron numbers told apart; the last one is: and more.
 ERROR_SIZES = 8
@@ -94,6 +94,39 @@ class EnsembleAxes:
 def _places(lengths: dict[str, int]) -> dict[str, slice]:
     ends = np.cumsum(list(lengths.values())).tolist()
     return {name: slice(end - size, end) for (name, size), end in zip(lengths.items(), ends, strict=True)}
+
+
+@dataclass(frozen=True)
+class EnsembleTotals:
+    """The sums over all tiles.
+
+    Attributes:
+        axes: axes of the ensemble.
+        integers: total of the rows of integers.
+        floats: total of the rows of floats.
+        samples: chosen frames of a pixel, all frames of a pixel; (1, 1) for ready-made histograms.
+    """
+
+    axes: EnsembleAxes
+    integers: NDArray[np.int64]
+    floats: FloatArray
+    samples: tuple[int, int]
+
+    def count(self, name: str) -> int:
+        """Return a tally that is one number."""
+        return int(self.integers[self.axes.integers[name]][0])
+
+    def counts(self, name: str) -> NDArray[np.int64]:
+        """Return a tally along an axis."""
+        return self.integers[self.axes.integers[name]]
+
+    def mean(self, name: str) -> FloatArray:
+        """Return the mean over the pixels of a sum."""
+        return self.floats[self.axes.floats[name]] / self.count("pixels")
+
+    def variance(self, name: str) -> FloatArray:
+        """Return the variance of the mean over the pixels, from the sum of the pixels' variances."""
+        return self.mean(name) / self.count("pixels")
 
 
 def ensemble_tile(

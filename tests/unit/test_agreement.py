@@ -47,8 +47,8 @@ def test_normalised_residuals() -> None:
 
 
 def test_chi_square_leaves_out_bins_with_few_samples() -> None:
-    counts = np.array([110, 3, 90])
-    expected, squares = np.array([100.0, 2.0, 100.0]), np.array([20.0, 0.1, 0.0])
-    found = chi_square(counts, expected, squares)
+    data, model = np.array([1.1, 0.03, 0.9, 0.5]), np.array([1.0, 0.02, 1.0, 0.4])
+    variance = np.array([0.008, 0.001, 0.01, 0.0])
+    found = chi_square(data, model, variance, np.array([110, 3, 90, 50]))
     assert found.dof == 2
-    assert found.value == pytest.approx(100 / 80 + 100 / 100)
+    assert found.value == pytest.approx(0.01 / 0.008 + 0.01 / 0.01)
