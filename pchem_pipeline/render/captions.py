@@ -103,7 +103,7 @@ CAPTIONS: dict[str, str] = {
     "electron_numbers": (
         "Gray: share of each electron number among the estimates. Dots: mass p(k) predicted from the map "
         "of H. Crosses: mass that the estimator itself should show, which errs between neighbouring "
-        "numbers. Below: estimate minus prediction, in thousandths, with two standard deviations of the "
+        "numbers. Below: estimate minus prediction, with two standard deviations of the "
         "sampling noise in gray."
     ),
     "component_widths": (

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS
 
-__all__ = ["MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
+__all__ = ["FEW_CHANNELS", "MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
 
 FloatArray = NDArray[np.float64]
+
+#: A line of fewer channels than this gets a point for each, no histogram.
+FEW_CHANNELS = 32
 
 #: The maps of Appendix C, in the order of the paper.
 MAP_NAMES = ("dark_current", "conversion_gain", "bias", "read_noise_e")
@@ -40,6 +43,7 @@ class PixelFit:
         stderr: standard errors under the same names; may lack some.
         status: words of ``fit_status``; empty if all is well.
         goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
+        channel: whether it is a channel of ready-made histograms.
     """
 
     label: str
@@ -51,6 +55,12 @@ class PixelFit:
     stderr: Mapping[str, float] = field(default_factory=dict)
     status: str = ""
     goodness_p: float = float("nan")
+    channel: bool = False
+
+    @property
+    def place(self) -> str:
+        """Where the pixel is, in words."""
+        return f"channel {self.x}" if self.channel else f"pixel y = {self.y}, x = {self.x}"
 
 
 @dataclass(frozen=True)
@@ -113,6 +123,11 @@ class ReportData:
     def noun(self) -> str:
         """What an element of a map is called: ``pixel``, or ``channel`` for ready-made histograms."""
         return "channel" if self.shape[0] == 1 else "pixel"
+
+    @property
+    def few_channels(self) -> bool:
+        """Tell whether this is a line of so few channels that a histogram over them says nothing."""
+        return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
     def has_values(self, name: str) -> bool:
         """Tell whether a map exists and at least one pixel has a value in it."""

@@ -28,7 +28,7 @@ from pchem_pipeline.render.style import (
     note,
     styled,
 )
-from pchem_pipeline.render.wording import scientific
+from pchem_pipeline.render.wording import power_of_ten, scientific
 
 __all__ = ["component_widths", "electron_numbers", "ensemble"]
 
@@ -161,12 +161,23 @@ def _ensemble_strip(strip: Axes, half: _Half) -> None:
     where = _bulk(half)
     density, x = half.density[where], half.x[where]
     noise = np.sqrt(np.maximum(density, 0.0) / (max(float(half.counts.sum()), 1.0) * half.step))
-    strip.fill_between(x, -2e4 * noise, 2e4 * noise, color="#DDDDDD", linewidth=0, step="mid")
-    for suffix, model in half.models.items():
+    differences = {suffix: density - model[where] for suffix, model in half.models.items()}
+    power = _power([2.0 * noise, *differences.values()])
+    scale = 10.0**-power
+    strip.fill_between(x, -2.0 * scale * noise, 2.0 * scale * noise, color="#DDDDDD", linewidth=0, step="mid")
+    for suffix, difference in differences.items():
         _, colour, line = _PREDICTIONS[suffix]
-        strip.plot(x, 1e4 * (density - model[where]), color=colour, linestyle=line, linewidth=0.8)
+        strip.plot(x, scale * difference, color=colour, linestyle=line, linewidth=0.8)
     strip.axhline(0.0, color=BLACK, linewidth=0.5)
-    strip.set(xlabel=f"signal ({half.unit})", ylabel="data − model\n" + f"(10⁻⁴/{half.unit})")
+    strip.set(
+        xlabel=f"signal ({half.unit})", ylabel=f"data − model\n({power_of_ten(power) or 1}/{half.unit})"
+    )
+
+
+def _power(values: Sequence[FloatArray]) -> int:
+    """Return the power of ten in which values are drawn, so that tick labels have few digits."""
+    largest = max((float(np.max(np.abs(v), initial=0.0)) for v in values), default=0.0)
+    return int(np.floor(np.log10(largest))) if largest > 0 else 0
 
 
 def _ensemble_tail(axes: Axes, half: _Half) -> None:
@@ -210,20 +221,26 @@ def electron_numbers(
     k, mass, pmf = (np.asarray(a, dtype=np.float64)[: last + 1] for a in (k, mass, pmf))
     top.bar(k, mass, width=0.85, color=GRAY, label="estimated electron numbers")
     top.plot(k, pmf, "o", color=BLACK, markersize=3.2, label=r"predicted mass $p_{K_e}$")
+    power = _power([mass - pmf])
+    scale = 10.0**-power
     if counts is not None and np.sum(counts) > 0:
-        noise = 2.0 * np.sqrt(mass / float(np.sum(counts)))
-        strip.bar(k, 2e3 * noise, bottom=-1e3 * noise, width=0.85, color="#DDDDDD", linewidth=0)
-    strip.plot(k, 1e3 * (mass - pmf), "o", color=BLACK, markersize=3.0)
+        noise = 2.0 * scale * np.sqrt(mass / float(np.sum(counts)))
+        strip.bar(k, 2.0 * noise, bottom=-noise, width=0.85, color="#DDDDDD", linewidth=0)
+    strip.plot(k, scale * (mass - pmf), "o", color=BLACK, markersize=3.0)
     if pmf_map is not None:
         expected = np.asarray(pmf_map, dtype=np.float64)[: last + 1]
         top.plot(
             k, expected, "x", color=VERMILION, markersize=4.0, label="mass that the estimator should show"
         )
-        strip.plot(k, 1e3 * (mass - expected), "x", color=VERMILION, markersize=4.0)
+        strip.plot(k, scale * (mass - expected), "x", color=VERMILION, markersize=4.0)
     strip.axhline(0.0, color=BLACK, linewidth=0.5)
     strip.margins(y=0.15)
     top.set(ylabel="probability", ylim=(0.0, 1.4 * max(float(np.nanmax(mass, initial=0.0)), 1e-12)))
-    strip.set(xlabel="electron number k (e⁻)", ylabel="difference\n(10⁻³)", xlim=(-0.6, last + 0.6))
+    strip.set(
+        xlabel="electron number k (e⁻)",
+        ylabel=f"difference\n({power_of_ten(power) or 1})",
+        xlim=(-0.6, last + 0.6),
+    )
     strip.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     handles, labels = top.get_legend_handles_labels()
     top.legend(handles[-1:] + handles[:-1], labels[-1:] + labels[:-1], loc="upper right")

@@ -98,9 +98,9 @@ def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             Exhibit(
                 "cluster_edges_pixel",
                 "cells",
-                f"Pixel y = {pixel.y}, x = {pixel.x} of this run",
+                f"{pixel.place.capitalize()} of this run",
                 CAPTIONS["cluster_edges_pixel"],
-                f"Histogram and density of pixel ({pixel.y}, {pixel.x}); first cell edges at "
+                f"Histogram and density of {pixel.place}; first cell edges at "
                 f"{_edges_text(pixel.parameters)} DN.",
                 _at(
                     pixel_figures.cluster_edges,
@@ -127,7 +127,7 @@ def _pixels(data: ReportData, _: ReportSettings) -> list[Exhibit]:
         names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
         numbers = ", ".join(_value_text(pixel, name) for name in names)
         state = f" ({pixel.status})" if pixel.status else ""
-        words.append(f"{pixel.label or 'pixel'} at ({pixel.y}, {pixel.x}): {numbers}{state}")
+        words.append(f"{pixel.label} {pixel.place}: {numbers}{state}".strip())
     return [
         Exhibit(
             "pixel_fits",
@@ -154,7 +154,8 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
 
 
 def _read_noise(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
-    if not data.has_values("read_noise_e"):
+    # a line of few channels is shown channel by channel, with the maps
+    if not data.has_values("read_noise_e") or data.few_channels:
         return []
     known = finite(data.maps["read_noise_e"])
     below = percent(float((known < 0.4).sum()), known.size)

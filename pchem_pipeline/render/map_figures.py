@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from pchem_pipeline.render.data import FEW_CHANNELS
 from pchem_pipeline.render.ranges import DisplayRange, finite, histogram_edges, robust_range
 from pchem_pipeline.render.stretch import stretch_map
 from pchem_pipeline.render.style import (
@@ -45,8 +46,6 @@ FloatArray = NDArray[np.float64]
 _STRIP = 2
 #: Images longer than this ratio are stretched to fit instead of keeping square pixels.
 _LONGEST_RATIO = 4.0
-#: Sensors with fewer channels than this get a point for each, not bins.
-_FEW = 32
 
 _STATUS_COLOURS = (VERMILION, BLACK, ORANGE, PURPLE, BLUE, SKY, GREEN, YELLOW)
 
@@ -156,7 +155,7 @@ def _channels(
     values: FloatArray, stderr: FloatArray | None, label: str, unit: str, width_mm: float
 ) -> Figure:
     """Draw a line of channels as points with error bars, and their histogram if they are many."""
-    many = finite(values).size >= _FEW
+    many = finite(values).size >= FEW_CHANNELS
     figure = new_figure(width_mm, 92.0 if many else 52.0)
     if many:
         top, axes = figure.subplots(2, 1, height_ratios=(1.0, 1.4))

@@ -171,8 +171,8 @@ def pixel_fits(pixels: Sequence[PixelFit], *, width_mm: float = PAGE_MM) -> Figu
 def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -> None:
     top, strip = part.subplots(2, 1, sharex=True, height_ratios=(3.4, 1.0))
     top.set_title(_title(pixel, letter, width_mm), fontsize=7.0, linespacing=1.35)
-    strip.set(xlabel="signal (DN)", ylabel="residual (σ)")
-    top.set_ylabel("share of frames (1/DN)")
+    strip.set(xlabel="signal (DN)", ylabel="residual\n(σ)")
+    top.set_ylabel("density (1/DN)")
     total = int(pixel.counts.sum())
     if total == 0:
         note(top, "no frames")
@@ -182,7 +182,7 @@ def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -
     dn = pixel.origin + np.arange(pixel.counts.size)
     low, high = dn[where][0] - 0.5, dn[where][-1] + 0.5
     top.set_xlim(low, high)
-    remarks = [f"{total:,} frames"]
+    remarks = [f"{total:,} {'samples' if pixel.channel else 'frames'}"]
     outside = total - int(pixel.counts[where].sum())
     if outside:
         remarks.append(f"{outside:,} outside the axis")
@@ -221,7 +221,7 @@ def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) 
 
 def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
     head = f"({letter}) {plain(_cut(pixel.label))}" if pixel.label else f"({letter})"
-    lines = [f"{head}: pixel y = {pixel.y}, x = {pixel.x}"]
+    lines = [f"{head}: {pixel.place}"]
     if has_fit(pixel.parameters):
         words = []
         for name in _TITLE_NAMES:
@@ -230,7 +230,9 @@ def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
                 words.append(
                     f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
                 )
-        lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
+        pairs = ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
+        fits = all(len(pair) - 12 < 0.62 * width_mm for pair in pairs)
+        lines += pairs if fits else words
     if pixel.status:
         lines += textwrap.wrap(f"status: {plain(pixel.status)}", max(20, int(width_mm * 0.72)))[:2]
     return "\n".join(lines)

@@ -103,7 +103,15 @@ def _template() -> jinja2.Template:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["together"] = _together
     return environment.from_string(text)
+
+
+def _together(text: str) -> str:
+    """Keep numbers and their units on one line."""
+    for unit in ("%", "e⁻", "DN", "±"):
+        text = text.replace(f" {unit}", f"\u00a0{unit}")
+    return text.replace("± ", "±\u00a0")
 
 
 def _picture(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> _Picture:
@@ -145,6 +153,8 @@ def _sections(
         shown = [picture for picture in pictures if picture.exhibit.section == id_]
         rows = [table for table in tables if _TABLE_PLACE.get(table.id) == id_]
         why = [data.missing[part] for part in parts if part in data.missing]
+        if id_ == "read-noise" and data.few_channels and not shown:
+            why.append("few channels have no histogram; their values are with the parameter maps")
         if not shown and not rows and not why:
             why = ["this run has no data for it."]
         if id_ == "maps":

@@ -202,7 +202,7 @@ def _moments(data: ReportData) -> Table:
             seen, difference = "", ""
         elif error:
             seen = measured(float(observed), float(error))
-            difference = short((float(observed) - predicted) / float(error), 2)
+            difference = f"{(float(observed) - predicted) / float(error):+.1f}".replace("-", "−")
         else:
             seen, difference = short(float(observed), 5), ""
         rows.append(

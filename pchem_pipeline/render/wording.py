@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["count", "measured", "percent", "scientific", "short", "stored_unit", "symbol", "unit_text"]
+__all__ = [
+    "count",
+    "measured",
+    "percent",
+    "power_of_ten",
+    "scientific",
+    "short",
+    "stored_unit",
+    "symbol",
+    "unit_text",
+]
 
 _UNITS = {
     "e-": "e⁻",
@@ -71,6 +81,11 @@ def scientific(value: float, digits: int = 2) -> str:
     if int(exponent) == 0:
         return mantissa.replace("-", "−")
     return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}".replace("-", "−")
+
+
+def power_of_ten(exponent: int) -> str:
+    """Return ``10⁻⁴``, or nothing for the power 0."""
+    return f"10{str(exponent).translate(_SUPERSCRIPT)}" if exponent else ""
 
 
 def measured(value: float, error: float, unit: str = "") -> str:

@@ -239,6 +239,7 @@ def _pixels(
                 stderr={name: float(maps[f"{name}_stderr"][y, x]) for name in names},
                 status=describe(word) if word else "",
                 goodness_p=float(fit["goodness_p"][y, x]) if "goodness_p" in fit else float("nan"),
+                channel=sensor.kind == "histograms",
             )
         )
     return found

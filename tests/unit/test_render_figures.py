@@ -138,7 +138,7 @@ def _map(kind: str) -> np.ndarray:
 
 
 KINDS = (
-    *"plain hot holes empty constant decades tiny wide column long channels".split(),
+    *["plain", "hot", "holes", "empty", "constant", "decades", "tiny", "wide", "column", "long", "channels"],
     "one value",
     "one pixel",
 )
