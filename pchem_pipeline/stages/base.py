@@ -31,7 +31,7 @@ from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.compute.executor import Executor, Outcome, Stop
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import PchEmError, StoreError
+from pchem_pipeline.errors import InputError, PchEmError, StoreError
 from pchem_pipeline.stages.interrupt import StopRequest
 from pchem_pipeline.stages.reporting import Reporter
 from pchem_pipeline.stages.sensor import SensorInfo
@@ -201,11 +201,15 @@ class StageContext:
             chosen &= {t.key for t in roi_tiles(self.options.roi, grid)}
         return [unit for unit in units if unit is WHOLE or chosen & set(unit.keys)]
 
-    def pending(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
-        """Return the chosen units that are not done; with ``--force`` all the chosen ones."""
+    def pending(self, units: Sequence[AnyUnit], *, by_tiles: bool = True) -> list[AnyUnit]:
+        """Return the chosen units that are not done; with ``--force`` all the chosen ones.
+
+        Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
+        """
         done = self.store.records.done(self.stage, self.fingerprint)
-        chosen = self.selected(units)
-        if self.options.force:
+        some_tiles = self.options.tiles is not None or self.options.roi is not None
+        chosen = self.selected(units) if by_tiles else list(units)
+        if self.options.force and (by_tiles or not some_tiles):
             return chosen
         return [unit for unit in chosen if not set(unit.keys) <= done]
 
@@ -216,26 +220,29 @@ class StageContext:
         *,
         unit_name: str = "tile",
         needs: str | None = None,
+        by_tiles: bool = True,
     ) -> dict[str, dict[str, Any]]:
         """Run ``task`` on every unit that is chosen and not done yet, and mark each.
 
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
-        every unit (a full disk). With ``needs``, an upstream stage of the same tiles, units that it has
-        not finished are failures too. Returns the summaries of all finished units by key, earlier
-        runs included.
+        every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same
+        tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
+        ``--tiles`` and ``--roi`` do not choose, such as blocks of frames. Returns the summaries of all
+        finished units by key, earlier runs included.
 
         Raises:
             InterruptedRunError: a signal asked for a stop; running units were finished.
+            InputError: the camera files are gone.
             StoreError: the store cannot be written.
         """
         self.n_keys = sum(len(unit.keys) for unit in units)
-        todo = self._ready(self.pending(units), needs)
+        todo = self._ready(self.pending(units, by_tiles=by_tiles), needs)
         for unit in todo:
             for key in unit.keys:
                 self.store.records.unmark(self.stage, self.fingerprint, key)
         marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
         fatal: list[BaseException] = []
-        total = len(self.selected(units))
+        total = len(self.selected(units) if by_tiles else units)
         with self.reporter.progress(self.stage, total, unit_name, total - len(todo)) as advance:
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
@@ -270,7 +277,9 @@ class StageContext:
         reason = str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
         self.failed[unit.key] = reason
         self.reporter.event("failed", stage=self.stage, unit=unit.key, reason=reason, trace=outcome.trace)
-        if (isinstance(error, StoreError) and is_fatal(error.__cause__ or error)) or is_fatal(error):
+        full = (isinstance(error, StoreError) and is_fatal(error.__cause__ or error)) or is_fatal(error)
+        # camera files that vanished or changed are gone for all units, too
+        if full or isinstance(error, InputError):
             fatal.append(error)
 
 

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
 from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
 from pchem_pipeline.frames.identity import digest_of
 from pchem_pipeline.frames.open import open_frames
@@ -143,10 +142,7 @@ def run(context: StageContext) -> None:
     _warn_of_a_small_disk(context, n_frames * ny * nx * reader.dtype.itemsize)
     task = functools.partial(_copy, store=context.store.path, reader=reader)
     units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
-    context.n_keys = len(units)
-    _all_tiles(context).run_units(units, task, unit_name="block")
-    if context.failed:
-        raise InputError(next(iter(context.failed.values())))
+    context.run_units(units, task, unit_name="block", by_tiles=False)
 
 
 def chunk_shape(shape: tuple[int, int, int], itemsize: int) -> tuple[int, int, int]:
@@ -174,11 +170,6 @@ def _copy(unit: CopyUnit, *, store: Path, reader: FrameReader) -> dict[str, Any]
     return {}
 
 
-def _all_tiles(context: StageContext) -> StageContext:
-    """Tiles and regions of the command line mean later stages; the input is taken as it is."""
-    return replace(context, options=replace(context.options, tiles=None, roi=None))
-
-
 def _inspect(context: StageContext) -> None:
     """Look at the input for mistakes, without reading it."""
     settings = context.config.input
@@ -204,8 +195,7 @@ def _nothing(unit: Any) -> dict[str, Any]:
 
 def _run_whole(context: StageContext) -> None:
     """Finish the stage where nothing is copied."""
-    context.n_keys = 1
-    _all_tiles(context).run_units([WHOLE], _nothing, unit_name="input")
+    context.run_units([WHOLE], _nothing, unit_name="input", by_tiles=False)
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

@@ -13,7 +13,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from zipfile import BadZipFile
@@ -111,10 +111,8 @@ def run(context: StageContext) -> None:
         workers=context.executor.workers,
         alone=len(_frame_units(files)) == 1,
     )
-    # tiles and regions mean the sensor that is read, not the one that is made: frames are made whole
-    whole = replace(context, options=replace(context.options, tiles=None, roi=None))
-    whole.run_units(units, task, unit_name="part")
-    context.n_keys = whole.n_keys
+    # frames are made whole: tiles and regions mean the sensor that is read
+    context.run_units(units, task, unit_name="part", by_tiles=False)
 
 
 def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int]) -> NDArray[Any]:
