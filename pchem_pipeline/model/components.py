@@ -173,7 +173,7 @@ def component_widths(pixels: PixelParameters, n_k: int) -> Components:
     serve all cases.
 
     Args:
-        pixels: the pixels; at least one with H > 0 if ``n_k > 1``.
+        pixels: the pixels; where all have H = 0 there is no component k > 0, and its moments are NaN.
         n_k: number of components, k = 0 .. n_k - 1.
 
     Returns:
@@ -190,7 +190,8 @@ def component_widths(pixels: PixelParameters, n_k: int) -> Components:
         log_exposure = np.log(exposure)
     for k in range(n_k):
         log_weight = (k * log_exposure if k else 0.0) - exposure
-        weight = np.exp(log_weight - log_weight.max())
+        largest = log_weight.max()
+        weight = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
         weighted = table @ weight / weight.sum()
         mean[k] = centres[0] + weighted[1] + k * (centres[1] + weighted[2])
         nuced[k] = weighted[6]

@@ -61,7 +61,7 @@ class EnsembleSettings(Section):
     )
     nuced_bin_width: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-3,
         description="bin width of the NUCed histogram, e-; null: median conversion gain times "
         "nuced_bin_steps, which keeps the number of DN per bin the same from bin to bin",
     )

@@ -25,12 +25,15 @@ def usable_pixels(
         read_noise_dn: sigma, DN.
 
     Returns:
-        True where all four are finite, H >= 0, g > 0 and sigma > 0.
+        True where all four are finite, H >= 0, g > 0 and sigma > 0, and where they are of a size that a pixel
+        can have: H up to 1e6 e-, 1e-6..1e3 e-/DN, |mu| up to 1e8 DN, read noise up to 1e3 e-.
     """
-    finite = np.isfinite(quanta_exposure) & np.isfinite(conversion_gain)
-    finite &= np.isfinite(bias) & np.isfinite(read_noise_dn)
-    with np.errstate(invalid="ignore"):
-        return finite & (quanta_exposure >= 0) & (conversion_gain > 0) & (read_noise_dn > 0)
+    with np.errstate(invalid="ignore", over="ignore"):  # comparisons with NaN are False
+        usable = (quanta_exposure >= 0) & (quanta_exposure <= 1e6)
+        usable &= (conversion_gain >= 1e-6) & (conversion_gain <= 1e3)
+        usable &= (np.abs(bias) <= 1e8) & (read_noise_dn > 0)
+        usable &= conversion_gain * read_noise_dn <= 1e3
+    return np.asarray(usable)
 
 
 @dataclass(frozen=True)

@@ -161,7 +161,7 @@ def error_rates(
 
     What one should expect follows from the fitted parameters alone (``expected_error_rate``) or, better, from
     data of the true parameters cut at the thresholds of the fitted ones; the least possible rate has the
-    thresholds of the true parameters.
+    thresholds of the true parameters. Frames that the fit has seen err slightly less than new ones.
 
     Args:
         totals: the sums over all tiles.

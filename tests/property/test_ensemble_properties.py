@@ -9,22 +9,49 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pchem_pipeline.model.electrons import electron_numbers, thresholds
-from pchem_pipeline.model.ensemble import DnAxis, ensemble_sums, merge_sums, merge_tallies, nuced_axis, tally
+from pchem_pipeline.model.ensemble import DnAxis, nuced_axis
 from pchem_pipeline.model.maps import display_transform
 from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.stages.ensemble_tile import EnsembleAxes, PixelHistograms, ensemble_tile
 
 RNG = np.random.default_rng(21)
 N = 40
-PIXELS = PixelParameters(
+MAPS = (
     RNG.lognormal(0.7, 0.5, N),
     0.1 * RNG.lognormal(0, 0.05, N),
     RNG.normal(100, 4, N),
     RNG.normal(3.2, 0.2, N),
 )
 DN = DnAxis(60, 240)
+AXES = EnsembleAxes(DN, nuced_axis(PixelParameters(*MAPS), DN), 12)
 COUNTS = RNG.poisson(2.0, size=(N, 60)).astype(np.uint16)
+OUTSIDE = RNG.poisson(0.3, size=N)
 ORIGIN = RNG.integers(80, 100, N)
-AXIS = nuced_axis(PIXELS, DN)
+WITH_GAPS = tuple(np.where(np.arange(N) == 11, np.nan, column) for column in MAPS)
+
+
+def sums_of(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+    part = slice(start, stop)
+    chosen = PixelHistograms(COUNTS[part] // 2, OUTSIDE[part] // 2)
+    everything = PixelHistograms(COUNTS[part], OUTSIDE[part])
+    maps = tuple(column[part] for column in WITH_GAPS)
+    return ensemble_tile(maps, ORIGIN[part], chosen, everything, AXES)
+
+
+@given(st.sets(st.integers(1, N - 1)))
+@settings(max_examples=30, deadline=None)
+def test_any_tiling_gives_the_same_ensemble(cuts: set[int]) -> None:
+    borders = [0, *sorted(cuts), N]
+    rows = [sums_of(a, b) for a, b in itertools.pairwise(borders)]
+    integers, floats = sums_of(0, N)
+    np.testing.assert_array_equal(sum(row[0] for row in rows), integers)
+    np.testing.assert_allclose(sum(row[1] for row in rows), floats, rtol=1e-12, atol=1e-18)
+    assert integers[AXES.integers["pixels"]] == N - 1
+    assert integers[AXES.integers["excluded"]] == 1
+    # every pixel counts the same, however many samples it has
+    inside, outside = (COUNTS // 2).sum(axis=1), OUTSIDE // 2
+    expected = np.delete(inside / (inside + outside), 11).sum()
+    np.testing.assert_allclose(floats[AXES.floats["share"]].sum(), expected, rtol=1e-12)
 
 
 @given(

@@ -84,6 +84,13 @@ def test_widths_survive_hot_pixels_and_many_electrons() -> None:
     assert result.mean[1400] == pytest.approx(110 + 1400 / 0.1)
 
 
+def test_no_electrons_means_one_component() -> None:
+    ones = np.ones(3)
+    result = component_widths(PixelParameters(0 * ones, 0.1 * ones, 100 * ones, 3 * ones), 2)
+    assert result.variance[0, 0] == pytest.approx(9.0)
+    assert np.isnan(result.mean[1])
+
+
 def test_moments_are_those_of_the_mixture() -> None:
     pixels = make_pixels(300)
     h, g, mu, sigma = pixels.columns()

@@ -167,3 +167,11 @@ def test_parameters_must_be_usable() -> None:
     np.testing.assert_array_equal(mask, [[True, False], [False, True]])
     assert len(pixels) == 2
     assert not usable_pixels(good, 0 * good, good, good).any()
+
+
+@pytest.mark.parametrize(("place", "value"), [(0, 1e9), (1, 1e-12), (1, 1e9), (2, -1e300), (3, 1e12)])
+def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
+    # a runaway fit must neither fill the memory nor overflow an index
+    columns = [np.array([v, v]) for v in (2.0, 0.1, 100.0, 3.0)]
+    columns[place][1] = value
+    np.testing.assert_array_equal(usable_pixels(*columns), [True, False])

@@ -1,0 +1,69 @@
+"""The compiled loops of the ensemble and the electron numbers against the same code, not compiled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.model import electrons_numba, ensemble_numba
+
+H = np.array([0.0, 0.7, 2.4])
+G = np.array([0.1, 0.12, 0.6])
+MU = np.array([20.0, 24.3, 21.8])
+SIGMA = np.array([2.8, 3.1, 0.6])
+SHARE = np.array([0.2, 0.5, 0.3])
+MASS = np.array([0.5, 0.3, 0.2])
+COUNTS = np.random.default_rng(1).poisson(1.5, size=(3, 40)).astype(np.uint16)
+ORIGIN = np.array([5, 10, 15])
+NUMBERS = np.array([[0, 3, 65535], [2, 2, 9]], dtype=np.uint16)
+TRUE = np.array([[0, 2, 1], [2, 5, 1]], dtype=np.uint32)
+
+ENSEMBLE: dict[str, tuple[Any, ...]] = {
+    "sum_pcd_cells": (SHARE, H, G, MU, SIGMA, 3, np.zeros(90)),
+    "sum_nuced_cells": (SHARE, H, G * SIGMA, 0.1, -8, np.zeros(80)),
+    "sum_nuced_product": (MASS, SHARE, G * SIGMA, 0.1, -8, np.zeros(80)),
+    "sum_poisson": (SHARE, H, np.zeros(12)),
+    "tally_counts": (
+        COUNTS,
+        ORIGIN,
+        G,
+        MU,
+        12,
+        np.zeros(30, dtype=np.int64),
+        0.1,
+        -8,
+        np.zeros(50, dtype=np.int64),
+        np.zeros((3, 2)),
+    ),
+}
+ELECTRONS: dict[str, tuple[Any, ...]] = {
+    "tally_electrons": (COUNTS, ORIGIN, H, G, MU, SIGMA, np.zeros(5, dtype=np.int64)),
+    "count_errors": (NUMBERS, TRUE, 65535, np.zeros(4, dtype=np.int64)),
+    "sum_cell_probabilities": (H, G, MU, SIGMA, H, G * 1.01, MU, SIGMA, np.zeros(6), np.zeros(3)),
+}
+
+
+@pytest.mark.parametrize(
+    ("kernel", "arguments"),
+    [
+        *((getattr(ensemble_numba, name), arguments) for name, arguments in ENSEMBLE.items()),
+        *((getattr(electrons_numba, name), arguments) for name, arguments in ELECTRONS.items()),
+    ],
+    ids=[*ENSEMBLE, *ELECTRONS],
+)
+def test_compiled_and_plain_agree(kernel: Any, arguments: tuple[Any, ...]) -> None:
+    results = []
+    for function in (kernel, kernel.py_func):
+        copies = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
+        returned = function(*copies)
+        outputs = [c for c, a in zip(copies, arguments, strict=True) if isinstance(a, np.ndarray)]
+        results.append((returned, outputs))
+        # something was written, and nothing but the outputs
+        changed = [not np.array_equal(c, a) for c, a in zip(copies, arguments, strict=True)]
+        assert any(changed)
+        assert not any(c and np.any(a) for c, a in zip(changed, arguments, strict=True))
+    assert results[0][0] == results[1][0]
+    for compiled, plain in zip(results[0][1], results[1][1], strict=True):
+        np.testing.assert_allclose(compiled, plain, rtol=1e-13, atol=1e-18)
