@@ -129,6 +129,14 @@ class ReportData:
         """Tell whether this is a line of so few channels that a histogram over them says nothing."""
         return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
+    @property
+    def unfitted(self) -> NDArray[np.bool_]:
+        """Pixels that no fit has reached yet: neither a value nor a reason; shape ``shape``."""
+        status, gain = self.fit.get("fit_status"), self.maps.get("conversion_gain")
+        if status is None or gain is None:
+            return np.zeros(self.shape, dtype=bool)
+        return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
+
     def has_values(self, name: str) -> bool:
         """Tell whether a map exists and at least one pixel has a value in it."""
         return name in self.maps and bool(np.isfinite(self.maps[name]).any())

@@ -276,7 +276,7 @@ def _status(data: ReportData, _: ReportSettings) -> list[Exhibit]:
     if status is None:
         return []
     rows = map_figures.status_counts(status, data.status_words)
-    parts = [f"{count(int((status == 0).sum()), data.noun)} with a good fit"]
+    parts = [f"{count(int(((status == 0) & ~data.unfitted).sum()), data.noun)} with a good fit"]
     parts += [f"{count(n, data.noun)}: {text}" for _, text, n in rows]
     return [
         Exhibit(
@@ -285,7 +285,7 @@ def _status(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Fit status of the pixels",
             CAPTIONS["fit_status"],
             "Map of the fit status. " + "; ".join(parts) + ".",
-            _at(map_figures.fit_status_map, status, data.status_words),
+            _at(map_figures.fit_status_map, status, data.status_words, unfitted=data.unfitted),
             raster=not map_figures.is_strip(status.shape),
         )
     ]

@@ -248,7 +248,11 @@ def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tu
 
 @styled
 def fit_status_map(
-    fit_status: NDArray[Any], words: Mapping[int, str], *, width_mm: float = COLUMN_MM
+    fit_status: NDArray[Any],
+    words: Mapping[int, str],
+    *,
+    unfitted: NDArray[np.bool_] | None = None,
+    width_mm: float = COLUMN_MM,
 ) -> Figure:
     """Draw where fits failed or deserve caution, with a legend of sentences.
 
@@ -257,17 +261,22 @@ def fit_status_map(
     Args:
         fit_status: status words (y, x).
         words: bit to sentence, gravest first.
+        unfitted: pixels that no fit has reached yet (y, x).
         width_mm: width of the figure.
     """
     status = np.asarray(fit_status).astype(np.int64)
     rows = status_counts(status, words)
-    colour = np.zeros(status.shape, dtype=np.int64)
+    missing = np.zeros(status.shape, dtype=bool) if unfitted is None else unfitted
+    last = len(_STATUS_COLOURS) + 1
+    colour = np.where(missing & (status == 0), last, 0)
     for index in range(len(rows), 0, -1):
-        colour[(status & rows[index - 1][0]) != 0] = min(index, len(_STATUS_COLOURS))
-    palette = ["#EDEDED", *_STATUS_COLOURS]
-    legend = [(palette[0], f"good fit: {_share(int((status == 0).sum()), status.size)}")]
+        colour[(status & rows[index - 1][0]) != 0] = min(index, last - 1)
+    palette = ["#EDEDED", *_STATUS_COLOURS, "#8C8C8C"]
+    legend = [(palette[0], f"good fit: {_share(int((colour == 0).sum()), status.size)}")]
+    if missing.any():
+        legend.append((palette[last], f"not fitted yet: {_share(int(missing.sum()), status.size)}"))
     legend += [
-        (palette[min(i + 1, len(_STATUS_COLOURS))], f"{text}: {_share(n, status.size)}")
+        (palette[min(i + 1, last - 1)], f"{text}: {_share(n, status.size)}")
         for i, (_, text, n) in enumerate(rows)
     ]
     legend = [(colour_, plain(textwrap.fill(text, int(width_mm * 0.62)))) for colour_, text in legend]

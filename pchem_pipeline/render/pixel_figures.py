@@ -159,7 +159,8 @@ def pixel_fits(pixels: Sequence[PixelFit], *, width_mm: float = PAGE_MM) -> Figu
     """
     columns = 2 if width_mm > 1.5 * COLUMN_MM and len(pixels) > 1 else 1
     rows = max(1, -(-len(pixels) // columns))
-    figure = new_figure(width_mm, 72.0 * rows)
+    lines = max((_title(pixel, "a", width_mm / columns).count("\n") for pixel in pixels), default=0)
+    figure = new_figure(width_mm, (62.0 + 3.5 * lines) * rows)
     if not pixels:
         return _empty(figure, figure.add_subplot(), "no pixel to show")
     parts = figure.subfigures(rows, columns, squeeze=False)
@@ -234,7 +235,7 @@ def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
         fits = all(len(pair) - 12 < 0.62 * width_mm for pair in pairs)
         lines += pairs if fits else words
     if pixel.status:
-        lines += textwrap.wrap(f"status: {plain(pixel.status)}", max(20, int(width_mm * 0.72)))[:2]
+        lines += textwrap.wrap(f"status: {plain(pixel.status)}", max(20, int(width_mm * 0.6)))[:2]
     return "\n".join(lines)
 
 

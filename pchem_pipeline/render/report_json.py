@@ -92,6 +92,7 @@ def _fit_status(data: ReportData) -> dict[str, Any]:
         "n_good": pixels.fitted - pixels.caution,
         "n_caution": pixels.caution,
         "n_failed": pixels.failed,
+        "n_unfitted": int(data.unfitted.sum()),
         "reasons": {
             bit.name.lower(): {
                 "pixels": reasons.get(bit.name.lower(), 0),

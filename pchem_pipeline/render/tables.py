@@ -266,8 +266,11 @@ def _status(data: ReportData) -> Table:
     if status is None:
         return Table("failures", "", "", (), ())
     total = status.size
-    good = int((status == 0).sum())
+    unfitted = int(data.unfitted.sum())
+    good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
     rows: list[tuple[str, ...]] = [("good fit", f"{good:,}", percent(good, total), "yes")]
+    if unfitted:
+        rows.append(("not fitted yet", f"{unfitted:,}", percent(unfitted, total), "no"))
     for bit, text, n in status_counts(status, data.status_words):
         rows.append(
             (text, f"{n:,}", percent(n, total), "no" if bit & data.failed_mask else "yes, with caution")

@@ -77,7 +77,7 @@ def pixel_counts(data: ReportData) -> PixelCounts:
     if status is None:
         total = int(np.prod(data.shape))
         return PixelCounts(total, total, 0)
-    failed = (status & data.failed_mask) != 0
+    failed = ((status & data.failed_mask) != 0) | data.unfitted
     return PixelCounts(int(status.size), int(failed.sum()), int(((status != 0) & ~failed).sum()))
 
 
@@ -131,7 +131,10 @@ def sentence(data: ReportData) -> str:
             summary = summarise(data.maps[name])
             parts.append(f"{lead} {measured(summary.median, summary.median_stderr, symbol(name)[2])}")
     frames = f" from {count(data.n_frames, 'frame')}" if data.n_frames else ""
-    text = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} were fitted{frames}. "
+    share = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} were"
+    if pixels.failed == 0 and pixels.total > 1:
+        share = f"All {count(pixels.total, data.noun)} were"
+    text = f"{share} fitted{frames}. "
     text += f"Medians over the {data.noun}s: " + ", ".join(parts) + "."
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     if "epcd_exact" in rmse and rmse.get("noise_floor"):
@@ -144,7 +147,14 @@ def sentence(data: ReportData) -> str:
 
 def flags(data: ReportData) -> list[Flag]:
     """Return what speaks for and against the results, the gravest first."""
-    found = [*_failed_pixels(data), *_cautions(data), *_goodness(data), *_agreement(data), *_conditions(data)]
+    found = [
+        *_failed_pixels(data),
+        *_unfitted(data),
+        *_cautions(data),
+        *_goodness(data),
+        *_agreement(data),
+        *_conditions(data),
+    ]
     order = ("serious", "caution", "note", "good")
     return sorted(found, key=lambda flag: order.index(flag.level))
 
@@ -159,6 +169,13 @@ def _failed_pixels(data: ReportData) -> list[Flag]:
     if pixels.failed:
         return [Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}.")]
     return [Flag("good", f"Every {data.noun} has a value.")]
+
+
+def _unfitted(data: ReportData) -> list[Flag]:
+    missing = int(data.unfitted.sum())
+    if not missing:
+        return []
+    return [Flag("serious", f"{count(missing, data.noun)} not fitted yet; continue the run.")]
 
 
 def _cautions(data: ReportData) -> list[Flag]:

@@ -1,0 +1,205 @@
+"""The stage report on a small simulated run whose fit is its truth."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.model.fit_status import FitStatus
+from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
+from pchem_pipeline.render.report import RenderedReport
+from pchem_pipeline.render.report_json import report_numbers
+from pchem_pipeline.render.verdict import flags
+from pchem_pipeline.stages import report
+from pchem_pipeline.stages.base import StageContext
+from pchem_pipeline.stages.interrupt import StopRequest
+from pchem_pipeline.stages.pipeline import execute, status
+from pchem_pipeline.stages.report import choose_pixels, gather
+from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.store.records import StageRecord
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.variables import PARAMETERS
+
+NY, NX, FRAMES = 16, 24, 200
+
+
+def make_context(folder: Path, settings: dict[str, object] | None = None, **run: object) -> StageContext:
+    config = RunConfig.model_validate(
+        {
+            "run": {"tile": 8, **run},
+            "simulate": {"shape": [NY, NX], "n_frames": FRAMES, "format": "npy"},
+            "report": {"figure_formats": [], "dpi": 72, **(settings or {})},
+        }
+    )
+    store, reporter = RunStore.create(folder / "run.zarr"), Reporter("off", quiet=True)
+    return StageContext(config, folder, store, SerialExecutor(), reporter, StopRequest())
+
+
+def write_fit(context: StageContext, status_map: np.ndarray, lost: np.ndarray) -> None:
+    """What the stage fit leaves behind."""
+    store = context.store
+    for name in PARAMETERS:
+        values = np.where(lost, np.nan, store.read(f"truth/{name}"))
+        store.write_array(f"fit/{name}", values)
+        store.write_array(f"fit/{name}_stderr", 0.01 * np.abs(values))
+    diagonal = [store.read(f"fit/{name}_stderr") ** 2 for name in PARAMETERS]
+    store.write_array("fit/covariance", np.stack(diagonal, axis=-1)[..., None] * np.eye(4))
+    store.write_array("fit/fit_status", status_map)
+    store.write_array("fit/goodness_p", np.where(lost, np.nan, 0.5))
+    store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
+    for tile in context.tiles():
+        store.records.mark("fit", "truth", tile.key, {})
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run up to the ensemble; 3 pixels failed."""
+    folder = tmp_path_factory.mktemp("base")
+    context = make_context(folder)
+    for name in ("simulate", "ingest", "histogram"):
+        assert execute(name, context).state == "complete"
+    status_map = np.zeros((NY, NX), dtype=np.uint16)
+    status_map[2, :3] = int(FitStatus.TOO_FEW_BINS)
+    status_map[5, 5] = int(FitStatus.POOR_FIT)
+    write_fit(context, status_map, status_map == int(FitStatus.TOO_FEW_BINS))
+    for name in ("maps", "ensemble"):
+        assert execute(name, context).state == "complete"
+    return folder
+
+
+@pytest.fixture
+def folder(base: Path, tmp_path: Path) -> Path:
+    shutil.copytree(base, tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write without drawing: fast."""
+    monkeypatch.setattr(
+        report, "report_tile", lambda data, settings: RenderedReport("page", "{}", {"new.svg": b"x"})
+    )
+
+
+def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
+    context = make_context(folder, {"figure_formats": ["svg"]}, title="My <sensor>")
+    assert execute("report", context).state == "complete"
+    store = folder / "run.zarr"
+    assert {path.name for path in (store / "figures").iterdir()} == {f"{name}.svg" for name in EXHIBIT_NAMES}
+    numbers = json.loads((store / "report.json").read_text())
+    median = float(np.nanmedian(context.store.read("maps/read_noise_e")))
+    assert numbers["summary"]["read_noise_e"]["median"] == pytest.approx(median)
+    assert numbers["ensemble"]["rmse"] == pytest.approx(context.store.attributes("ensemble")["rmse"])
+    assert numbers["fit_status"]["n_failed"] == 3
+    assert numbers["fit_status"]["reasons"]["poor_fit"]["pixels"] == 1
+    assert [row["stage"] for row in numbers["stages"]] == [
+        "simulate",
+        "ingest",
+        "histogram",
+        "fit",
+        "maps",
+        "ensemble",
+    ]
+    assert numbers["inputs"][0]["name"].endswith(".npy")
+    assert len(numbers["moments"]) >= 4
+    html = (store / "report.html").read_text(encoding="utf-8")
+    assert "My &lt;sensor&gt;" in html
+    assert "/work" not in html
+    assert str(folder) not in html
+    assert status(report, context).state == "complete"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_settings_of_the_report_make_only_it_stale(folder: Path) -> None:
+    execute("report", make_context(folder))
+    changed = make_context(folder, {"map_stretch": "linear"})
+    state = status(report, changed)
+    assert state.state == "stale"
+    assert "report.map_stretch beta -> linear" in state.why
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_figures_that_are_no_longer_made_are_removed_and_others_kept(folder: Path) -> None:
+    figures = folder / "run.zarr" / "figures"
+    figures.mkdir()
+    (figures / "ensemble.png").write_bytes(b"old")
+    (figures / "mine.png").write_bytes(b"mine")
+    execute("report", make_context(folder))
+    assert {path.name for path in figures.iterdir()} == {"mine.png", "new.svg"}
+
+
+def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
+    context = make_context(folder, {"pixels": [[2, 1], [15, 23]]})
+    data = gather(context.store, context.config, 4.87, [])
+    assert [(pixel.y, pixel.x) for pixel in data.pixels] == [(2, 1), (15, 23)]
+    assert data.pixels[0].status == "fewer than 3 occupied bins"
+    assert data.pixels[1].counts.sum() == FRAMES
+    with pytest.raises(ConfigError, match="y = 16, x = 0 lies outside the sensor of 16 x 24"):
+        execute("report", make_context(folder, {"pixels": [[16, 0]]}))
+
+
+def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
+    context = make_context(folder)
+    pixel = gather(context.store, context.config, None, []).pixels[0]
+    frames = np.load(next(folder.rglob("*.npy")))[:, pixel.y, pixel.x]
+    shown = np.repeat(pixel.origin + np.arange(pixel.counts.size), pixel.counts)
+    np.testing.assert_array_equal(shown, np.sort(frames))
+
+
+def test_what_a_run_lacks_is_said(folder: Path) -> None:
+    context = make_context(folder)
+    context.store.delete("ensemble")
+    for name in ("maps/dark_current", "maps/dark_current_stderr"):
+        context.store.delete(name)
+    data = gather(context.store, context.config, None, [])
+    assert set(data.missing) == {"dark_current", "ensemble", "nuced", "electrons", "components"}
+    assert "input.integration_time" in data.missing["dark_current"]
+
+
+def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
+    context = make_context(folder)
+    for name in ("maps/conversion_gain", "maps/read_noise_e"):
+        values = context.store.read(name)
+        values[8:, :8] = np.nan
+        context.store.write_array(name, values)
+    data = gather(context.store, context.config, None, [])
+    assert data.unfitted.sum() == 64
+    assert any("64 pixels not fitted yet" in flag.text for flag in flags(data))
+    counted = report_numbers(data)["fit_status"]
+    assert (counted["n_unfitted"], counted["n_failed"]) == (64, 3 + 64)
+
+
+def test_the_task_can_go_to_another_process(folder: Path) -> None:
+    context = make_context(folder)
+    task = partial(report._write, context.store.path, context.config, 4.87, report._stage_rows(context))
+    assert pickle.loads(pickle.dumps(task)).func is report._write
+
+
+def test_four_pixels_lie_in_the_corners_of_noise_and_exposure() -> None:
+    rng = np.random.default_rng(1)
+    noise, exposure = rng.random((40, 50)), rng.random((40, 50))
+    fit_status = np.zeros((40, 50), dtype=np.uint16)
+    fit_status[:20] = int(FitStatus.POOR_FIT)
+    chosen = choose_pixels(noise, exposure, fit_status)
+    assert len({(y, x) for _, y, x in chosen}) == 4
+    for label, y, x in chosen:
+        assert y >= 20
+        assert (noise[y, x] > 0.5) == label.startswith("high read noise")
+        assert (exposure[y, x] > 0.5) == label.endswith("high exposure")
+        assert 0.02 < abs(noise[y, x] - 0.5) < 0.48
+
+
+def test_few_or_no_pixels_to_choose_from() -> None:
+    nan, one = np.full((2, 2), np.nan), np.array([[0.3, np.nan], [0.2, np.nan]])
+    words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
+    assert choose_pixels(nan, nan, words) == [("no fit", 0, 0), ("no fit", 1, 0)]
+    assert {(y, x) for _, y, x in choose_pixels(one, one, np.zeros((2, 2), np.uint16))} == {(0, 0), (1, 0)}
