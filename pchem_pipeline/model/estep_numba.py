@@ -19,6 +19,18 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.workspace_numba import (
+    LOGLIK,
+    N_TOTAL,
+    SUM_E,
+    SUM_EE,
+    SUM_K,
+    SUM_KE,
+    SUM_KK,
+    Histogram,
+    Workspace,
+)
+
 # Sums may be reassociated, so that they run in vector registers: the order is then fixed by the compiler, the
 # same for every pixel and every batch. NaN and infinity keep their meaning.
 _REORDER = {"reassoc", "nsz", "contract", "arcp"}
@@ -30,9 +42,6 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 # Places in `sums`, the sums over one block of values; c count, d offset from the block's lowest component,
 # m1 and m2 posterior moments of i, v11 var(i), v12 cov(i, i^2), v22 var(i^2), i counted from that component
-# Places in `total`, what an evaluation leaves besides score and information
-LOGLIK, SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(6)
-N_TOTAL = 6
 
 
 def _block_kernel(width: int) -> Callable[..., Any]:
@@ -228,35 +237,20 @@ def _sum_block(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def evaluate(
-    weights: NDArray[np.float64],
-    cumulative: NDArray[np.float64],
-    n_bins: int,
-    first: float,
-    theta: NDArray[np.float64],
-    work: NDArray[np.float64],
-    total: NDArray[np.float64],
-    score: NDArray[np.float64],
-    information: NDArray[np.float64],
-    frames: float,
-) -> float:
+def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace, frames: float) -> float:
     """Evaluate log-likelihood, E-step sums, score and observed information of one pixel.
 
     Args:
-        weights: counts of successive DN, at least ``n_bins`` long.
-        cumulative: ``cumulative[i]`` is the sum of the first i weights.
-        n_bins: number of DN in use.
-        first: first DN minus the centre.
+        histogram: of the pixel.
         theta: (log H, a, m, log sigma^2).
-        work: scratch, shape (at least 4, at least n_bins + 1 and 16).
-        total: out, log-likelihood and the sums over frames of E[k], E[k^2], E[k e], E[e], E[e^2].
-        score: out, gradient of the log-likelihood in theta.
-        information: out, observed information in theta.
-        frames: leave the counts of each DN expected in so many frames in ``work[0]``; nothing if 0.
+        space: scratch; out: sums, score and information.
+        frames: leave the counts of each DN expected in so many frames in ``space.rows[0]``; nothing if 0.
 
     Returns:
         The log-likelihood, nats.
     """
+    weights, cumulative, n_bins, first, _, _, _ = histogram
+    work, total, score, information = space
     exposure, a, origin, s2 = math.exp(theta[0]), theta[1], theta[2], math.exp(theta[3])
     densities, powers, prior = work[0], work[1], work[2]
     j = max(0, int(math.floor((first - origin) / a + 0.5)))

@@ -66,19 +66,19 @@ def fit_histograms(
     counts = np.ascontiguousarray(counts)
     n = counts.shape[0]
     parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
-    out, words = np.full((n, pchem_numba.N_OUT), np.nan), np.zeros((n, 5), np.int64)
+    out, words = np.full((n, pchem_numba.N_OUT), np.nan), np.zeros((n, pchem_numba.N_WORDS), np.int64)
     pchem_numba.fit_tile(
         counts, np.asarray(origin, np.int64), regression_basis(), _limits(settings), parameters, covariance, out, words
     )
-    dof = words[:, 2]
+    dof = words[:, pchem_numba.FREEDOM]
     probability = chdtrc(np.where(dof > 0, dof, np.nan), out[:, pchem_numba.CHI2])
-    status = words[:, 0]
+    status = words[:, pchem_numba.STATUS]
     status[probability < settings.goodness_limit] |= FitStatus.POOR_FIT
     for outside in (under, over):
         if outside is not None:
             status[np.asarray(outside) > 0] |= FitStatus.OUTSIDE_WINDOW
     if adc_limits is not None:
-        status[(words[:, 3] <= adc_limits[0]) | (words[:, 4] >= adc_limits[1])] |= FitStatus.ADC_LIMIT
+        status[(words[:, pchem_numba.LOWEST_DN] <= adc_limits[0]) | (words[:, pchem_numba.HIGHEST_DN] >= adc_limits[1])] |= FitStatus.ADC_LIMIT
     failed = (status & FAILED) != 0
     parameters[failed] = np.nan
     covariance[failed] = np.nan
@@ -91,7 +91,7 @@ def fit_histograms(
         log_likelihood=out[:, pchem_numba.LOG_LIKELIHOOD].copy(),
         likelihood_gap=out[:, pchem_numba.GAP].copy(),
         fit_status=status.astype(np.uint16),
-        n_iterations=words[:, 1].astype(np.int32),
+        n_iterations=words[:, pchem_numba.EVALUATIONS].astype(np.int32),
         goodness_chi2=out[:, pchem_numba.CHI2].copy(),
         goodness_dof=dof.astype(np.int32),
         goodness_p=probability,

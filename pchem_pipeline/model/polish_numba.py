@@ -1,6 +1,6 @@
 """From a starting point to the nearest maximum of the likelihood: EM steps and a safeguarded Newton finish.
 
-Parameters, weights and scratch as in :mod:`pchem_pipeline.model.estep_numba`.
+Parameters ``theta`` as in :mod:`pchem_pipeline.model.estep_numba`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,20 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.estep_numba import N_TOTAL, SUM_E, SUM_EE, SUM_K, SUM_KE, SUM_KK, evaluate
+from pchem_pipeline.model.estep_numba import evaluate
 from pchem_pipeline.model.fisher_numba import back_substitute, cholesky
+from pchem_pipeline.model.workspace_numba import (
+    SUM_E,
+    SUM_EE,
+    SUM_K,
+    SUM_KE,
+    SUM_KK,
+    Histogram,
+    Workspace,
+    copy,
+    copy_answers,
+    make_workspace,
+)
 
 # outcomes of `polish`
 CONVERGED = 0
@@ -22,7 +34,7 @@ FAR_BELOW = 3  # given up: too far below the likelihood to beat
 
 # places in `limits`
 MIN_LOG_EXPOSURE, MAX_STEP, TOLERANCE, WARM_UP, MAX_EVALUATIONS, ONLY_EM = range(6)
-N_LIMITS = 6
+N_POLISH_LIMITS = 6
 
 MIN_LOG_VARIANCE = math.log(1.0 / 12.0)  # rounding alone
 MIN_ELECTRON_NOISE = 0.03  # below it the polynomials of the E-step overflow
@@ -31,13 +43,6 @@ _MIN_STEP = 1.2  # DN per electron: a comb with a tooth at each DN would fit any
 MAX_LOG_EXPOSURE = math.log(1e5)
 _LEAST_SHARE = 1e-5  # of the complete-data information in a damped step
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken
-
-
-@nb.njit(nogil=True, cache=True, error_model="numpy")
-def copy(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
-    """Copy a vector; a plain loop, since slice assignment compiles slowly."""
-    for i in range(source.size):
-        target[i] = source[i]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -92,9 +97,7 @@ def add_complete(
 def newton_step(
     n: float,
     theta: NDArray[np.float64],
-    total: NDArray[np.float64],
-    score: NDArray[np.float64],
-    information: NDArray[np.float64],
+    space: Workspace,
     bound: float,
     share: float,
     step: NDArray[np.float64],
@@ -108,6 +111,7 @@ def newton_step(
         Half the squared Newton decrement, the expected rise of the log-likelihood, and the share used. Only
         with a share of 0 does the former say how far the maximum is.
     """
+    _, total, score, information = space
     held = np.zeros(4, np.bool_)
     held[0] = theta[0] <= bound + 1e-12 and score[0] <= 0.0
     held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-12 and score[3] <= 0.0
@@ -160,56 +164,44 @@ def same_maximum(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def polish(
-    weights: NDArray[np.float64],
-    cumulative: NDArray[np.float64],
-    n_bins: int,
-    first: float,
+    histogram: Histogram,
     theta: NDArray[np.float64],
     limits: NDArray[np.float64],
     to_beat: float,
     known: NDArray[np.float64],
     known_loglik: float,
-    work: NDArray[np.float64],
-    total: NDArray[np.float64],
-    score: NDArray[np.float64],
-    information: NDArray[np.float64],
+    space: Workspace,
 ) -> tuple[int, float, int]:
     """Climb to the maximum near ``theta``, which is updated in place.
 
     Args:
-        weights: counts of successive DN.
-        cumulative: running sums of the weights, one longer.
-        n_bins: number of DN in use.
-        first: first DN minus the centre.
+        histogram: of the pixel.
         theta: start; out: the maximum.
         limits: bounds and limits, see the names at the top of this module.
         to_beat: give up once the log-likelihood cannot rise to this value, judged by twice the expected rise.
         known: a maximum known already; the climb ends where it heads for that one.
         known_loglik: its log-likelihood; infinite where there is none, as for the climb from a start, which alone
             warms up by EM steps, or takes nothing else where the limits say so.
-        work: scratch of `evaluate`.
-        total: scratch.
-        score: scratch.
-        information: scratch.
+        space: scratch.
 
     Returns:
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
         that is trusted), number of evaluations.
     """
     bound, tolerance = limits[MIN_LOG_EXPOSURE], limits[TOLERANCE]
-    n = cumulative[n_bins]
+    n = histogram.n
     trial, step = np.empty(4), np.empty(4)
-    new_total, new_score, new_information = np.empty(N_TOTAL), np.empty(4), np.empty((4, 4))
+    ahead = make_workspace(space.rows)
     theta[0] = max(bound, theta[0])
     theta[3] = max(min_log_variance(theta[1]), theta[3])
     if degenerate(theta, limits[MAX_STEP]):
         return DEGENERATE, -math.inf, 0
-    loglik = evaluate(weights, cumulative, n_bins, first, theta, work, total, score, information, 0.0)
+    loglik = evaluate(histogram, theta, space, 0.0)
     used, damping = 1, 0.0
     warm_up = limits[WARM_UP] if known_loglik == math.inf else 0.0
     only_em = limits[ONLY_EM] > 0.0 and known_loglik == math.inf
     while used < limits[MAX_EVALUATIONS]:
-        rise, share = newton_step(n, theta, total, score, information, bound, damping, step)
+        rise, share = newton_step(n, theta, space, bound, damping, step)
         if share == 0.0 and rise < tolerance:
             if not only_em:
                 _bounded(theta, step, bound, theta)
@@ -223,13 +215,11 @@ def polish(
         factor = 1.0
         if newton:
             factor = _bounded(theta, step, bound, trial)
-        elif not em_step(n, theta, total, bound, trial):
+        elif not em_step(n, theta, space.total, bound, trial):
             return NOT_CONVERGED, loglik, used
         if degenerate(trial, limits[MAX_STEP]):
             return DEGENERATE, loglik, used
-        risen = evaluate(
-            weights, cumulative, n_bins, first, trial, work, new_total, new_score, new_information, 0.0
-        )
+        risen = evaluate(histogram, trial, ahead, 0.0)
         used += 1
         expected = (2.0 * factor - factor * factor) * rise
         if newton and not risen >= loglik - 1e-11 * abs(loglik):
@@ -244,9 +234,6 @@ def polish(
         else:
             damping = share
         copy(trial, theta)
-        copy(new_total, total)
-        copy(new_score, score)
-        for i in range(4):
-            copy(new_information[i], information[i])
+        copy_answers(ahead, space)
         loglik = risen
     return NOT_CONVERGED, loglik, used

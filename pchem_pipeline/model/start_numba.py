@@ -13,6 +13,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.workspace_numba import Histogram
+
 _REORDER = {"reassoc", "nsz", "contract", "arcp"}
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a lobe
@@ -36,9 +38,7 @@ def regression_basis() -> NDArray[np.float64]:
 
 @nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
 def ecf(
-    weights: NDArray[np.float64],
-    n_bins: int,
-    first: float,
+    histogram: Histogram,
     step: float,
     n_frequencies: int,
     work: NDArray[np.float64],
@@ -47,6 +47,7 @@ def ecf(
 
     ``work`` has six rows; successive DN differ by a rotation, so no sine is taken per DN.
     """
+    weights, first = histogram.weights, histogram.first
     real, imag, cosine, sine = work[0], work[1], work[2], work[3]
     turn_c, turn_s = work[4], work[5]
     for m in range(n_frequencies):
@@ -57,7 +58,7 @@ def ecf(
         sine[m] = math.sin(angle * first)
         real[m] = 0.0
         imag[m] = 0.0
-    for i in range(n_bins):
+    for i in range(histogram.n_bins):
         c = weights[i]
         for m in range(n_frequencies):
             co = cosine[m]
@@ -69,13 +70,14 @@ def ecf(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def ecf_at(weights: NDArray[np.float64], n_bins: int, first: float, frequency: float) -> tuple[float, float]:
+def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
+    weights = histogram.weights
     angle = _TWO_PI * frequency
-    co, si = math.cos(angle * first), math.sin(angle * first)
+    co, si = math.cos(angle * histogram.first), math.sin(angle * histogram.first)
     turn_c, turn_s = math.cos(angle), math.sin(angle)
     real = imag = 0.0
-    for i in range(n_bins):
+    for i in range(histogram.n_bins):
         real += weights[i] * co
         imag += weights[i] * si
         co, si = co * turn_c - si * turn_s, co * turn_s + si * turn_c
@@ -127,12 +129,7 @@ def _regress(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def assemble(
-    weights: NDArray[np.float64],
-    n_bins: int,
-    first: float,
-    n: float,
-    mean: float,
-    variance: float,
+    histogram: Histogram,
     a: float,
     exposure: float,
     theta: NDArray[np.float64],
@@ -144,7 +141,8 @@ def assemble(
     """
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
-    modulus, phase = ecf_at(weights, n_bins, first, 1.0 / a)
+    _, _, _, _, n, mean, variance = histogram
+    modulus, phase = ecf_at(histogram, 1.0 / a)
     modulus /= n
     s2 = max(variance - exposure * a * a, 0.16 * a * a)
     bias = mean - exposure * a
@@ -171,12 +169,7 @@ def assemble(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def start_regression(
-    weights: NDArray[np.float64],
-    n_bins: int,
-    first: float,
-    n: float,
-    mean: float,
-    variance: float,
+    histogram: Histogram,
     basis: NDArray[np.float64],
     work: NDArray[np.float64],
     theta: NDArray[np.float64],
@@ -186,9 +179,10 @@ def start_regression(
     Returns:
         Whether there is a start, and whether the side lobe at its frequency stands clear of the noise.
     """
+    n, variance = histogram.n, histogram.variance
     sd = math.sqrt(variance)
     n_used = min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP))
-    ecf(weights, n_bins, first, FREQUENCY_STEP / sd, n_used, work)
+    ecf(histogram, FREQUENCY_STEP / sd, n_used, work)
     weight, quadratic, target = work[6, :n_used], work[7, :n_used], work[8, :n_used]
     floor = 9.0 / n
     for m in range(n_used):
@@ -204,23 +198,19 @@ def start_regression(
     lobe, exposure = _regress(basis, weight, quadratic, target)
     if lobe <= 0.0:
         return False, False
-    return assemble(weights, n_bins, first, n, mean, variance, sd / lobe, exposure, theta)
+    return assemble(histogram, sd / lobe, exposure, theta)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def start_peak(
-    weights: NDArray[np.float64],
-    n_bins: int,
-    first: float,
-    n: float,
-    mean: float,
-    variance: float,
+    histogram: Histogram,
     work: NDArray[np.float64],
     theta: NDArray[np.float64],
 ) -> bool:
     """Start from the highest side lobe of the ECF; False where none stands out of the noise."""
+    n, variance = histogram.n, histogram.variance
     sd = math.sqrt(variance)
-    ecf(weights, n_bins, first, FREQUENCY_STEP / sd, N_FREQUENCIES_WIDE, work)
+    ecf(histogram, FREQUENCY_STEP / sd, N_FREQUENCIES_WIDE, work)
     modulus = work[6]
     for m in range(N_FREQUENCIES_WIDE):
         modulus[m] = math.hypot(work[0, m], work[1, m]) / n
@@ -237,20 +227,16 @@ def start_peak(
     a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
     electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
     exposure = max(0.05, variance / (a * a) - electron_noise)
-    return assemble(weights, n_bins, first, n, mean, variance, a, exposure, theta)[0]
+    return assemble(histogram, a, exposure, theta)[0]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def start_cumulants(
-    weights: NDArray[np.float64],
-    n_bins: int,
-    first: float,
-    n: float,
-    mean: float,
-    variance: float,
+    histogram: Histogram,
     theta: NDArray[np.float64],
 ) -> bool:
     """Start from the third and fourth cumulants, ``a = k4/k3`` and ``H = k3/a^3``; good below H = 1."""
+    weights, _, n_bins, first, n, mean, variance = histogram
     third = fourth = 0.0
     for i in range(n_bins):
         d = first + i - mean

@@ -1,0 +1,105 @@
+"""Which starting point a pixel is given first, and the others that a suspicious pixel gets."""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.estep_numba import evaluate
+from pchem_pipeline.model.start_numba import assemble, start_cumulants, start_peak, start_regression
+from pchem_pipeline.model.workspace_numba import Histogram, Workspace, copy
+
+N_OTHERS = 5
+
+_MIN_STEP = 1.2  # DN per electron
+_N_SCAN = 25  # steps of the scan over the gain, from a fifth of the sd to 2.5 sd
+_SCAN_NOISE = 0.1225  # e-^2
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def first_start(
+    histogram: Histogram, basis: NDArray[np.float64], space: Workspace, theta: NDArray[np.float64]
+) -> bool:
+    """Fill ``theta`` with the regression's start, or, if that sees no side lobe, the likeliest of three.
+
+    Args:
+        histogram: of the pixel.
+        basis: from `regression_basis`.
+        space: scratch.
+        theta: out, the start.
+
+    Returns:
+        Whether there is a start.
+    """
+    usable, clear = start_regression(histogram, basis, space.rows, theta)
+    if usable and clear:
+        return True
+    trial = np.empty(4)
+    best = -math.inf
+    if usable and theta[1] > _MIN_STEP:
+        best = evaluate(histogram, theta, space, 0.0)
+    for which in range(2):
+        if which == 0:
+            found = start_peak(histogram, space.rows, trial)
+        else:
+            found = start_cumulants(histogram, trial)
+        if found and trial[1] > _MIN_STEP:
+            loglik = evaluate(histogram, trial, space, 0.0)
+            if loglik > best:
+                best = loglik
+                copy(trial, theta)
+    return best > -math.inf
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _scan(histogram: Histogram, space: Workspace, theta: NDArray[np.float64]) -> bool:
+    """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
+    trial = np.empty(4)
+    best = -math.inf
+    for place in range(_N_SCAN):
+        a = math.sqrt(histogram.variance) * 0.2 * 12.5 ** (place / (_N_SCAN - 1.0))
+        exposure = histogram.variance / (a * a) - _SCAN_NOISE
+        if exposure > 0.0 and a > _MIN_STEP:
+            assemble(histogram, a, exposure, trial)
+            trial[3] = math.log(max(_SCAN_NOISE * a * a, 1.0 / 12.0))
+            loglik = evaluate(histogram, trial, space, 0.0)
+            if loglik > best:
+                best = loglik
+                copy(trial, theta)
+    return best > -math.inf
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def other_start(
+    which: int, histogram: Histogram, best: NDArray[np.float64], space: Workspace, theta: NDArray[np.float64]
+) -> bool:
+    """Fill ``theta`` with one of the `N_OTHERS` starts kept for suspicious pixels.
+
+    Args:
+        which: 0 side lobe, 1 cumulants, 2 scan over the gain, 3 and 4 half and twice the gain of the best.
+        histogram: of the pixel.
+        best: best maximum so far, theta; its step is 0 where there is none.
+        space: scratch.
+        theta: out, the start.
+
+    Returns:
+        Whether there is a start.
+    """
+    if which == 0:
+        return start_peak(histogram, space.rows, theta)
+    if which == 1:
+        return start_cumulants(histogram, theta)
+    if which == 2:
+        return _scan(histogram, space, theta)
+    if not best[1] > 0.0:
+        return False
+    scale = 2.0 if which == 3 else 0.5
+    exposure = math.exp(best[0]) / scale
+    theta[0] = math.log(exposure)
+    theta[1] = best[1] * scale
+    theta[2] = histogram.mean - exposure * theta[1]
+    theta[3] = math.log(max(histogram.variance - exposure * theta[1] ** 2, 0.09 * theta[1] ** 2))
+    return True

@@ -1,0 +1,120 @@
+"""What the loops of the fit hand to each other: one pixel's histogram, and room to work in."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+# places in `Workspace.total`, the sums that an evaluation leaves besides score and information
+LOGLIK, SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(6)
+N_TOTAL = 6
+N_ROWS = 9
+_MIN_COLUMNS = 160  # the frequencies of the starting points
+
+
+class Histogram(NamedTuple):
+    """One pixel's histogram without its empty ends, values counted from a centre near its mean.
+
+    Attributes:
+        weights: counts of successive DN, at least ``n_bins`` long.
+        cumulative: ``cumulative[i]`` is the sum of the first i weights.
+        n_bins: number of DN in use.
+        first: first DN minus the centre.
+        n: number of frames.
+        mean: mean minus the centre, DN.
+        variance: variance, DN^2.
+    """
+
+    weights: NDArray[np.float64]
+    cumulative: NDArray[np.float64]
+    n_bins: int
+    first: float
+    n: float
+    mean: float
+    variance: float
+
+
+class Workspace(NamedTuple):
+    """Scratch of an evaluation of the likelihood, and its answers.
+
+    Attributes:
+        rows: scratch, shape (N_ROWS, enough).
+        total: log-likelihood and the sums over frames of E[k], E[k^2], E[k e], E[e], E[e^2] with
+            ``e = x - mu - k/g``; the names above are their places.
+        score: gradient of the log-likelihood in theta, shape (4,).
+        information: observed information in theta, shape (4, 4).
+    """
+
+    rows: NDArray[np.float64]
+    total: NDArray[np.float64]
+    score: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+
+@nb.njit(nogil=True, cache=True)
+def make_rows(n_bins: int) -> NDArray[np.float64]:
+    """Return scratch rows for histograms of at most so many bins."""
+    return np.empty((N_ROWS, max(n_bins + 2, _MIN_COLUMNS)))
+
+
+@nb.njit(nogil=True, cache=True)
+def make_workspace(rows: NDArray[np.float64]) -> Workspace:
+    """Return a workspace; several may share their rows, which hold nothing between evaluations."""
+    return Workspace(rows, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)))
+
+
+@nb.njit(nogil=True, cache=True)
+def copy(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    """Copy a vector; a plain loop, since slice assignment compiles slowly."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@nb.njit(nogil=True, cache=True)
+def copy_answers(source: Workspace, target: Workspace) -> None:
+    """Copy totals, score and information."""
+    copy(source.total, target.total)
+    copy(source.score, target.score)
+    for i in range(4):
+        copy(source.information[i], target.information[i])
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def load(
+    counts: NDArray[np.generic], weights: NDArray[np.float64], cumulative: NDArray[np.float64]
+) -> tuple[Histogram, int, int]:
+    """Copy a histogram without its empty ends and sum it up.
+
+    Returns:
+        The histogram, its centre (bins after bin 0) and the number of occupied bins.
+    """
+    low, high = 0, counts.size
+    while low < high and counts[low] == 0:
+        low += 1
+    while high > low and counts[high - 1] == 0:
+        high -= 1
+    n_bins = high - low
+    cumulative[0] = 0.0
+    occupied = 0
+    moment = 0.0
+    for i in range(n_bins):
+        c = float(counts[low + i])
+        weights[i] = c
+        cumulative[i + 1] = cumulative[i] + c
+        moment += c * i
+        if c > 0.0:
+            occupied += 1
+    n = cumulative[n_bins]
+    if n == 0.0:
+        return Histogram(weights, cumulative, 0, 0.0, 0.0, 0.0, 0.0), 0, 0
+    mean = moment / n
+    square = 0.0
+    for i in range(n_bins):
+        square += weights[i] * (i - mean) ** 2
+    middle = int(math.floor(mean))
+    histogram = Histogram(weights, cumulative, n_bins, -float(middle), n, mean - middle, square / n)
+    return histogram, low + middle, occupied
