@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.estep_numba import evaluate
 from pchem_pipeline.model.start_numba import assemble, start_cumulants, start_peak, start_regression
-from pchem_pipeline.model.workspace_numba import Histogram, Workspace, copy
+from pchem_pipeline.model.workspace_numba import Histogram, Workspace, copy, load, make_rows
 
 N_OTHERS = 5
 
@@ -88,12 +88,16 @@ def other_start(
     Returns:
         Whether there is a start.
     """
+    found: bool
     if which == 0:
-        return start_peak(histogram, space.rows, theta)
+        found = start_peak(histogram, space.rows, theta)
+        return found
     if which == 1:
-        return start_cumulants(histogram, theta)
+        found = start_cumulants(histogram, theta)
+        return found
     if which == 2:
-        return _scan(histogram, space, theta)
+        found = _scan(histogram, space, theta)
+        return found
     if not best[1] > 0.0:
         return False
     scale = 2.0 if which == 3 else 0.5
@@ -103,3 +107,33 @@ def other_start(
     theta[2] = histogram.mean - exposure * theta[1]
     theta[3] = math.log(max(histogram.variance - exposure * theta[1] ** 2, 0.09 * theta[1] ** 2))
     return True
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def start_tile(
+    counts: NDArray[np.generic],
+    origin: NDArray[np.int64],
+    basis: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Fill ``out`` (n, 3, 4), which comes as NaN, with (H, g, mu, sigma) of the three closed-form starts."""
+    n_most = counts.shape[1]
+    weights, cumulative = np.empty(n_most), np.empty(n_most + 1)
+    rows = make_rows(n_most)
+    theta = np.empty(4)
+    for pixel in range(counts.shape[0]):
+        histogram, centre, occupied = load(counts[pixel], weights, cumulative)
+        if occupied < 3:
+            continue
+        for which in range(3):
+            if which == 0:
+                found, _ = start_regression(histogram, basis, rows, theta)
+            elif which == 1:
+                found = start_peak(histogram, rows, theta)
+            else:
+                found = start_cumulants(histogram, theta)
+            if found:
+                out[pixel, which, 0] = math.exp(theta[0])
+                out[pixel, which, 1] = 1.0 / theta[1]
+                out[pixel, which, 2] = float(origin[pixel] + centre) + theta[2]
+                out[pixel, which, 3] = math.exp(0.5 * theta[3])

@@ -4,9 +4,9 @@ Internal parameters ``theta = (log H, a, m, log sigma^2)`` with ``a = 1/g`` and 
 values are counted from an integer ``centre`` near the pixel's mean, so that no moment cancels.
 
 For the values nearest to component ``j``, with ``d = y - m - j a``, the components ``j + l`` weigh in as
-``(P_{j+l} / P_j) exp(-l^2 a^2 / 2 sigma^2) r^l`` with ``r = exp(d a / sigma^2)``: a polynomial in ``r``, and ``r`` is a
-geometric sequence over successive DN. The posterior moments of ``l`` up to the fourth give the score and
-``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
+``(P_{j+l} / P_j) exp(-l^2 a^2 / 2 sigma^2) r^l`` with ``r = exp(d a / sigma^2)``: a polynomial in ``r``, and
+``r`` is a geometric sequence over successive DN. The posterior moments of ``l`` up to the fourth give the
+score and ``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ def _block_kernel(width: int) -> Callable[..., Any]:
         sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a0, ad, add, b1, b1d, b2
         sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = v11, v11d, v11dd, v12, v12d, v22
 
-    return block_sums
+    kernel: Callable[..., Any] = block_sums
+    return kernel
 
 
 block_sums_3 = _block_kernel(3)
@@ -113,10 +114,10 @@ block_sums_any = _block_kernel(0)
 def _half_width(electron_noise: float, exposure: float, first: int, last: int) -> int:
     """Return how many components matter on either side of the nearest one."""
     variance = electron_noise * electron_noise
-    half = max(1, int(math.ceil(math.sqrt(2.0 * _DROPPED * variance + 0.25) - 0.5)))
+    half = max(1, math.ceil(math.sqrt(2.0 * _DROPPED * variance + 0.25) - 0.5))
     if electron_noise > 0.5:  # the Poisson factor moves the largest term away from the nearest component
         tilt = max(abs(math.log(exposure / (first + 1.0))), abs(math.log(exposure / (last + 1.0))))
-        half += int(math.ceil(variance * tilt))
+        half += math.ceil(variance * tilt)
     return half
 
 
@@ -124,7 +125,7 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int) -
 def _fill_prior(
     prior: NDArray[np.float64], nearest: int, low: int, width: int, exposure: float, overlap: float
 ) -> None:
-    """Fill the polynomial's coefficients, relative to the nearest component; ``overlap = exp(-a^2/2 sigma^2)``."""
+    """Fill the polynomial's coefficients relative to the nearest; ``overlap = exp(-a^2/2 sigma^2)``."""
     place = nearest - low
     square = overlap * overlap
     prior[place] = 1.0
@@ -156,7 +157,8 @@ def _add_block(
     total[SUM_KE] += low * ad + b1d - a * low * b1 - a * b2
     total[SUM_E] += ad - a * b1
     total[SUM_EE] += add - 2.0 * a * b1d + a * a * b2
-    # S = const + alpha i + beta i^2: alpha = (1, u, -a/s2, -a d/s2), u = (d - a low)/s2; beta = (0, -a/s2, 0, a^2/2 s2)
+    # S = const + alpha i + beta i^2: alpha = (1, u, -a/s2, -a d/s2), u = (d - a low)/s2; beta = (0, -a/s2,
+    # 0, a^2/2 s2)
     t = a / s2
     low_a = low * a
     u11 = (v11d - low_a * v11) / s2
@@ -253,8 +255,8 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
     work, total, score, information = space
     exposure, a, origin, s2 = math.exp(theta[0]), theta[1], theta[2], math.exp(theta[3])
     densities, powers, prior = work[0], work[1], work[2]
-    j = max(0, int(math.floor((first - origin) / a + 0.5)))
-    last = max(j, int(math.floor((first + n_bins - 1 - origin) / a + 0.5)))
+    j = max(0, math.floor((first - origin) / a + 0.5))
+    last = max(j, math.floor((first + n_bins - 1 - origin) / a + 0.5))
     half = _half_width(math.sqrt(s2) / a, exposure, j, last)
     width = min(2 * half + 1, prior.size)
     overlap = math.exp(-0.5 * a * a / s2)
@@ -268,10 +270,10 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
     for i in range(N_TOTAL):
         total[i] = 0.0
     log_prior = j * theta[0] - exposure - math.lgamma(j + 1.0)
-    loglik = -0.5 * cumulative[n_bins] * (theta[3] + LOG_2PI)
+    loglik: float = -0.5 * cumulative[n_bins] * (theta[3] + LOG_2PI)
     start = n_bins - n_bins  # 0 as a variable, lest a constant have its own compilation
     while start < n_bins:
-        stop = min(n_bins, int(math.ceil(origin + (j + 0.5) * a - first)))
+        stop = min(n_bins, math.ceil(origin + (j + 0.5) * a - first))
         if j == last:
             stop = n_bins
         if stop > start and cumulative[stop] > cumulative[start]:

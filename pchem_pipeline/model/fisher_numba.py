@@ -49,7 +49,9 @@ def back_substitute(lower: NDArray[np.float64], vector: NDArray[np.float64]) -> 
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def invert(information: NDArray[np.float64], held: NDArray[np.bool_], covariance: NDArray[np.float64]) -> bool:
+def invert(
+    information: NDArray[np.float64], held: NDArray[np.bool_], covariance: NDArray[np.float64]
+) -> bool:
     """Fill the inverse; NaN for held parameters, and everywhere (answer False) unless positive definite."""
     lower = np.zeros((4, 4))
     column = np.empty(4)
@@ -79,7 +81,7 @@ def to_natural(
     parameters: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> bool:
-    """Turn theta = (log H, a, m, log sigma^2) and its information into (H, g, mu, sigma) and their covariance."""
+    """Turn theta and its information into (H, g, mu, sigma) and their covariance; see :mod:`.estep_numba`."""
     slope = np.empty(4)
     parameters[0] = math.exp(theta[0])
     parameters[1] = 1.0 / theta[1]
@@ -89,7 +91,7 @@ def to_natural(
     slope[1] = -parameters[1] * parameters[1]
     slope[2] = 1.0
     slope[3] = 0.5 * parameters[3]
-    regular = invert(information, held, covariance)
+    regular: bool = invert(information, held, covariance)
     for i in range(4):
         for j in range(4):
             covariance[i, j] *= slope[i] * slope[j]

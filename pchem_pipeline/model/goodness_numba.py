@@ -50,4 +50,5 @@ def normal_score(chi2: float, freedom: int) -> float:
     if freedom <= 0:
         return 0.0
     spread = 2.0 / (9.0 * freedom)
-    return ((chi2 / freedom) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread)
+    deviate: float = ((chi2 / freedom) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread)
+    return deviate

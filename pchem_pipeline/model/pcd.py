@@ -1,8 +1,8 @@
 """The photon counting distribution (PCD): density, moments, quantised mass and draws.
 
 A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
-standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that treats
-the rounding as additive noise, ``sigma^2 = sigma_R^2/g^2 + 1/12`` (eq. X_density).
+standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
+treats the rounding as additive noise, ``sigma^2 = sigma_R^2/g^2 + 1/12`` (eq. X_density).
 
 All arguments broadcast. Units: H and sigma_R in e-, g in e-/DN, mu, sigma and x in DN.
 """

@@ -45,7 +45,7 @@ def largest_term(y: float, exposure: float, step: float, sigma: float) -> int:
 @nb.njit(nogil=True, cache=True)
 def log_density(y: float, exposure: float, step: float, sigma: float) -> float:
     """Return the log density of the PCD at ``y = x - mu`` (DN), with ``step = 1/g`` (DN)."""
-    constant = -exposure - math.log(sigma) - 0.5 * math.log(2.0 * math.pi)
+    constant: float = -exposure - math.log(sigma) - 0.5 * math.log(2.0 * math.pi)
     if exposure == 0.0:
         return constant - 0.5 * (y / sigma) ** 2
     mode = largest_term(y, exposure, step, sigma)
@@ -65,7 +65,8 @@ def log_density(y: float, exposure: float, step: float, sigma: float) -> float:
             break
         total += math.exp(term)
         k -= 1
-    return constant + top + math.log(total)
+    answer: float = constant + top + math.log(total)
+    return answer
 
 
 @nb.njit(nogil=True, cache=True)

@@ -1,20 +1,20 @@
-"""PCH-EM on a batch of pixel histograms."""
+"""PCH-EM on a batch of pixel histograms: maximum likelihood, standard errors, a word on every pixel."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtrc
 
-from pchem_pipeline.model import pchem_numba, polish_numba
+from pchem_pipeline.model import pchem_numba, polish_numba, workspace_numba
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.model.start_numba import regression_basis
 
-__all__ = ["FitResult", "fit_histograms"]
+__all__ = ["EmTrace", "FitResult", "em_trace", "fit_histograms"]
 
 WARM_UP = 1  # EM steps before the first Newton step
 
@@ -28,14 +28,21 @@ class FitResult:
         conversion_gain: g, e-/DN, shape (n,).
         bias: mu, DN, shape (n,).
         read_noise_dn: sigma, DN, quantisation included, shape (n,).
-        covariance: of (H, g, mu, sigma), shape (n, 4, 4).
-        log_likelihood: nats, shape (n,).
-        likelihood_gap: nats above the runner-up, shape (n,).
+        covariance: of (H, g, mu, sigma), the inverse of the observed information (Louis 1982), shape (n, 4,
+            4); NaN in the row and column of a parameter at its bound.
+        log_likelihood: ``sum_i c_i log f_X(x_i)``, nats, shape (n,).
+        likelihood_gap: nats between the likelihood kept and the runner-up, shape (n,). Runners-up are the
+            maxima reached from the neighbours (H -+ 1, mu +- 1/g), the other maxima found, and the best
+            single Gaussian (g to infinity). A gap below 30 is exact: the runner-up was polished to its
+            maximum. A larger one says that the neighbour was given up when, by the quadratic through it,
+            twice its expected rise would have left it more than 30 below; its height is then taken from that
+            quadratic. Negative only with a reason in ``fit_status``: one Gaussian, or a climb that did not
+            converge, stands higher.
         fit_status: bits of :class:`~pchem_pipeline.model.fit_status.FitStatus`, uint16, shape (n,).
-        n_iterations: evaluations of the likelihood, int32, shape (n,).
-        goodness_chi2: Pearson chi-square, shape (n,).
-        goodness_dof: degrees of freedom, int32, shape (n,).
-        goodness_p: probability of a larger chi-square, shape (n,).
+        n_iterations: evaluations of the likelihood, all starts and neighbours together, int32, shape (n,).
+        goodness_chi2: Pearson chi-square, adjacent DN merged until 5 counts are expected, shape (n,).
+        goodness_dof: its degrees of freedom, groups - 5, int32, shape (n,); 0 if there are none.
+        goodness_p: probability of a larger chi-square, shape (n,); NaN without degrees of freedom.
     """
 
     quanta_exposure: NDArray[np.float64]
@@ -52,6 +59,18 @@ class FitResult:
     goodness_p: NDArray[np.float64]
 
 
+class EmTrace(NamedTuple):
+    """Iterates of plain EM.
+
+    Attributes:
+        log_likelihood: nats, shape (iterations + 1,); it never falls.
+        parameters: (H, g, mu, sigma), shape (iterations + 1, 4).
+    """
+
+    log_likelihood: NDArray[np.float64]
+    parameters: NDArray[np.float64]
+
+
 def fit_histograms(
     counts: NDArray[np.unsignedinteger],
     origin: NDArray[np.integer],
@@ -61,51 +80,124 @@ def fit_histograms(
     settings: FitSettings | None = None,
     adc_limits: tuple[int, int] | None = None,
 ) -> FitResult:
-    """Estimate (H, g, mu, sigma) of every pixel from its histogram."""
+    """Estimate (H, g, mu, sigma) of every pixel from its histogram by maximum likelihood.
+
+    The likelihood is that of the PCD at whole DN (Hendrickson et al. 2023, eq. X_density). A start from the
+    empirical characteristic function is improved by an EM step, eqs. (update_eqns) to (gamma_nk), and by
+    damped Newton steps with Louis' observed information (``algorithm: em``: by EM steps alone), until the
+    expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried and the likeliest is
+    kept; a pixel whose goodness of fit or read noise raises suspicion gets other starts. No pixel raises:
+    what cannot be fitted holds NaN and a reason. The answer for a pixel does not depend on the others in the
+    batch.
+
+    Args:
+        counts: histograms, shape (n, B), any unsigned type.
+        origin: DN of bin 0, shape (n,).
+        under: frames below bin 0, shape (n,); such pixels are fitted inside the window and flagged.
+        over: frames above the last bin, shape (n,).
+        settings: how to fit; the defaults if None.
+        adc_limits: first and last code of the ADC, DN; pixels that reach them are flagged.
+
+    Returns:
+        Estimates, covariances and a status word per pixel.
+    """
     settings = settings or FitSettings()
     counts = np.ascontiguousarray(counts)
     n = counts.shape[0]
     parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
-    out, words = np.full((n, pchem_numba.N_OUT), np.nan), np.zeros((n, pchem_numba.N_WORDS), np.int64)
+    out = np.full((n, pchem_numba.N_OUT), np.nan)
+    words = np.zeros((n, pchem_numba.N_WORDS), np.int64)
     pchem_numba.fit_tile(
-        counts, np.asarray(origin, np.int64), regression_basis(), _limits(settings), parameters, covariance, out, words
+        counts,
+        np.ascontiguousarray(origin, np.int64),
+        regression_basis(),
+        _limits(settings),
+        parameters,
+        covariance,
+        out,
+        words,
     )
-    dof = words[:, pchem_numba.FREEDOM]
-    probability = chdtrc(np.where(dof > 0, dof, np.nan), out[:, pchem_numba.CHI2])
-    status = words[:, pchem_numba.STATUS]
-    status[probability < settings.goodness_limit] |= FitStatus.POOR_FIT
-    for outside in (under, over):
-        if outside is not None:
-            status[np.asarray(outside) > 0] |= FitStatus.OUTSIDE_WINDOW
-    if adc_limits is not None:
-        status[(words[:, pchem_numba.LOWEST_DN] <= adc_limits[0]) | (words[:, pchem_numba.HIGHEST_DN] >= adc_limits[1])] |= FitStatus.ADC_LIMIT
+    chi2, dof = out[:, pchem_numba.CHI2], words[:, pchem_numba.FREEDOM]
+    probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
+    status = _status(words, probability, under, over, settings, adc_limits)
     failed = (status & FAILED) != 0
     parameters[failed] = np.nan
     covariance[failed] = np.nan
+    exposure, gain, bias, sigma = np.ascontiguousarray(parameters.T)
     return FitResult(
-        quanta_exposure=parameters[:, 0].copy(),
-        conversion_gain=parameters[:, 1].copy(),
-        bias=parameters[:, 2].copy(),
-        read_noise_dn=parameters[:, 3].copy(),
+        quanta_exposure=exposure,
+        conversion_gain=gain,
+        bias=bias,
+        read_noise_dn=sigma,
         covariance=covariance,
         log_likelihood=out[:, pchem_numba.LOG_LIKELIHOOD].copy(),
         likelihood_gap=out[:, pchem_numba.GAP].copy(),
         fit_status=status.astype(np.uint16),
         n_iterations=words[:, pchem_numba.EVALUATIONS].astype(np.int32),
-        goodness_chi2=out[:, pchem_numba.CHI2].copy(),
+        goodness_chi2=chi2.copy(),
         goodness_dof=dof.astype(np.int32),
         goodness_p=probability,
     )
 
 
+def _status(
+    words: NDArray[np.int64],
+    probability: NDArray[np.float64],
+    under: NDArray[np.integer] | None,
+    over: NDArray[np.integer] | None,
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+) -> NDArray[np.int64]:
+    """Add to the status words what the loop over the pixels does not know."""
+    status = words[:, pchem_numba.STATUS].copy()
+    status[probability < settings.goodness_limit] |= FitStatus.POOR_FIT
+    for outside in (under, over):
+        if outside is not None:
+            status[np.asarray(outside).ravel() > 0] |= FitStatus.OUTSIDE_WINDOW
+    if adc_limits is not None:
+        low, high = words[:, pchem_numba.LOWEST_DN], words[:, pchem_numba.HIGHEST_DN]
+        seen = (status & FitStatus.NO_DATA) == 0
+        status[seen & ((low <= adc_limits[0]) | (high >= adc_limits[1]))] |= FitStatus.ADC_LIMIT
+    return status
+
+
 def _limits(settings: FitSettings) -> NDArray[np.float64]:
+    """Pack the settings for the loops."""
     em = settings.algorithm == "em"
     limits = np.zeros(pchem_numba.N_LIMITS)
     limits[polish_numba.MIN_LOG_EXPOSURE] = np.log(settings.minimum_quanta_exposure)
     limits[polish_numba.TOLERANCE] = settings.tolerance
     limits[polish_numba.WARM_UP] = WARM_UP
     limits[polish_numba.MAX_EVALUATIONS] = settings.em_max_iterations if em else settings.max_iterations
+    limits[polish_numba.ONLY_EM] = em
     limits[pchem_numba.GAP_THRESHOLD] = settings.gap_threshold
     limits[pchem_numba.NOISE_LIMIT] = settings.read_noise_limit
-    limits[polish_numba.ONLY_EM] = em
     return limits
+
+
+def em_trace(counts: NDArray[np.integer], origin: int, start: ArrayLike, n_iterations: int) -> EmTrace:
+    """Return the iterates of plain EM on one histogram.
+
+    Hendrickson et al. 2023, eqs. (update_eqns) to (gamma_nk).
+
+    Args:
+        counts: histogram of one pixel with at least 3 occupied bins, shape (B,).
+        origin: DN of bin 0.
+        start: (H, g, mu, sigma); sigma at least 1/sqrt(12) DN.
+        n_iterations: EM steps to take.
+
+    Returns:
+        Log-likelihood and parameters at the start and after every step.
+    """
+    counts = np.ascontiguousarray(counts)
+    weights, cumulative = np.empty(counts.size), np.empty(counts.size + 1)
+    histogram, centre, _ = workspace_numba.load(counts, weights, cumulative)
+    exposure, gain, bias, sigma = (float(value) for value in np.asarray(start, np.float64))
+    middle = float(origin + centre)
+    theta = np.array([np.log(exposure), 1.0 / gain, bias - middle, 2.0 * np.log(sigma)])
+    path, logliks = np.empty((n_iterations + 1, 4)), np.empty(n_iterations + 1)
+    polish_numba.em_path(histogram, theta, -np.inf, path, logliks)
+    natural = np.stack(
+        [np.exp(path[:, 0]), 1.0 / path[:, 1], middle + path[:, 2], np.exp(0.5 * path[:, 3])], axis=1
+    )
+    return EmTrace(logliks, natural)

@@ -49,7 +49,9 @@ N_WORDS = 5
 
 _CLEAR_GAP = 30.0  # nats: a neighbour this far below is not polished to the end
 _SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
-_SUSPICIOUS_NOISE = 0.45  # e-: above it the side lobe sinks into the noise and the first start errs more often
+_SUSPICIOUS_NOISE = (
+    0.45  # e-: above it the side lobe sinks into the noise and the first start errs more often
+)
 _MOST_MOVES = 40
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
@@ -146,8 +148,8 @@ def fit_pixel(
 ) -> tuple[int, int, int]:
     """Find the most likely parameters of one pixel.
 
-    The first start is polished and its neighbours are climbed. Where the goodness of fit or the read noise raises
-    suspicion, the other starts follow; the likeliest maximum is kept.
+    The first start is polished and its neighbours are climbed. Where the goodness of fit or the read noise
+    raises suspicion, the other starts follow; the likeliest maximum is kept.
 
     Args:
         histogram: of the pixel.

@@ -23,6 +23,7 @@ from pchem_pipeline.model.workspace_numba import (
     Workspace,
     copy,
     copy_answers,
+    make_rows,
     make_workspace,
 )
 
@@ -80,7 +81,11 @@ def em_step(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def add_complete(
-    n: float, theta: NDArray[np.float64], total: NDArray[np.float64], share: float, matrix: NDArray[np.float64]
+    n: float,
+    theta: NDArray[np.float64],
+    total: NDArray[np.float64],
+    share: float,
+    matrix: NDArray[np.float64],
 ) -> None:
     """Add a share of the complete-data information, positive definite everywhere, to the lower triangle."""
     s2 = math.exp(theta[3])
@@ -104,8 +109,8 @@ def newton_step(
 ) -> tuple[float, float]:
     """Solve for the damped Newton step; parameters held by a bound stay.
 
-    A share of the complete-data information is added to the observed information, more of it where that is not
-    positive definite: the step turns from Newton's into a shortened EM step.
+    A share of the complete-data information is added to the observed information, more of it where that is
+    not positive definite: the step turns from Newton's into a shortened EM step.
 
     Returns:
         Half the squared Newton decrement, the expected rise of the log-likelihood, and the share used. Only
@@ -159,7 +164,8 @@ def degenerate(theta: NDArray[np.float64], longest_step: float) -> bool:
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def same_maximum(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
     """Tell whether two points belong to one maximum: bias within 0.3 e-, step within 10 %."""
-    return abs(left[2] - right[2]) < 0.3 * left[1] and abs(left[1] - right[1]) < 0.1 * left[1]
+    same: bool = abs(left[2] - right[2]) < 0.3 * left[1] and abs(left[1] - right[1]) < 0.1 * left[1]
+    return same
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -180,8 +186,8 @@ def polish(
         limits: bounds and limits, see the names at the top of this module.
         to_beat: give up once the log-likelihood cannot rise to this value, judged by twice the expected rise.
         known: a maximum known already; the climb ends where it heads for that one.
-        known_loglik: its log-likelihood; infinite where there is none, as for the climb from a start, which alone
-            warms up by EM steps, or takes nothing else where the limits say so.
+        known_loglik: its log-likelihood; infinite where there is none, as for the climb from a start, which
+            alone warms up by EM steps, or takes nothing else where the limits say so.
         space: scratch.
 
     Returns:
@@ -237,3 +243,23 @@ def polish(
         copy_answers(ahead, space)
         loglik = risen
     return NOT_CONVERGED, loglik, used
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def em_path(
+    histogram: Histogram,
+    theta: NDArray[np.float64],
+    bound: float,
+    path: NDArray[np.float64],
+    logliks: NDArray[np.float64],
+) -> None:
+    """Fill ``path`` (iterations + 1, 4) and ``logliks`` with the iterates of plain EM from ``theta``."""
+    space = make_workspace(make_rows(histogram.n_bins))
+    present = theta.copy()
+    following = theta.copy()
+    for row in range(logliks.size):
+        copy(following, present)
+        copy(present, path[row])
+        logliks[row] = evaluate(histogram, present, space, 0.0)
+        if not em_step(histogram.n, present, space.total, bound, following):
+            copy(present, following)

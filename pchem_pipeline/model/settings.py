@@ -31,13 +31,14 @@ class FitSettings(Section):
         default=1e-8,
         gt=0,
         le=1e-2,
-        description="nats: converged when the likelihood can rise by less (half the squared Newton decrement), "
-        "that is when the next step is below sqrt(2 tolerance) standard errors",
+        description="nats: converged when the likelihood can rise by less (half the squared Newton "
+        "decrement), that is when the next step is below sqrt(2 tolerance) standard errors",
     )
     gap_threshold: float = Field(
         default=5.0,
         ge=0,
-        description="nats: the bias counts as ambiguous when a runner-up (one electron more or fewer) is closer",
+        description="nats: the bias counts as ambiguous when a runner-up (one electron more or fewer) "
+        "is closer",
     )
     read_noise_limit: float = Field(
         default=0.5,

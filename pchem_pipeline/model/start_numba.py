@@ -1,8 +1,8 @@
 """Starting points in closed form, from the empirical characteristic function (ECF) and from cumulants.
 
-``phi(f) = mean exp(2 pi i f y)`` of a PCD has ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f a)`` and the
-phase ``2 pi f m + H sin 2 pi f a`` (f in cycles/DN, ``a = 1/g``). Frequencies and steps are counted in units of
-1/sd and sd of the pixel: the side lobes then always have a width near 0.16.
+``phi(f) = mean exp(2 pi i f y)`` of a PCD has ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f a)`` and
+the phase ``2 pi f m + H sin 2 pi f a`` (f in cycles/DN, ``a = 1/g``). Frequencies and steps are counted in
+units of 1/sd and sd of the pixel: the side lobes then always have a width near 0.16.
 """
 
 from __future__ import annotations
@@ -86,7 +86,10 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
 
 @nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
 def _regress(
-    basis: NDArray[np.float64], weight: NDArray[np.float64], quadratic: NDArray[np.float64], target: NDArray[np.float64]
+    basis: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    quadratic: NDArray[np.float64],
+    target: NDArray[np.float64],
 ) -> tuple[float, float]:
     """Return (lobe frequency in 1/sd, H) of the best weighted regression over all trial steps."""
     n = weight.size
@@ -198,7 +201,8 @@ def start_regression(
     lobe, exposure = _regress(basis, weight, quadratic, target)
     if lobe <= 0.0:
         return False, False
-    return assemble(histogram, sd / lobe, exposure, theta)
+    answer: tuple[bool, bool] = assemble(histogram, sd / lobe, exposure, theta)
+    return answer
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -227,7 +231,8 @@ def start_peak(
     a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
     electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
     exposure = max(0.05, variance / (a * a) - electron_noise)
-    return assemble(histogram, a, exposure, theta)[0]
+    found: bool = assemble(histogram, a, exposure, theta)[0]
+    return found
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")

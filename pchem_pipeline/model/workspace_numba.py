@@ -115,6 +115,6 @@ def load(
     square = 0.0
     for i in range(n_bins):
         square += weights[i] * (i - mean) ** 2
-    middle = int(math.floor(mean))
+    middle = math.floor(mean)
     histogram = Histogram(weights, cumulative, n_bins, -float(middle), n, mean - middle, square / n)
     return histogram, low + middle, occupied
