@@ -175,8 +175,8 @@ def _channels(
         channel[inside], values[inside], yerr=errors, fmt="o", markersize=3 if not many else 1.5, color=BLUE,
         elinewidth=0.8, capsize=2 if not many else 0,
     )  # fmt: skip
-    axes.set(xlabel="channel", ylabel=label, xlim=(-0.5, values.size - 0.5))
-    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    axes.set(xlabel="channel", ylabel=label)
+    _channel_axis(axes, values.size)
     if many or shown.n_outside:
         axes.set_ylim(*_padded(shown))
     missing = channel[~known]
@@ -187,6 +187,14 @@ def _channels(
         cross = " (×)" if missing.size else ""
         note(axes, shown.words() + cross)
     return figure
+
+
+def _channel_axis(axes: Axes, n_channels: int) -> None:
+    axes.set_xlim(-0.5, n_channels - 0.5)
+    if n_channels <= 12:
+        axes.set_xticks(np.arange(n_channels))
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
 
 
 def _padded(shown: DisplayRange) -> tuple[float, float]:
@@ -291,8 +299,8 @@ def fit_status_map(
             color=[palette[c] for c in colour.ravel()],
             edgecolor="white",
         )
-        axes.set(xlabel="channel", yticks=[], xlim=(-0.5, status.size - 0.5), ylim=(0.0, 1.0))
-        axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+        axes.set(xlabel="channel", yticks=[], ylim=(0.0, 1.0))
+        _channel_axis(axes, status.size)
     else:
         figure = new_figure(width_mm, _map_height(status.shape, width_mm - 14.0) + legend_mm)
         axes = figure.add_subplot()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -177,6 +178,8 @@ def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -
     total = int(pixel.counts.sum())
     if total == 0:
         note(top, "no frames")
+        for axes in (top, strip):
+            axes.set(xticks=[], yticks=[])
         return
     where = shown_bins(pixel.counts)
     _bars(top, pixel.counts, pixel.origin)
@@ -195,6 +198,7 @@ def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -
         _residual_strip(strip, pixel, dn.astype(np.float64), where)
     else:
         remarks.append("no fit")
+        strip.set_yticks([])
     top.set_ylim(0.0, 1.25 * max(top.get_ylim()[1], 1e-12))
     note(top, "\n".join(remarks))
 
@@ -232,7 +236,8 @@ def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
                     f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
                 )
         pairs = ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
-        fits = all(len(pair) - 12 < 0.62 * width_mm for pair in pairs)
+        # a symbol in mathtext is about two letters wide
+        fits = all(len(re.sub(r"\$[^$]*\$", "MM", pair)) < 0.66 * width_mm for pair in pairs)
         lines += pairs if fits else words
     if pixel.status:
         lines += textwrap.wrap(f"status: {plain(pixel.status)}", max(20, int(width_mm * 0.6)))[:2]

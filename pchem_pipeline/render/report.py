@@ -14,7 +14,7 @@ from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.report_json import report_json
 from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.render.style import COLUMN_MM, figure_bytes
+from pchem_pipeline.render.style import COLUMN_MM, figure_bytes, small_png
 from pchem_pipeline.render.tables import Table, provenance_tables, result_tables
 from pchem_pipeline.render.verdict import flags, key_numbers, sentence
 
@@ -121,7 +121,7 @@ def _picture(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, byte
         figures[f"{exhibit.name}.{kind}"] = figure_bytes(figure, kind, dpi=settings.dpi, title=exhibit.title)
     have = {kind: figures.get(f"{exhibit.name}.{kind}") for kind in ("svg", "png")}
     if exhibit.raster:
-        source = _data_url(have["png"] or figure_bytes(figure, "png", dpi=settings.dpi), "png")
+        source = _data_url(small_png(have["png"] or figure_bytes(figure, "png", dpi=settings.dpi)), "png")
     else:
         source = _line_drawing(
             have["svg"] or figure_bytes(figure, "svg"), lambda: figure_bytes(figure, "png", dpi=200)
@@ -135,7 +135,7 @@ def _picture(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, byte
 
 
 def _line_drawing(svg: bytes, png: Callable[[], bytes]) -> str:
-    return _data_url(svg, "svg") if len(svg) <= _LARGEST_SVG else _data_url(png(), "png")
+    return _data_url(svg, "svg") if len(svg) <= _LARGEST_SVG else _data_url(small_png(png()), "png")
 
 
 def _data_url(content: bytes, kind: str) -> str:

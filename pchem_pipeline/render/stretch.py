@@ -51,6 +51,9 @@ def stretch_map(values: NDArray[Any], stretch: Literal["beta", "linear"] = "beta
     known = finite(full)
     if known.size == 0:
         return StretchedMap(np.full(full.shape, np.nan), (), ())
+    if known.min() == known.max():
+        colour = np.where(np.isfinite(full), 0.5, np.nan)
+        return StretchedMap(colour, (0.5,), (short(float(known[0])),))
     level = np.asarray(STRETCH_LEVELS)
     if stretch == "beta":
         physical = np.quantile(known, level**2 * (3.0 - 2.0 * level))

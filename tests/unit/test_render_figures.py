@@ -1,5 +1,6 @@
 """Every figure, on data as they should be and on data as they are."""
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 from report_material import CASES, PARAMETERS, pixel_fit, report_data, true_maps
 
 from pchem_pipeline.model.fit_status import MEANINGS, FitStatus
@@ -19,7 +21,7 @@ from pchem_pipeline.render.map_figures import (
     status_counts,
 )
 from pchem_pipeline.render.pixel_figures import PAPER_EXAMPLE, cluster_edges, pixel_fits, shown_bins
-from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM, figure_bytes
+from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM, figure_bytes, small_png
 
 WORDS = {int(bit): text for bit, text in MEANINGS.items()}
 
@@ -287,3 +289,14 @@ def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
         figure_bytes(figure, "svg")
         assert dict(mpl.rcParams) == before
         assert figure.axes[0].get_facecolor() != (1.0, 0.0, 0.0, 1.0)
+
+
+def test_a_palette_does_not_change_a_map_visibly() -> None:
+    full = figure_bytes(map_and_histogram(_map("holes"), "bias"), "png", dpi=150)
+    few = small_png(full)
+    assert len(few) < len(full)
+    before, after = (
+        np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=float) for png in (full, few)
+    )
+    assert np.abs(before - after).mean() < 1.0
+    assert np.abs(before - after).max() < 32
