@@ -65,7 +65,7 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         "status",
         "Fit status",
         "Pixels that could not be fitted, or whose values deserve caution, and why.",
-        ("maps",),
+        (),
     ),
 )
 

@@ -53,7 +53,7 @@ def size_words(size: float) -> str:
 def _parameters(data: ReportData) -> Table:
     rows = []
     found = summaries(data)
-    for name, summary in ((name, found[name]) for name in _ORDER if name in found):
+    for name, summary in ((name, found[name]) for name in _ORDER if data.has_values(name)):
         _, words, unit = symbol(name)
         errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
         values = [short(value, 4) for value in summary.percentiles.values()]

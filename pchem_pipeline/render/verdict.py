@@ -233,7 +233,11 @@ def _agreement(data: ReportData) -> list[Flag]:
 
 
 def _conditions(data: ReportData) -> list[Flag]:
-    found = [Flag("note", _as_sentence(text)) for text in data.missing.values()]
+    found = [
+        Flag("note", _as_sentence(data.missing[part]))
+        for part in ("dark_current", "ensemble")
+        if part in data.missing
+    ]
     read_noise = finite(data.maps.get("read_noise_e", np.empty(0)))
     if read_noise.size and float(np.median(read_noise)) > 0.5:
         found.append(
