@@ -113,7 +113,6 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     assert len(numbers["moments"]) >= 4
     html = (store / "report.html").read_text(encoding="utf-8")
     assert "My &lt;sensor&gt;" in html
-    assert "/work" not in html
     assert str(folder) not in html
     assert status(report, context).state == "complete"
 
