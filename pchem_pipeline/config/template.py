@@ -28,7 +28,8 @@ def commented_config(name: str, *, files: list[str], simulated: bool = False) ->
         files: what to write as ``input.files``.
         simulated: include the section ``simulate``.
     """
-    given = {"input.files": files}
+    stem = name.rsplit(".", 1)[0]
+    given = {"input.files": files, "run.store": f"{stem}.zarr", "simulate.output": f"{stem}-frames"}
     lines = [_HEAD.format(name=name)]
     for key, field in RunConfig.model_fields.items():
         if key == "simulate" and not simulated:

@@ -99,6 +99,8 @@ def status(stage: StageModule, context: StageContext) -> StageState:
     if done < record.keys or record.keys == 0:
         reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
         return StageState(stage.NAME, "partial", reason, done, record.keys)
+    if not record.finished:
+        return StageState(stage.NAME, "partial", "interrupted", done, record.keys)
     return StageState(stage.NAME, "complete", "", done, record.keys)
 
 
@@ -194,6 +196,7 @@ def _perform(stage: StageModule, context: StageContext, before: StageState, *, r
     wall, cpu = time.perf_counter(), _cpu_seconds()
     try:
         stage.run(context)
+        record = replace(record, finished=True)
     finally:
         record = replace(
             record,

@@ -28,6 +28,7 @@ class StageRecord:
         fingerprint: digest of all that decides the result.
         content: what the digest was taken of: settings read, upstream fingerprints, input identity.
         keys: how many unit markers the complete stage has.
+        finished: True once the stage came to its end; work after the last unit may be missing before.
         started: UTC time, ISO 8601.
         seconds: wall time, summed over the runs that completed it.
         cpu_seconds: CPU time of this process and its children.
@@ -42,6 +43,7 @@ class StageRecord:
     fingerprint: str
     content: dict[str, Any]
     keys: int = 0
+    finished: bool = False
     started: str = ""
     seconds: float = 0.0
     cpu_seconds: float = 0.0

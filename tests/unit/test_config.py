@@ -13,7 +13,8 @@ CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 @pytest.mark.parametrize("simulated", [False, True])
 def test_the_template_is_the_defaults_and_explains_every_setting(simulated):
     text = commented_config("c.yaml", files=["a.tif"], simulated=simulated)
-    short = "input: {files: [a.tif]}\n" + ("simulate: {}\n" if simulated else "")
+    short = "run: {store: c.zarr}\ninput: {files: [a.tif]}\n"
+    short += "simulate: {output: c-frames}\n" if simulated else ""
     assert parse_config(text) == parse_config(short)
     keys = [line for line in text.splitlines() if ":" in line and not line.lstrip().startswith("#")]
     comments = [line for line in text.splitlines() if line.lstrip().startswith("#")]

@@ -198,6 +198,24 @@ def test_a_signal_stops_between_units_and_the_rest_is_done_later(make):
     assert len(CALLS) == 9
 
 
+def test_work_after_the_last_unit_is_made_up_for(make):
+    """A stop between the last unit and the end of a stage must not leave it complete."""
+    context = make()
+
+    class StopAtTheEnd(SerialExecutor):
+        def map(self, function, items, on_result):
+            super().map(function, items, on_result)
+            context.stop.signal = signal.SIGINT
+
+    context.executor = StopAtTheEnd()
+    with pytest.raises(InterruptedRunError):
+        execute("fit", context)
+    assert status(FAKES["fit"], make()).words() == "partial 12 of 12 - interrupted"
+    CALLS.clear()
+    assert execute("fit", make()).state == "complete"
+    assert CALLS == []
+
+
 def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
     before = signal.getsignal(signal.SIGTERM)
     with stop_on_signals() as stop:
