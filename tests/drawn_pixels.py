@@ -1,0 +1,45 @@
+"""Histograms of simulated pixels for the tests of the fit."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.model.pcd import pcd_mass
+
+
+class Drawn(NamedTuple):
+    """Histograms and the true (H, g, mu, sigma)."""
+
+    counts: NDArray[np.uint32]
+    origin: NDArray[np.int64]
+    truth: NDArray[np.float64]
+
+
+def draw(
+    rng: np.random.Generator,
+    exposure: ArrayLike,
+    step: ArrayLike,
+    electron_noise: ArrayLike,
+    bias: ArrayLike = 100.3,
+    n_frames: int = 17_750,
+) -> Drawn:
+    """Draw histograms from the exact quantised mass; ``step = 1/g`` in DN, total noise in e-."""
+    h, a, s, mu = np.atleast_1d(
+        *np.broadcast_arrays(*[np.asarray(v, float) for v in (exposure, step, electron_noise, bias)])
+    )
+    analog = np.sqrt(s**2 - 1 / (12 * a**2))
+    origin = np.floor(mu - 9 * s * a).astype(np.int64)
+    width = np.ceil((h + 11 * np.sqrt(h) + 12 + 18 * s) * a)
+    x = origin[:, None] + np.arange(int(width.max()) + 1)
+    mass = pcd_mass(x, h[:, None], 1 / a[:, None], mu[:, None], analog[:, None])
+    counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
+    return Drawn(counts.astype(np.uint32), origin, np.stack([h, 1 / a, mu, s * a], axis=1))
+
+
+def samples(counts: ArrayLike, origin: int) -> NDArray[np.float64]:
+    """Return the raw sample of a histogram, sorted."""
+    values = np.asarray(counts)
+    return np.repeat(origin + np.arange(values.size), values).astype(float)

@@ -1,0 +1,167 @@
+"""Estimates are unbiased, efficient, have honest errors, and sit at the right maximum."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drawn_pixels import Drawn, draw
+from numpy.typing import NDArray
+from scipy.stats import kstest
+
+from pchem_pipeline.model.fisher import cramer_rao, cramer_rao_stderr, propagate
+from pchem_pipeline.model.pchem import FitResult, em_trace, fit_histograms
+from pchem_pipeline.model.start import START_METHODS, starting_points
+
+N_PIXELS = 1500
+FIVE = 5.0
+
+
+def estimates(result: FitResult) -> NDArray[np.float64]:
+    return np.stack(
+        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
+    )
+
+
+def wrong(result: FitResult, truth: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Bias off by more than half an electron, gain by a quarter, or no answer."""
+    _, gain, bias, _ = estimates(result).T
+    return ~((np.abs(bias - truth[:, 2]) * truth[:, 1] < 0.5) & (np.abs(gain / truth[:, 1] - 1) < 0.25))
+
+
+def drawn_in_range(
+    seed: int, n: int, exposure: tuple[float, float], noise: tuple[float, float], **k: int
+) -> Drawn:
+    rng = np.random.default_rng(seed)
+    h = np.exp(rng.uniform(*np.log(exposure), n))
+    return draw(rng, h, rng.uniform(8, 14, n), rng.uniform(*noise, n), rng.uniform(95, 105, n), **k)
+
+
+@pytest.mark.parametrize("case", [(0.1, 11.0, 0.2), (2.0, 9.0, 0.3), (9.0, 11.0, 0.35)])
+def test_pulls_and_efficiency(case: tuple[float, float, float]) -> None:
+    h, step, noise = case
+    pixels = draw(
+        np.random.default_rng(31), np.full(N_PIXELS, h), step, noise, np.linspace(100, 101, N_PIXELS)
+    )
+    result = fit_histograms(pixels.counts, pixels.origin)
+    error = estimates(result) - pixels.truth
+    stderr = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
+    pulls = error / stderr
+    assert np.all(np.abs(pulls.mean(axis=0)) < FIVE / np.sqrt(N_PIXELS))
+    limit = FIVE * np.sqrt(2 / N_PIXELS)
+    assert np.all(np.abs(pulls.var(axis=0) - 1) < limit)
+    bound = cramer_rao_stderr(h, 1 / step, noise * step, 17_750)
+    assert np.all(np.abs((error**2).mean(axis=0) / bound**2 - 1) < limit)
+    assert np.all(np.abs((pulls / 1.5).var(axis=0) - 1) > limit)  # standard errors off by half are seen
+    # correlations count: H/g, the signal in DN, is known better than H and g suggest
+    gradient = np.zeros((N_PIXELS, 4))
+    gradient[:, 0], gradient[:, 1] = 1 / pixels.truth[:, 1], -pixels.truth[:, 0] / pixels.truth[:, 1] ** 2
+    signal_pull = (result.quanta_exposure / result.conversion_gain - h * step) / propagate(
+        result.covariance, gradient
+    )
+    assert abs(signal_pull.var() - 1) < limit
+
+
+def test_the_right_maximum_is_found_or_flagged() -> None:
+    pixels = drawn_in_range(32, 4000, (0.1, 10), (0.15, 0.35))
+    result = fit_histograms(pixels.counts, pixels.origin)
+    assert not np.any(wrong(result, pixels.truth) & (result.fit_status == 0))
+    assert np.mean(result.fit_status == 0) > 0.999
+    # outside of the range a wrong answer may be had, but not without a word
+    for exposure, noise in (((15, 60), (0.2, 0.4)), ((2, 10), (0.5, 0.7))):
+        pixels = drawn_in_range(33, 300, exposure, noise)
+        result = fit_histograms(pixels.counts, pixels.origin)
+        bad = wrong(result, pixels.truth)
+        assert bad.sum() > 5  # so hard that some are wrong
+        assert np.count_nonzero(bad & (result.fit_status == 0)) <= 1
+
+
+def test_plain_em_stays_at_a_bias_off_by_one_electron_and_the_fit_does_not() -> None:
+    pixels = draw(np.random.default_rng(34), 5.0, 11.0, 0.3)
+    h, g, mu, sigma = pixels.truth[0]
+    off = em_trace(pixels.counts[0], int(pixels.origin[0]), (h - 1, g, mu + 1 / g, sigma), 800)
+    right = em_trace(pixels.counts[0], int(pixels.origin[0]), (h, g, mu, sigma), 800)
+    assert abs(off.parameters[-1, 2] - mu) > 0.8 / g  # EM never leaves the wrong maximum
+    gap = right.log_likelihood[-1] - off.log_likelihood[-1]
+    assert gap > 20
+    result = fit_histograms(pixels.counts, pixels.origin)
+    assert result.bias[0] == pytest.approx(mu, abs=0.1 / g)
+    assert 30 < result.likelihood_gap[0] <= gap + 1
+
+
+def test_a_gap_below_thirty_is_that_to_the_polished_neighbour() -> None:
+    pixels = draw(np.random.default_rng(35), 12.0, 11.0, 0.33)
+    result = fit_histograms(pixels.counts, pixels.origin)
+    best = estimates(result)[0]
+    a = 1 / best[1]
+    runners = [
+        em_trace(
+            pixels.counts[0], int(pixels.origin[0]), (best[0] + d, best[1], best[2] - d * a, best[3]), 6000
+        )
+        for d in (-1, 1)
+    ]
+    assert 0 < result.likelihood_gap[0] < 30
+    heights = [runner.log_likelihood[-1] for runner in runners]
+    assert result.log_likelihood[0] - max(heights) == pytest.approx(result.likelihood_gap[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("case", [(2.0, 11.0, 0.3), (0.1, 9.0, 0.45), (6.0, 12.0, 0.6), (30.0, 9.0, 0.3)])
+def test_em_never_lowers_the_likelihood(case: tuple[float, float, float]) -> None:
+    pixels = draw(np.random.default_rng(36), *case)
+    rng = np.random.default_rng(37)
+    for _ in range(4):
+        start = pixels.truth[0] * np.exp(rng.normal(0, [0.4, 0.1, 0.01, 0.4]))
+        trace = em_trace(pixels.counts[0], int(pixels.origin[0]), start, 150).log_likelihood
+        slack = 1e-12 * np.abs(trace[0])
+        assert np.all(np.diff(trace) > -slack)
+        assert trace[-1] - trace[0] > 1e6 * slack  # a step that lowered it would be seen
+
+
+def test_plain_em_and_newton_agree() -> None:
+    from pchem_pipeline.model.settings import FitSettings
+
+    pixels = drawn_in_range(38, 60, (0.2, 8), (0.2, 0.38))
+    newton = fit_histograms(pixels.counts, pixels.origin)
+    em = fit_histograms(pixels.counts, pixels.origin, settings=FitSettings(algorithm="em"))
+    stderr = np.sqrt(np.diagonal(newton.covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose((estimates(em) - estimates(newton)) / stderr, 0, atol=3e-4)
+    np.testing.assert_array_equal(em.fit_status, newton.fit_status)
+    assert em.n_iterations.mean() > 2 * newton.n_iterations.mean()
+
+
+def test_goodness_of_fit_is_uniform_where_the_model_holds() -> None:
+    pixels = drawn_in_range(39, 2000, (0.3, 8), (0.2, 0.4))
+    p = fit_histograms(pixels.counts, pixels.origin).goodness_p
+    # a Kolmogorov distance above 0.060 has a chance of 6e-7 at 2000; the rest is for the approximation
+    assert kstest(p, "uniform").statistic < 0.071
+    # and a mixture of two exposures is noticed in every pixel
+    other = draw(np.random.default_rng(40), np.full(50, 1.0), 11.0, 0.3)
+    both = draw(np.random.default_rng(41), np.full(50, 4.0), 11.0, 0.3)
+    counts = np.zeros((50, both.counts.shape[1]), np.uint32)
+    counts[:, : other.counts.shape[1]] += other.counts
+    assert np.all(fit_histograms(counts + both.counts, both.origin).goodness_p < 1e-6)
+
+
+def test_bound_matches_known_values() -> None:
+    # percent of g, e-, percent of sigma at N = 17,750
+    noise = np.array([0.2, 0.305, 0.305, 0.4, 0.5])
+    exposure = np.array([2.0, 0.1, 10.0, 2.0, 2.0])
+    stderr = cramer_rao_stderr(exposure, 0.1, noise / 0.1, 17_750)
+    np.testing.assert_allclose(stderr[:, 1] / 0.1 * 100, [0.12, 1.19, 0.16, 0.58, 1.56], rtol=0.03)
+    np.testing.assert_allclose(stderr[:, 2] * 0.1, [0.003, 0.003, 0.016, 0.012, 0.037], atol=6e-4)
+    np.testing.assert_allclose(stderr[:, 3] / (noise / 0.1) * 100, [0.56, 0.66, 0.87, 1.51, 3.33], rtol=0.01)
+    # a Gaussian with needles: sd(H) = sqrt(H/N), sd(sigma) = sigma / sqrt(2 N)
+    needles = cramer_rao(2.0, 1.0, 0.05, 1000.0)
+    assert needles[0, 0] == pytest.approx(2 / 1000, rel=1e-3)
+    assert needles[3, 3] == pytest.approx(0.05**2 / 2000, rel=1e-3)
+
+
+def test_starting_points_are_near_where_they_should_be() -> None:
+    regression, lobe, cumulants = range(len(START_METHODS))
+    few = drawn_in_range(42, 200, (0.15, 0.6), (0.2, 0.35))
+    many = drawn_in_range(43, 200, (1.5, 8), (0.2, 0.35))
+    for pixels, methods in ((few, (regression, cumulants)), (many, (regression, lobe))):
+        starts = starting_points(pixels.counts, pixels.origin)
+        for method in methods:
+            off = np.abs(starts[:, method, 1] / pixels.truth[:, 1] - 1)
+            assert np.median(off) < 0.15
+    assert np.isnan(starting_points(np.zeros((1, 9), np.uint32), np.array([0]))).all()

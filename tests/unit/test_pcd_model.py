@@ -1,0 +1,102 @@
+"""Density, quantised mass, moments and draws of the PCD."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from pchem_pipeline.model import pcd_numba
+from pchem_pipeline.model.pcd import (
+    analog_read_noise,
+    draw_pcd,
+    log_pcd,
+    pcd,
+    pcd_mass,
+    pcd_moments,
+    total_read_noise,
+)
+
+CASES = [
+    (0.05, 0.1, 50.2, 3.0),
+    (2.0, 0.09, 100.0, 3.4),
+    (15.0, 0.07, -20.0, 6.0),
+    (3.0, 1.0, 0.0, 2.5),
+    (80.0, 0.1, 7.0, 2.0),
+]
+
+
+@pytest.mark.parametrize("theta", CASES)
+def test_density_has_the_moments_of_its_cumulants(theta: tuple[float, float, float, float]) -> None:
+    mean, variance, third, fourth = pcd_moments(*theta)
+    x = np.linspace(mean - 14 * np.sqrt(variance), mean + 40 * np.sqrt(variance), 200_001)
+    weight = pcd(x, *theta) * (x[1] - x[0])
+    d = x - (weight @ x)
+    assert weight.sum() == pytest.approx(1, abs=1e-10)
+    assert weight @ x == pytest.approx(float(mean), rel=1e-10)
+    assert weight @ d**2 == pytest.approx(float(variance), rel=1e-9)
+    assert weight @ d**3 == pytest.approx(float(third), rel=1e-7)
+    assert weight @ d**4 - 3 * (weight @ d**2) ** 2 == pytest.approx(
+        float(fourth), rel=1e-6, abs=1e-6 * float(variance) ** 2
+    )
+
+
+def test_without_electrons_it_is_a_gaussian() -> None:
+    x = np.linspace(-30, 30, 13)
+    np.testing.assert_allclose(log_pcd(x, 0.0, 0.1, 1.0, 2.5), norm.logpdf(x, 1.0, 2.5), rtol=1e-14)
+
+
+def test_far_tails_do_not_underflow() -> None:
+    assert log_pcd(-1000.0, 2.0, 0.1, 0.0, 3.0) == pytest.approx(norm.logpdf(-1000, 0, 3) - 2.0, rel=1e-12)
+    assert np.isfinite(log_pcd(1e5, 2.0, 0.1, 0.0, 3.0))
+
+
+def test_bad_parameters_give_nan_not_an_error() -> None:
+    assert np.isnan(
+        log_pcd(0.0, [-1.0, 1.0, 1.0, np.nan], [0.1, 0.0, 0.1, 0.1], 0.0, [3.0, 3.0, -1.0, 3.0])
+    ).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3, 2.0])
+def test_mass_sums_to_one_and_matches_draws(noise: float) -> None:
+    rng = np.random.default_rng(11)
+    n = 40_000
+    x = np.arange(0, 400)
+    mass = pcd_mass(x, 2.0, 0.21, 120.3, noise)
+    assert mass.sum() == pytest.approx(1, abs=1e-13)
+    seen = np.bincount(draw_pcd(rng, 2.0, 0.21, 120.3, noise, n), minlength=400)[:400]
+    assert np.all(np.abs(seen - n * mass) <= 5 * np.sqrt(n * mass * (1 - mass)) + 3)
+    mean, spread = seen @ x / n, np.sqrt(seen @ x**2 / n - (seen @ x / n) ** 2) / np.sqrt(n)
+    assert abs(mean - mass @ x) < 5 * spread
+    assert (
+        abs(mean - pcd_mass(x, 2.0, 0.21, 122.3, noise) @ x) > 20 * spread
+    )  # a bias off by 2 DN would be seen
+
+
+def test_mass_is_the_integral_of_the_density() -> None:
+    fine = np.linspace(-0.5, 0.5, 2001)
+    x = np.arange(80, 150)
+    sigma = 0.3 / 0.09
+    integral = np.trapezoid(pcd(x[:, None] + fine, 1.5, 0.09, 100.2, sigma), fine, axis=1)
+    np.testing.assert_allclose(pcd_mass(x, 1.5, 0.09, 100.2, 0.3), integral, atol=1e-9)
+
+
+def test_read_noise_with_and_without_quantisation() -> None:
+    assert total_read_noise(0.3, 0.1) == pytest.approx(np.sqrt(9 + 1 / 12))
+    assert analog_read_noise(total_read_noise(0.3, 0.1), 0.1) == pytest.approx(0.3)
+    assert analog_read_noise(0.2, 0.1) == 0
+
+
+def test_compiled_equals_plain() -> None:
+    rng = np.random.default_rng(2)
+    arguments = [
+        rng.uniform(80, 140, 30),
+        rng.uniform(0.1, 5, 30),
+        rng.uniform(0.05, 0.2, 30),
+        np.full(30, 100.0),
+    ]
+    for kernel, last in ((pcd_numba.log_densities, 3.0), (pcd_numba.masses, 0.3)):
+        compiled, plain = np.empty(30), np.empty(30)
+        kernel(*arguments, np.full(30, last), compiled)
+        kernel.py_func(*arguments, np.full(30, last), plain)
+        np.testing.assert_allclose(compiled, plain, rtol=1e-12)
