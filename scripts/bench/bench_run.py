@@ -1,7 +1,7 @@
 """From camera file to report with one command: wall time, CPU time and peak memory of every stage.
 
-The peer in the same run is reading the same file once with ``readinto``, the floor of any method. Make the file
-of the paper's size (9.3 GB) with scripts/simulate_full_size.py. Example:
+The peer in the same run is reading the same file once with ``readinto``, the floor of any method. Make the
+file of the paper's size (9.3 GB) with scripts/simulate_full_size.py. Example:
 
     python scripts/simulate_full_size.py /data/full
     python scripts/bench/bench_run.py /data/full/frames/frames.raw --workers 2
@@ -71,7 +71,7 @@ def main() -> None:
         )
     print(f"{'pchem run':<12}{wall:>9.1f}{cpu:>9.1f}{size / 1e9 / wall:>9.2f}{peak:>17.0f}")
     print(
-        f"{'readinto':<12}{floor:>9.1f}{'':>9}{size / 1e9 / floor:>9.2f}   (floor; the run takes {wall / floor:.1f} x)"
+        f"{'readinto':<12}{floor:>9.1f}{'':>9}{size / 1e9 / floor:>9.2f}   (the run takes {wall / floor:.1f} x)"
     )
 
 
