@@ -70,9 +70,8 @@ def main() -> None:
             f"{record['stage']:<12}{record['seconds']:>9.1f}{record['cpu_seconds']:>9.1f}{speed:>9}{peak_mib:>17.0f}"
         )
     print(f"{'pchem run':<12}{wall:>9.1f}{cpu:>9.1f}{size / 1e9 / wall:>9.2f}{peak:>17.0f}")
-    print(
-        f"{'readinto':<12}{floor:>9.1f}{'':>9}{size / 1e9 / floor:>9.2f}   (the run takes {wall / floor:.1f} x)"
-    )
+    ratio = f"   (the run takes {wall / floor:.1f} x)"
+    print(f"{'readinto':<12}{floor:>9.1f}{'':>9}{size / 1e9 / floor:>9.2f}{ratio}")
 
 
 if __name__ == "__main__":
