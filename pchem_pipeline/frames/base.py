@@ -39,6 +39,8 @@ class FrameReader(ABC):
         integration_time: s, where the file says so.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
+        rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
+            any rows can be read alone.
     """
 
     format_name: ClassVar[str] = ""
@@ -53,6 +55,7 @@ class FrameReader(ABC):
     integration_time: float | None = None
     timestamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
+    rows_per_read: int = 1
 
     @classmethod
     @abstractmethod

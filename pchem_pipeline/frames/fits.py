@@ -73,6 +73,8 @@ class FitsReader(ContiguousReader):
             signed = False if biased else check_samples(path, stored, settings)
             n, rows, columns = stack_shape(path, sizes, "image")
             compressed = isinstance(hdu, fits.CompImageHDU)
+            if compressed:
+                self.rows_per_read = min(rows, int(hdu.tile_shape[-2]))
             start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
             end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
             self._read_facts(primary, header)

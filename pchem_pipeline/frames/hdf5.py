@@ -73,6 +73,8 @@ class Hdf5Reader(FrameReader):
         self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
         self.dtype = unsigned_type(dataset.dtype)
         self._full = tuple(dataset.shape)
+        if dataset.chunks is not None:
+            self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         self._read_facts(dataset)
 
     def _read_facts(self, dataset: Any) -> None:

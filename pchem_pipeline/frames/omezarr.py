@@ -61,6 +61,7 @@ class ZarrReader(FrameReader):
         self.shape = stack_shape(path, array.shape, f"array {self._name}".strip())
         self.dtype = unsigned_type(np.dtype(array.dtype))
         self._full = tuple(array.shape)
+        self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         self._array = array
         time, depth = attributes.get("integration_time"), attributes.get("bit_depth")
         if isinstance(time, int | float) and 0 < time < np.inf:

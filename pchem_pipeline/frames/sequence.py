@@ -54,6 +54,7 @@ class FrameSequence(FrameReader):
         self._columns = columns
         self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
         self.dtype = readers[0].dtype
+        self.rows_per_read = max(reader.rows_per_read for reader in readers)
         self._set_facts(readers, settings, end)
 
     def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:

@@ -143,6 +143,7 @@ class TiffReader(ContiguousReader):
         self.dtype = unsigned_type(np.dtype(first.dtype))
         self._size = size
         self._signed = signed
+        self.rows_per_read = min(rows, int(height.max()))
         self._segments = _Segments(offsets, counts, model, -(-columns // width), height)
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:

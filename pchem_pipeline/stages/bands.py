@@ -11,7 +11,15 @@ from pchem_pipeline.model.histogram_settings import HistogramSettings
 from pchem_pipeline.model.summaries import ROW_GROUP
 from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["CHUNK_BLOCKS", "COLUMN_FRAMES", "Band", "bytes_per_row", "plan_bands", "row_frames"]
+__all__ = [
+    "CHUNK_BLOCKS",
+    "COLUMN_FRAMES",
+    "Band",
+    "bytes_per_row",
+    "plan_bands",
+    "row_frames",
+    "rows_together",
+]
 
 #: frames, or blocks, in a chunk of the arrays along time
 COLUMN_FRAMES = 1024
@@ -71,7 +79,7 @@ def plan_bands(
     """
     ny = tiles[-1].y1
     step = max(tiles[0].y1, ROW_GROUP)
-    aligned = math.lcm(step, min(rows_per_read, ny))
+    aligned = rows_together(step, rows_per_read, ny, workers)
     if min(aligned, ny) <= most_rows:
         step = aligned
     keys: dict[int, list[str]] = {}
@@ -89,6 +97,23 @@ def plan_bands(
         bands.append(Band(first * step, min(end * step, ny), names))
         first = end
     return bands
+
+
+def rows_together(step: int, rows_per_read: int, ny: int, workers: int) -> int:
+    """Return the multiple of ``step`` by which bands should grow so that little is decoded twice.
+
+    Args:
+        step: rows that must not be cut.
+        rows_per_read: rows that come at no more cost than one.
+        ny: rows of the sensor.
+        workers: number of workers, which should all get a band.
+
+    Returns:
+        Rows; no read is shared by two bands where each worker still gets one, else few are.
+    """
+    rows = min(rows_per_read, ny)
+    exact = math.lcm(step, rows)
+    return exact if exact * workers <= ny else step * math.ceil(rows / step)
 
 
 def row_frames(ny: int) -> int:

@@ -80,7 +80,7 @@ def run(context: StageContext) -> None:
         )
     depth = context.store.array("electrons/electron_number").chunks[0]
     rows = _BLOCK_BYTES // (depth * nx * 2)
-    bands = tile_bands(context, "fit", rows, int(getattr(source, "rows_per_read", 1)))
+    bands = tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, store=context.store.path, source=source, depth=depth)
     context.run_units(bands, task, unit_name="band", needs="fit")
 

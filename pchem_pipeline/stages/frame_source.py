@@ -31,6 +31,11 @@ class FrameSource(Protocol):
         """Type of the samples."""
         ...
 
+    @property
+    def rows_per_read(self) -> int:
+        """Rows that are decoded together, and so come at no more cost than one."""
+        ...
+
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """Fill ``buffer`` (frame, y, x) with frames t0..t1 and rows y0..y1, ends excluded."""
         ...

@@ -138,8 +138,7 @@ def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
     most = (settings.band_memory << 20) // row
     pending = {tile.key for tile in context.pending(tiles)}
-    together = int(getattr(source, "rows_per_read", 1))
-    bands = plan_bands(tiles, pending, most, context.executor.workers, together)
+    bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
     highest = max(band.y1 - band.y0 for band in bands)
     if highest > most:
         context.note(
@@ -203,7 +202,8 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
     tiles = context.tiles()
     most = (settings.band_memory << 20) // row
-    bands = plan_bands(tiles, {tile.key for tile in tiles}, most, context.executor.workers)
+    everything = {tile.key for tile in tiles}
+    bands = plan_bands(tiles, everything, most, context.executor.workers, source.rows_per_read)
     context.stop.check()
     # starting other processes takes longer than this does on all but huge sensors
     few = settings.window_frames * math.prod(source.shape[1:]) < _FEW_SAMPLES

@@ -6,10 +6,9 @@ them. A tile that is done, or that is not to be done, is in no band and stays a 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-from pchem_pipeline.stages.bands import Band
+from pchem_pipeline.stages.bands import Band, rows_together
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.store.tiles import Tile
 
@@ -34,8 +33,10 @@ def tile_bands(
     ready = context.tiles_done(needs)
     todo = {tile.key for tile in context.pending(tiles)} & ready
     step = tiles[0].y1
-    together = math.lcm(step, rows_per_read)
-    if together <= most_rows and together * context.executor.workers <= tiles[-1].y1:
+    ny, workers = tiles[-1].y1, context.executor.workers
+    together = rows_together(step, rows_per_read, ny, workers)
+    # one worker that decodes once is faster than all of them that decode the same many times
+    if min(together, ny) <= most_rows and (together * workers <= ny or together > step * workers):
         step = together
     groups: dict[int, list[Tile]] = {}
     for tile in tiles:

@@ -59,6 +59,9 @@ def test_rows_that_are_decoded_together_stay_together():
     everything = {tile.key for tile in tiles}
     assert len(plan_bands(tiles, everything, 10_000, 8, rows_per_read=128)) == 4
     assert len(plan_bands(tiles, everything, 10_000, 8, rows_per_read=512)) == 1
+    # odd strips: each worker keeps its band, at the price of a few strips decoded twice
+    assert len(plan_bands(tiles, everything, 10_000, 4, rows_per_read=27)) == 4
+    assert len(plan_bands(tiles, everything, 10_000, 2, rows_per_read=500)) == 1
     # unless memory forbids
     assert len(plan_bands(tiles, everything, 64, 8, rows_per_read=512)) == 8
 
@@ -78,6 +81,7 @@ def test_row_sums_of_tall_sensors_are_read_in_smaller_pieces():
 class _Source:
     def __init__(self, frames, broken_at=None):
         self._frames, self.shape, self.dtype = frames, frames.shape, frames.dtype
+        self.rows_per_read = 1
         self._broken_at = broken_at
 
     def read_into(self, buffer, t0, t1, y0=0, y1=None):
