@@ -337,8 +337,27 @@ def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
     for name in PARAMETERS:
         context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
     state = execute("ensemble", context)
-    assert state.state == "failed"
-    assert "no pixel has a value" in state.why
+    assert state.state == "complete"
+    assert context.store.records.read("ensemble").notes[0].startswith("no pixel has a value")
+    assert not context.store.has("ensemble/density")
+    assert execute("ensemble", context) == state
+
+
+def test_no_pixel_with_a_value_so_far(prepared: Path, tmp_path: Path) -> None:
+    """Tiles that the fit has not finished are no reason to call the ensemble done."""
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path)
+    write_fit(context, tiles=["0.0"])
+    good = {name: context.store.read(f"fit/{name}") for name in PARAMETERS}
+    for name in PARAMETERS:
+        context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
+    assert execute("ensemble", context).state == "failed"
+    write_fit(context)
+    for name, values in good.items():
+        values = np.where(np.isnan(values), context.store.read(f"fit/{name}"), values)
+        context.store.write_array(f"fit/{name}", values)
+    assert execute("ensemble", make_context(tmp_path)).state == "complete"
+    assert np.isfinite(context.store.read("ensemble/density")).all()
 
 
 @pytest.mark.parametrize("n_samples", [(20_000, 20_000), (5_000, 80_000)])
