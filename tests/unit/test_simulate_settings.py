@@ -118,5 +118,5 @@ def test_the_settings_import_nothing_heavy():
 
 def test_the_commented_yaml_of_a_simulated_run_gives_the_defaults():
     text = commented_config("config.yaml", files=[], simulated=True)
-    assert parse_config(text).simulate == SimulateSettings()
+    assert parse_config(text).simulate == SimulateSettings(output="config-frames")
     assert "loguniform (low, high)" in " ".join(text.replace("#", " ").split())
