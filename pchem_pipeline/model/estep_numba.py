@@ -7,6 +7,9 @@ For the values nearest to component ``j``, with ``d = y - m - j a``, the compone
 ``(P_{j+l} / P_j) exp(-l^2 a^2 / 2 sigma^2) r^l`` with ``r = exp(d a / sigma^2)``: a polynomial in ``r``, and
 ``r`` is a geometric sequence over successive DN. The posterior moments of ``l`` up to the fourth give the
 score and ``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
+
+First `_fill` lays the values out in a table, a column for each DN, with the polynomial's coefficients; then
+one loop without branches or calls runs over the columns, which the compiler turns into vector instructions.
 """
 
 from __future__ import annotations
@@ -20,13 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.workspace_numba import (
+    CAPACITY,
+    LANES,
     LOGLIK,
-    N_TOTAL,
-    SUM_E,
-    SUM_EE,
-    SUM_K,
-    SUM_KE,
-    SUM_KK,
+    MAX_COMPONENTS,
     Histogram,
     Workspace,
 )
@@ -38,76 +38,101 @@ _REORDER = {"reassoc", "nsz", "contract", "arcp"}
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
 _LARGEST_RATIO = 1e145  # keeps r^2 finite when the peaks are needles
 
+# rows of the table; the coefficients follow
+_WEIGHT, _RATIO, _OFFSET, _LOWEST, _LEVEL, _COEFFICIENT = range(6)
+# places in `totals`: LOGLIK, the five sums of `Workspace.total`, then sums of c times var(i), cov(i, i^2)
+# and var(i^2),
+# i counted from the lowest component, times powers of the offset d from it and of w = d - a lowest
+_V11, _V11W, _V11D, _V11WW, _V11DW, _V11DD, _V12, _V12W, _V12D, _V22 = range(6, 16)
+_N_TOTALS = 16
+
 LOG_2PI = math.log(2.0 * math.pi)
+_LN2 = math.log(2.0)
+_MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
+_ONE = np.int64(0x3FF0000000000000)
 
-# Places in `sums`, the sums over one block of values; c count, d offset from the block's lowest component,
-# m1 and m2 posterior moments of i, v11 var(i), v12 cov(i, i^2), v22 var(i^2), i counted from that component
 
-
-def _block_kernel(width: int) -> Callable[..., Any]:
-    """Make the loop over the values of a block for a fixed number of components (0: given at run time)."""
+def _table_kernel(width: int) -> Callable[..., Any]:
+    """Make the loop over the columns for a fixed number of components (0: given at run time)."""
 
     @nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
-    def block_sums(
-        weights: NDArray[np.float64],
-        start: int,
-        stop: int,
-        offset: float,
-        top_ratio: float,
-        powers: NDArray[np.float64],
-        prior: NDArray[np.float64],
-        components: int,
-        densities: NDArray[np.float64],
-        sums: NDArray[np.float64],
+    def table_sums(
+        table: NDArray[np.float64], columns: int, components: int, a: float, totals: NDArray[np.float64]
     ) -> None:
         terms = width if width > 0 else components
-        n = stop - start
-        a0 = ad = add = b1 = b1d = b2 = 0.0
-        v11 = v11d = v11dd = v12 = v12d = v22 = 0.0
-        for i in range(n):
-            c = weights[start + i]
-            d = offset + i
-            ratio = min(top_ratio * powers[n - 1 - i], _LARGEST_RATIO)
+        loglik = sum_k = sum_kk = sum_ke = sum_e = sum_ee = 0.0
+        v11 = v11w = v11d = v11ww = v11dw = v11dd = v12 = v12w = v12d = v22 = 0.0
+        for i in range(columns):
+            c, ratio, d = table[_WEIGHT, i], table[_RATIO, i], table[_OFFSET, i]
+            low = table[_LOWEST, i]
             power = 1.0
-            s0 = prior[0]
+            s0 = table[_COEFFICIENT, i]
             s1 = s2 = s3 = s4 = 0.0
             for k in range(1, terms):
                 power = power * ratio
-                term = prior[k] * power
+                term = table[_COEFFICIENT + k, i] * power
                 s0 += term
                 s1 += k * term
                 s2 += k * k * term
                 s3 += k * k * k * term
                 s4 += k * k * k * k * term
-            densities[start + i] = s0
+            # log(s0): exponent, and 2 artanh((f - 1)/(f + 1)) of the fraction f in [sqrt(1/2), sqrt(2))
+            bits = np.float64(s0).view(np.int64)
+            fraction = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
+            exponent = float((bits >> 52) - 1023)
+            large = 1.0 if fraction > 1.4142135623730951 else 0.0
+            fraction = fraction * (1.0 - 0.5 * large)
+            q = (fraction - 1.0) / (fraction + 1.0)
+            z = q * q
+            series = 1 / 15 + z * (1 / 17 + z * (1 / 19 + z / 21))
+            series = 1 / 7 + z * (1 / 9 + z * (1 / 11 + z * (1 / 13 + z * series)))
+            series = 1.0 + z * (1 / 3 + z * (1 / 5 + z * series))
+            loglik += c * (table[_LEVEL, i] + (exponent + large) * _LN2 + 2.0 * q * series)
             inverse = 1.0 / s0
             m1, m2, m3, m4 = s1 * inverse, s2 * inverse, s3 * inverse, s4 * inverse
-            cd = c * d
-            e11, e12, e22 = m2 - m1 * m1, m3 - m1 * m2, m4 - m2 * m2
-            a0 += c
-            ad += cd
-            add += cd * d
-            b1 += c * m1
-            b1d += cd * m1
-            b2 += c * m2
-            v11 += c * e11
-            v11d += cd * e11
-            v11dd += cd * d * e11
-            v12 += c * e12
-            v12d += cd * e12
-            v22 += c * e22
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a0, ad, add, b1, b1d, b2
-        sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = v11, v11d, v11dd, v12, v12d, v22
+            w = d - a * low
+            sum_k += c * (low + m1)
+            sum_kk += c * (low * (low + 2.0 * m1) + m2)
+            sum_ke += c * (low * d + m1 * w - a * m2)
+            sum_e += c * (d - a * m1)
+            sum_ee += c * (d * d - a * (2.0 * d * m1 - a * m2))
+            c11, c12, c22 = c * (m2 - m1 * m1), c * (m3 - m1 * m2), c * (m4 - m2 * m2)
+            v11 += c11
+            v11w += c11 * w
+            v11d += c11 * d
+            v11ww += c11 * w * w
+            v11dw += c11 * d * w
+            v11dd += c11 * d * d
+            v12 += c12
+            v12w += c12 * w
+            v12d += c12 * d
+            v22 += c22
+        totals[0] += loglik
+        totals[1] += sum_k
+        totals[2] += sum_kk
+        totals[3] += sum_ke
+        totals[4] += sum_e
+        totals[5] += sum_ee
+        totals[6] += v11
+        totals[7] += v11w
+        totals[8] += v11d
+        totals[9] += v11ww
+        totals[10] += v11dw
+        totals[11] += v11dd
+        totals[12] += v12
+        totals[13] += v12w
+        totals[14] += v12d
+        totals[15] += v22
 
-    kernel: Callable[..., Any] = block_sums
+    kernel: Callable[..., Any] = table_sums
     return kernel
 
 
-block_sums_3 = _block_kernel(3)
-block_sums_5 = _block_kernel(5)
-block_sums_7 = _block_kernel(7)
-block_sums_9 = _block_kernel(9)
-block_sums_any = _block_kernel(0)
+table_sums_3 = _table_kernel(3)
+table_sums_5 = _table_kernel(5)
+table_sums_7 = _table_kernel(7)
+table_sums_9 = _table_kernel(9)
+table_sums_any = _table_kernel(0)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -118,7 +143,7 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int) -
     if electron_noise > 0.5:  # the Poisson factor moves the largest term away from the nearest component
         tilt = max(abs(math.log(exposure / (first + 1.0))), abs(math.log(exposure / (last + 1.0))))
         half += math.ceil(variance * tilt)
-    return half
+    return min(half, (MAX_COMPONENTS - 1) // 2)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -141,101 +166,114 @@ def _fill_prior(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _add_block(
-    sums: NDArray[np.float64],
-    low: float,
-    a: float,
-    s2: float,
-    total: NDArray[np.float64],
-    cov: NDArray[np.float64],
+def _sum_table(
+    table: NDArray[np.float64], filled: int, width: int, a: float, totals: NDArray[np.float64]
 ) -> None:
-    """Add one block to the totals and to the conditional covariance of the complete-data score."""
-    a0, ad, add, b1, b1d, b2 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-    v11, v11d, v11dd, v12, v12d, v22 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
-    total[SUM_K] += low * a0 + b1
-    total[SUM_KK] += low * low * a0 + 2.0 * low * b1 + b2
-    total[SUM_KE] += low * ad + b1d - a * low * b1 - a * b2
-    total[SUM_E] += ad - a * b1
-    total[SUM_EE] += add - 2.0 * a * b1d + a * a * b2
-    # S = const + alpha i + beta i^2: alpha = (1, u, -a/s2, -a d/s2), u = (d - a low)/s2; beta = (0, -a/s2,
-    # 0, a^2/2 s2)
-    t = a / s2
-    low_a = low * a
-    u11 = (v11d - low_a * v11) / s2
-    cov[0, 0] += v11
-    cov[0, 1] += u11 - t * v12
-    cov[0, 3] += 0.5 * a * t * v12 - t * v11d
-    cov[1, 1] += (
-        (v11dd - 2.0 * low_a * v11d + low_a * low_a * v11) / (s2 * s2)
-        - 2.0 * t * (v12d - low_a * v12) / s2
-        + t * t * v22
-    )
-    cov[1, 3] += (
-        -t * (v11dd - low_a * v11d) / s2
-        + 0.5 * a * t * (v12d - low_a * v12) / s2
-        + t * t * v12d
-        - 0.5 * a * t * t * v22
-    )
-    cov[3, 3] += t * t * (v11dd - a * v12d + 0.25 * a * a * v22)
+    """Fill up the last vector with columns of no weight, and sum with the loop for this many components."""
+    columns = (filled + LANES - 1) // LANES * LANES
+    for i in range(filled, columns):
+        for row in range(_COEFFICIENT + width):
+            table[row, i] = 0.0
+        table[_COEFFICIENT, i] = 1.0
+    if width == 3:
+        table_sums_3(table, columns, 3, a, totals)
+    elif width == 5:
+        table_sums_5(table, columns, 5, a, totals)
+    elif width == 7:
+        table_sums_7(table, columns, 7, a, totals)
+    elif width == 9:
+        table_sums_9(table, columns, 9, a, totals)
+    else:
+        table_sums_any(table, columns, width, a, totals)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _finish(
-    theta: NDArray[np.float64],
-    n: float,
-    total: NDArray[np.float64],
-    score: NDArray[np.float64],
-    information: NDArray[np.float64],
+def _expect(
+    table: NDArray[np.float64], filled: int, width: int, frames: float, start: int, out: NDArray[np.float64]
 ) -> None:
-    """Turn the totals and conditional covariances into the score and Louis' observed information."""
-    exposure, a, s2 = math.exp(theta[0]), theta[1], math.exp(theta[3])
-    t = a / s2
-    sum_k, sum_kk, sum_ke = total[SUM_K], total[SUM_KK], total[SUM_KE]
-    sum_e, sum_ee = total[SUM_E], total[SUM_EE]
+    """Leave the counts expected of the DN in the table, from ``start`` on, in ``out``."""
+    for i in range(filled):
+        power = 1.0
+        density = table[_COEFFICIENT, i]
+        for k in range(1, width):
+            power *= table[_RATIO, i]
+            density += table[_COEFFICIENT + k, i] * power
+        out[start + i] = frames * density * math.exp(table[_LEVEL, i])
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _finish(n: float, theta: NDArray[np.float64], totals: NDArray[np.float64], space: Workspace) -> None:
+    """Turn the totals into score and observed information.
+
+    With ``S = const + alpha i + beta i^2``, ``alpha = (1, w/s2, -a/s2, -a d/s2)`` and ``beta = (0, -a/s2, 0,
+    a^2/2 s2)``, the conditional covariance of the complete-data score is made of the sums of var(i),
+    cov(i, i^2) and var(i^2) times powers of d and w.
+    """
+    total, score, information = space.total, space.score, space.information
+    exposure, a, inverse = math.exp(theta[0]), theta[1], math.exp(-theta[3])
+    t = a * inverse
+    for i in range(6):
+        total[i] = totals[i]
+    sum_k, sum_kk, sum_ke, sum_e, sum_ee = totals[1], totals[2], totals[3], totals[4], totals[5]
+    v11, v12, v22 = totals[_V11], totals[_V12], totals[_V22]
+    cov01 = inverse * totals[_V11W] - t * v12
+    cov03 = 0.5 * a * t * v12 - t * totals[_V11D]
+    cov11 = inverse * (inverse * totals[_V11WW] - 2.0 * t * totals[_V12W]) + t * t * v22
+    cov13 = t * inverse * (0.5 * a * totals[_V12W] - totals[_V11DW])
+    cov13 += t * t * (totals[_V12D] - 0.5 * a * v22)
+    cov33 = t * t * (totals[_V11DD] - a * totals[_V12D] + 0.25 * a * a * v22)
     score[0] = sum_k - n * exposure
-    score[1] = sum_ke / s2
-    score[2] = sum_e / s2
-    score[3] = 0.5 * (sum_ee / s2 - n)
-    cov00, cov01, cov03 = information[0, 0], information[0, 1], information[0, 3]
-    information[0, 0] = n * exposure - cov00
+    score[1] = sum_ke * inverse
+    score[2] = sum_e * inverse
+    score[3] = 0.5 * (sum_ee * inverse - n)
+    information[0, 0] = n * exposure - v11
     information[0, 1] = -cov01
-    information[0, 2] = t * cov00
+    information[0, 2] = t * v11
     information[0, 3] = -cov03
-    information[1, 1] = sum_kk / s2 - information[1, 1]
-    information[1, 2] = sum_k / s2 + t * cov01
-    information[1, 3] = sum_ke / s2 - information[1, 3]
-    information[2, 2] = n / s2 - t * t * cov00
-    information[2, 3] = sum_e / s2 + t * cov03
-    information[3, 3] = 0.5 * sum_ee / s2 - information[3, 3]
+    information[1, 1] = sum_kk * inverse - cov11
+    information[1, 2] = sum_k * inverse + t * cov01
+    information[1, 3] = sum_ke * inverse - cov13
+    information[2, 2] = n * inverse - t * t * v11
+    information[2, 3] = sum_e * inverse + t * cov03
+    information[3, 3] = 0.5 * sum_ee * inverse - cov33
     for row in range(1, 4):
         for column in range(row):
             information[row, column] = information[column, row]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _sum_block(
-    width: int,
+def _fill(
+    table: NDArray[np.float64],
+    filled: int,
     weights: NDArray[np.float64],
     start: int,
     stop: int,
-    offset: float,
-    top_ratio: float,
-    powers: NDArray[np.float64],
+    nearest: float,
+    shift: float,
+    low: float,
+    level: float,
+    a: float,
+    inverse: float,
     prior: NDArray[np.float64],
-    densities: NDArray[np.float64],
-    sums: NDArray[np.float64],
+    width: int,
+    powers: NDArray[np.float64],
 ) -> None:
-    """Choose the loop compiled for this number of components."""
-    if width == 3:
-        block_sums_3(weights, start, stop, offset, top_ratio, powers, prior, 3, densities, sums)
-    elif width == 5:
-        block_sums_5(weights, start, stop, offset, top_ratio, powers, prior, 5, densities, sums)
-    elif width == 7:
-        block_sums_7(weights, start, stop, offset, top_ratio, powers, prior, 7, densities, sums)
-    elif width == 9:
-        block_sums_9(weights, start, stop, offset, top_ratio, powers, prior, 9, densities, sums)
-    else:
-        block_sums_any(weights, start, stop, offset, top_ratio, powers, prior, width, densities, sums)
+    """Lay out the DN from ``start`` to ``stop``; the first is ``nearest`` DN off their nearest component."""
+    n = stop - start
+    top = math.exp((nearest + n - 1) * a * inverse)
+    for i in range(n):
+        d = nearest + i
+        column = filled + i
+        table[_WEIGHT, column] = weights[start + i]
+        table[_RATIO, column] = min(top * powers[n - 1 - i], _LARGEST_RATIO)
+        table[_OFFSET, column] = d + shift
+        table[_LOWEST, column] = low
+        table[_LEVEL, column] = level - (0.5 * d + shift) * d * inverse
+    for k in range(width):
+        coefficient = prior[k]
+        row = table[_COEFFICIENT + k]
+        for column in range(filled, filled + n):
+            row[column] = coefficient
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -252,58 +290,56 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
         The log-likelihood, nats.
     """
     weights, cumulative, n_bins, first, _, _, _ = histogram
-    work, total, score, information = space
-    exposure, a, origin, s2 = math.exp(theta[0]), theta[1], theta[2], math.exp(theta[3])
-    densities, powers, prior = work[0], work[1], work[2]
+    table, expected, powers, totals = space.table, space.rows[0], space.rows[1], space.rows[2]
+    prior = space.rows[3]
+    exposure, a, origin, inverse = math.exp(theta[0]), theta[1], theta[2], math.exp(-theta[3])
     j = max(0, math.floor((first - origin) / a + 0.5))
     last = max(j, math.floor((first + n_bins - 1 - origin) / a + 0.5))
-    half = _half_width(math.sqrt(s2) / a, exposure, j, last)
-    width = min(2 * half + 1, prior.size)
-    overlap = math.exp(-0.5 * a * a / s2)
-    decay = math.exp(-a / s2)
-    filled = 1
+    half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last)
+    width = 2 * half + 1
+    overlap = math.exp(-0.5 * a * a * inverse)
+    decay = math.exp(-a * inverse)
     powers[0] = 1.0
-    sums = work[3]
-    for i in range(4):
-        for k in range(4):
-            information[i, k] = 0.0
-    for i in range(N_TOTAL):
-        total[i] = 0.0
-    log_prior = j * theta[0] - exposure - math.lgamma(j + 1.0)
-    loglik: float = -0.5 * cumulative[n_bins] * (theta[3] + LOG_2PI)
+    known = 1
+    for i in range(_N_TOTALS):
+        totals[i] = 0.0
+    level = j * theta[0] - exposure - math.lgamma(j + 1.0) - 0.5 * (theta[3] + LOG_2PI)
     start = n_bins - n_bins  # 0 as a variable, lest a constant have its own compilation
+    filled = start
     while start < n_bins:
-        stop = min(n_bins, math.ceil(origin + (j + 0.5) * a - first))
+        end = min(n_bins, math.ceil(origin + (j + 0.5) * a - first))
         if j == last:
-            stop = n_bins
-        if stop > start and cumulative[stop] > cumulative[start]:
-            while filled < stop - start:
-                powers[filled] = powers[filled - 1] * decay
-                filled += 1
+            end = n_bins
+        empty = end <= start or cumulative[end] == cumulative[start]
+        if not empty:
             low = max(0, j - half)
             _fill_prior(prior, j, low, width, exposure, overlap)
-            nearest = first + start - origin - j * a
-            shift = (j - low) * a
-            top = math.exp((nearest + stop - 1 - start) * a / s2)
-            _sum_block(width, weights, start, stop, nearest + shift, top, powers, prior, densities, sums)
-            logs = 0.0
-            for i in range(start, stop):
-                logs += weights[i] * math.log(densities[i])
-            d1 = sums[1] - shift * sums[0]
-            d2 = sums[2] - shift * (2.0 * sums[1] - shift * sums[0])
-            loglik += logs + sums[0] * log_prior - 0.5 * d2 / s2 - shift * d1 / s2
-            _add_block(sums, float(low), a, s2, total, information)
-            if frames > 0.0:
-                level = math.log(frames) + log_prior - 0.5 * (theta[3] + LOG_2PI)
-                for i in range(start, stop):
-                    d = nearest + (i - start)
-                    densities[i] *= math.exp(level - (0.5 * d + shift) * d / s2)
-        elif frames > 0.0:
-            for i in range(start, stop):
-                densities[i] = 0.0
-        start = max(start, stop)
+        while start < end:
+            stop = min(end, start + CAPACITY)
+            if filled + stop - start > CAPACITY:
+                _sum_table(table, filled, width, a, totals)
+                filled = 0
+            if empty:
+                if frames > 0.0:
+                    for i in range(start, end):
+                        expected[i] = 0.0
+                stop = end
+            else:
+                while known < stop - start:
+                    powers[known] = powers[known - 1] * decay
+                    known += 1
+                nearest = first + start - origin - j * a
+                shift = (j - low) * a
+                _fill(
+                    table, filled, weights, start, stop, nearest, shift, float(low), level, a, inverse,
+                    prior, width, powers,
+                )  # fmt: skip
+                if frames > 0.0:
+                    _expect(table[:, filled:], stop - start, width, frames, start, expected)
+                filled += stop - start
+            start = stop
         j += 1
-        log_prior += theta[0] - math.log(j)
-    total[LOGLIK] = loglik
-    _finish(theta, cumulative[n_bins], total, score, information)
-    return loglik
+        level += theta[0] - math.log(j)
+    _sum_table(table, filled, width, a, totals)
+    _finish(cumulative[n_bins], theta, totals, space)
+    return float(totals[LOGLIK])

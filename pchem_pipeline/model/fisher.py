@@ -66,7 +66,8 @@ def observed_covariance(counts: ArrayLike, origin: int, parameters: ArrayLike) -
         Covariance of (H, g, mu, sigma), shape (4, 4); NaN where the information is not positive definite.
     """
     weights = np.asarray(counts, np.float64)
-    histogram, centre, _ = workspace_numba.load(weights, np.empty(weights.size), np.empty(weights.size + 1))
+    room = np.empty(weights.size), np.empty(weights.size + 1)
+    histogram, centre, _ = workspace_numba.load(weights, *room)
     exposure, gain, bias, sigma = (float(value) for value in np.asarray(parameters, np.float64))
     middle = float(origin + centre)
     theta = np.array([np.log(exposure), 1.0 / gain, bias - middle, 2.0 * np.log(sigma)])

@@ -29,6 +29,7 @@ from pchem_pipeline.model.workspace_numba import (
     load,
     make_rows,
     make_workspace,
+    share_workspace,
 )
 
 # bits of fit_status; a test compares them with FitStatus
@@ -229,7 +230,7 @@ def fit_tile(
     n_most = counts.shape[1]
     weights, cumulative = np.empty(n_most), np.empty(n_most + 1)
     space = make_workspace(make_rows(n_most))
-    at_best = make_workspace(space.rows)
+    at_best = share_workspace(space)
     theta = np.empty(4)
     held = np.zeros(4, np.bool_)
     own_limits = limits.copy()

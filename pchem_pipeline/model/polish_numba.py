@@ -25,6 +25,7 @@ from pchem_pipeline.model.workspace_numba import (
     copy_answers,
     make_rows,
     make_workspace,
+    share_workspace,
 )
 
 # outcomes of `polish`
@@ -116,7 +117,7 @@ def newton_step(
         Half the squared Newton decrement, the expected rise of the log-likelihood, and the share used. Only
         with a share of 0 does the former say how far the maximum is.
     """
-    _, total, score, information = space
+    total, score, information = space.total, space.score, space.information
     held = np.zeros(4, np.bool_)
     held[0] = theta[0] <= bound + 1e-12 and score[0] <= 0.0
     held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-12 and score[3] <= 0.0
@@ -197,7 +198,7 @@ def polish(
     bound, tolerance = limits[MIN_LOG_EXPOSURE], limits[TOLERANCE]
     n = histogram.n
     trial, step = np.empty(4), np.empty(4)
-    ahead = make_workspace(space.rows)
+    ahead = share_workspace(space)
     theta[0] = max(bound, theta[0])
     theta[3] = max(min_log_variance(theta[1]), theta[3])
     if degenerate(theta, limits[MAX_STEP]):

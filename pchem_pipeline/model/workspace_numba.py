@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 LOGLIK, SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(6)
 N_TOTAL = 6
 N_ROWS = 9
-_MIN_COLUMNS = 160  # the frequencies of the starting points
+LANES = 8  # doubles in the widest vector register
+CAPACITY = 256  # columns of the table of an evaluation; a longer histogram goes through in pieces
+MAX_COMPONENTS = 201  # of which a value may be a mixture
+_MIN_COLUMNS = 256  # the frequencies of the starting points, a value's components, a table's columns
 
 
 class Histogram(NamedTuple):
@@ -43,6 +46,7 @@ class Workspace(NamedTuple):
 
     Attributes:
         rows: scratch, shape (N_ROWS, enough).
+        table: scratch, a column for each DN.
         total: log-likelihood and the sums over frames of E[k], E[k^2], E[k e], E[e], E[e^2] with
             ``e = x - mu - k/g``; the names above are their places.
         score: gradient of the log-likelihood in theta, shape (4,).
@@ -50,6 +54,7 @@ class Workspace(NamedTuple):
     """
 
     rows: NDArray[np.float64]
+    table: NDArray[np.float64]
     total: NDArray[np.float64]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -63,8 +68,15 @@ def make_rows(n_bins: int) -> NDArray[np.float64]:
 
 @nb.njit(nogil=True, cache=True)
 def make_workspace(rows: NDArray[np.float64]) -> Workspace:
-    """Return a workspace; several may share their rows, which hold nothing between evaluations."""
-    return Workspace(rows, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)))
+    """Return a workspace with these rows."""
+    table = np.empty((MAX_COMPONENTS + 5, CAPACITY))
+    return Workspace(rows, table, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)))
+
+
+@nb.njit(nogil=True, cache=True)
+def share_workspace(space: Workspace) -> Workspace:
+    """Return a workspace of the same scratch, which keeps nothing between calls, with its own answers."""
+    return Workspace(space.rows, space.table, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)))
 
 
 @nb.njit(nogil=True, cache=True)

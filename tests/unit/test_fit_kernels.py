@@ -119,29 +119,31 @@ def test_compiled_evaluation_equals_plain() -> None:
     rows = workspace_numba.make_rows.py_func(histogram.n_bins)
     plain = workspace_numba.make_workspace.py_func(rows)
     assert estep_numba.evaluate.py_func(histogram, point, plain, 0.0) == pytest.approx(loglik, rel=1e-13)
-    for compiled_array, plain_array in zip(space[1:], plain[1:], strict=True):
+    for compiled_array, plain_array in zip(space[2:], plain[2:], strict=True):
         np.testing.assert_allclose(compiled_array, plain_array, rtol=1e-9, atol=1e-7)
 
 
-def test_compiled_block_equals_plain_at_every_length() -> None:
+def test_compiled_table_equals_plain_at_every_width() -> None:
     rng = np.random.default_rng(8)
-    weights, powers = rng.integers(0, 50, 12).astype(float), 0.7 ** np.arange(12.0)
     kernels = {
-        3: estep_numba.block_sums_3,
-        5: estep_numba.block_sums_5,
-        7: estep_numba.block_sums_7,
-        9: estep_numba.block_sums_9,
-        6: estep_numba.block_sums_any,
+        3: estep_numba.table_sums_3,
+        5: estep_numba.table_sums_5,
+        7: estep_numba.table_sums_7,
+        9: estep_numba.table_sums_9,
+        12: estep_numba.table_sums_any,
     }
     for width, kernel in kernels.items():
-        prior = rng.uniform(0.01, 1, width)
+        table = rng.uniform(0.01, 2, (5 + width, 24))
+        table[5:] *= 10.0 ** rng.integers(-30, 30, 24)  # the logarithm over many powers of two
         answers = []
-        for function in (kernel, kernel.py_func, estep_numba.block_sums_any):
-            densities, sums = np.zeros(12), np.zeros(16)
-            function(weights, 1, 11, -4.2, 2.5, powers, prior, width, densities, sums)
-            answers.append(np.concatenate([densities, sums]))
+        for function in (kernel, kernel.py_func, estep_numba.table_sums_any):
+            totals = np.zeros(16)
+            function(table, 24, width, 1.3, totals)
+            answers.append(totals)
         np.testing.assert_allclose(answers[0], answers[1], rtol=1e-11)
         np.testing.assert_allclose(answers[0], answers[2], rtol=1e-11)
+        density = (table[5:] * table[1] ** np.arange(width)[:, None]).sum(axis=0)
+        assert answers[0][0] == pytest.approx(table[0] @ (table[4] + np.log(density)), rel=1e-13)
 
 
 def test_compiled_steps_equal_plain() -> None:
