@@ -48,8 +48,29 @@ _N_TOTALS = 16
 
 LOG_2PI = math.log(2.0 * math.pi)
 _LN2 = math.log(2.0)
+_ROOT2 = math.sqrt(2.0)
 _MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
 _ONE = np.int64(0x3FF0000000000000)
+
+
+@nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
+def vector_log(x: float) -> float:
+    """Return log(x) of a positive normal number, in a form that compiles to vector instructions.
+
+    From the exponent and ``2 artanh((f - 1)/(f + 1))`` of the fraction f in [sqrt(1/2), sqrt(2)).
+    """
+    bits = np.float64(x).view(np.int64)
+    fraction = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
+    large = 1.0 if fraction > _ROOT2 else 0.0
+    exponent = float((bits >> 52) - 1023) + large
+    fraction = fraction * (1.0 - 0.5 * large)
+    q = (fraction - 1.0) / (fraction + 1.0)
+    z = q * q
+    series = 1 / 15 + z * (1 / 17 + z * (1 / 19 + z / 21))
+    series = 1 / 7 + z * (1 / 9 + z * (1 / 11 + z * (1 / 13 + z * series)))
+    series = 1.0 + z * (1 / 3 + z * (1 / 5 + z * series))
+    answer: float = exponent * _LN2 + 2.0 * q * series
+    return answer
 
 
 def _table_kernel(width: int) -> Callable[..., Any]:
@@ -76,18 +97,7 @@ def _table_kernel(width: int) -> Callable[..., Any]:
                 s2 += k * k * term
                 s3 += k * k * k * term
                 s4 += k * k * k * k * term
-            # log(s0): exponent, and 2 artanh((f - 1)/(f + 1)) of the fraction f in [sqrt(1/2), sqrt(2))
-            bits = np.float64(s0).view(np.int64)
-            fraction = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
-            exponent = float((bits >> 52) - 1023)
-            large = 1.0 if fraction > 1.4142135623730951 else 0.0
-            fraction = fraction * (1.0 - 0.5 * large)
-            q = (fraction - 1.0) / (fraction + 1.0)
-            z = q * q
-            series = 1 / 15 + z * (1 / 17 + z * (1 / 19 + z / 21))
-            series = 1 / 7 + z * (1 / 9 + z * (1 / 11 + z * (1 / 13 + z * series)))
-            series = 1.0 + z * (1 / 3 + z * (1 / 5 + z * series))
-            loglik += c * (table[_LEVEL, i] + (exponent + large) * _LN2 + 2.0 * q * series)
+            loglik += c * (table[_LEVEL, i] + vector_log(s0))
             inverse = 1.0 / s0
             m1, m2, m3, m4 = s1 * inverse, s2 * inverse, s3 * inverse, s4 * inverse
             w = d - a * low
@@ -107,22 +117,12 @@ def _table_kernel(width: int) -> Callable[..., Any]:
             v12w += c12 * w
             v12d += c12 * d
             v22 += c22
-        totals[0] += loglik
-        totals[1] += sum_k
-        totals[2] += sum_kk
-        totals[3] += sum_ke
-        totals[4] += sum_e
-        totals[5] += sum_ee
-        totals[6] += v11
-        totals[7] += v11w
-        totals[8] += v11d
-        totals[9] += v11ww
-        totals[10] += v11dw
-        totals[11] += v11dd
-        totals[12] += v12
-        totals[13] += v12w
-        totals[14] += v12d
-        totals[15] += v22
+        first = (loglik, sum_k, sum_kk, sum_ke, sum_e, sum_ee)
+        second = (v11, v11w, v11d, v11ww, v11dw, v11dd, v12, v12w, v12d, v22)
+        for place, value in enumerate(first):
+            totals[place] += value
+        for place, value in enumerate(second):
+            totals[_V11 + place] += value
 
     kernel: Callable[..., Any] = table_sums
     return kernel

@@ -146,6 +146,14 @@ def test_compiled_table_equals_plain_at_every_width() -> None:
         assert answers[0][0] == pytest.approx(table[0] @ (table[4] + np.log(density)), rel=1e-13)
 
 
+def test_vector_log_is_the_logarithm() -> None:
+    x = np.exp(np.random.default_rng(1).uniform(-690, 690, 2000))
+    for function in (estep_numba.vector_log, estep_numba.vector_log.py_func):
+        np.testing.assert_allclose(
+            [function(v) for v in [*x, 1.0, 2.0, 0.5]], np.log([*x, 1.0, 2.0, 0.5]), rtol=1e-15, atol=1e-15
+        )
+
+
 def test_compiled_steps_equal_plain() -> None:
     histogram, centre, _, theta = prepare(CASES[0])
     point = internal(theta, centre)
