@@ -12,7 +12,9 @@ from pchem_pipeline.model.estep_numba import evaluate
 from pchem_pipeline.model.start_numba import assemble, start_cumulants, start_peak, start_regression
 from pchem_pipeline.model.workspace_numba import Histogram, Workspace, copy, load, make_rows
 
-N_OTHERS = 5
+#: starts of a suspicious pixel: side lobe, cumulants, scan, and the best with its gain scaled
+_SCALES = (2.0, 0.5, 1.5, 0.67, 1.22, 0.82)
+N_OTHERS = 3 + len(_SCALES)
 
 _MIN_STEP = 1.2  # DN per electron
 _N_SCAN = 25  # steps of the scan over the gain, from a fifth of the sd to 2.5 sd
@@ -79,7 +81,8 @@ def other_start(
     """Fill ``theta`` with one of the `N_OTHERS` starts kept for suspicious pixels.
 
     Args:
-        which: 0 side lobe, 1 cumulants, 2 scan over the gain, 3 and 4 half and twice the gain of the best.
+        which: 0 side lobe, 1 cumulants, 2 scan over the gain, further ones the best with 1/g scaled, the
+            mean and the variance of the signal kept.
         histogram: of the pixel.
         best: best maximum so far, theta; its step is 0 where there is none.
         space: scratch.
@@ -100,12 +103,14 @@ def other_start(
         return found
     if not best[1] > 0.0:
         return False
-    scale = 2.0 if which == 3 else 0.5
-    exposure = math.exp(best[0]) / scale
-    theta[0] = math.log(exposure)
-    theta[1] = best[1] * scale
-    theta[2] = histogram.mean - exposure * theta[1]
-    theta[3] = math.log(max(histogram.variance - exposure * theta[1] ** 2, 0.09 * theta[1] ** 2))
+    # the read noise in e- is kept, the exposure takes up the rest of the variance
+    a = best[1] * _SCALES[which - 3]
+    noise2 = min(math.exp(best[3]) / (best[1] * best[1]), 0.25)
+    exposure = histogram.variance / (a * a) - noise2
+    if exposure < 0.03 or a < _MIN_STEP:
+        return False
+    assemble(histogram, a, exposure, theta)
+    theta[3] = math.log(max(noise2 * a * a, 1.0 / 12.0))
     return True
 
 

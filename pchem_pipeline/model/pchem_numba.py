@@ -50,9 +50,7 @@ N_WORDS = 5
 
 _CLEAR_GAP = 30.0  # nats: a neighbour this far below is not polished to the end
 _SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
-_SUSPICIOUS_NOISE = (
-    0.45  # e-: above it the side lobe sinks into the noise and the first start errs more often
-)
+_CLEAR_LOBE = 3.0  # standard errors: a side lobe of the characteristic function that settles the gain
 _MOST_MOVES = 40
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
@@ -119,6 +117,16 @@ def climb_neighbours(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
+def side_lobe(histogram: Histogram, theta: NDArray[np.float64]) -> float:
+    """Return the height exp(-2 pi^2 s_e^2) of the ECF's side lobe in units of its noise, 1/sqrt(N).
+
+    Where the lobe sinks into the noise, maxima at other gains come as near as the right one.
+    """
+    noise2 = math.exp(theta[3]) / (theta[1] * theta[1])
+    return math.sqrt(histogram.n) * math.exp(-2.0 * math.pi**2 * noise2)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
 def _judge(
     best: NDArray[np.float64], loglik: float, runner_up: float, gaussian: float, limits: NDArray[np.float64]
 ) -> int:
@@ -149,8 +157,8 @@ def fit_pixel(
 ) -> tuple[int, int, int]:
     """Find the most likely parameters of one pixel.
 
-    The first start is polished and its neighbours are climbed. Where the goodness of fit or the read noise
-    raises suspicion, the other starts follow; the likeliest maximum is kept.
+    The first start is polished and its neighbours are climbed. Where the goodness of fit or a side lobe in
+    the noise raises suspicion, the other starts follow; the likeliest maximum is kept.
 
     Args:
         histogram: of the pixel.
@@ -194,8 +202,7 @@ def fit_pixel(
         runner_up = max(beside, runner_up)
         best_loglik = evaluate(histogram, best, at_best, histogram.n)
         out[CHI2], freedom = pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
-        noise = math.exp(0.5 * best[3]) / best[1]
-        if normal_score(out[CHI2], freedom) < _SUSPICIOUS and noise < _SUSPICIOUS_NOISE:
+        if normal_score(out[CHI2], freedom) < _SUSPICIOUS and side_lobe(histogram, best) > _CLEAR_LOBE:
             break
     if not best[1] > 0.0:
         return GAIN_NOT_IDENTIFIED if degenerate else FIT_NOT_CONVERGED, used, 0
