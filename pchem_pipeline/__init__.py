@@ -1,7 +1,54 @@
-"""Characterise deep sub-electron read noise image sensors with PCH-EM."""
+"""Characterise deep sub-electron read noise image sensors with PCH-EM.
+
+The names below are the public ones; they are imported when first used.
+
+    >>> import numpy as np
+    >>> from pchem_pipeline import FitStatus, fit_histograms
+    >>> rng = np.random.default_rng(1)
+    >>> dn = np.rint(100 + 10 * (rng.poisson(2, 5000) + 0.25 * rng.normal(size=5000))).astype(int)
+    >>> result = fit_histograms(np.bincount(dn)[None, :], origin=np.array([0]))
+    >>> FitStatus(int(result.fit_status[0]))
+    <FitStatus.OK: 0>
+    >>> bool(abs(result.conversion_gain[0] - 0.1) < 5 * result.covariance[0, 1, 1] ** 0.5)
+    True
+"""
 
 from __future__ import annotations
 
-__all__ = ["__version__"]
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pchem_pipeline.errors import PchEmError
+    from pchem_pipeline.model.fit_status import FitStatus
+    from pchem_pipeline.model.pchem import FitResult, fit_histograms
+    from pchem_pipeline.model.settings import FitSettings
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = [
+    "FitResult",
+    "FitSettings",
+    "FitStatus",
+    "PchEmError",
+    "RunStore",
+    "__version__",
+    "fit_histograms",
+]
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "FitResult": "model.pchem",
+    "FitSettings": "model.settings",
+    "FitStatus": "model.fit_status",
+    "PchEmError": "errors",
+    "RunStore": "store.run_store",
+    "fit_histograms": "model.pchem",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that the command starts at once."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

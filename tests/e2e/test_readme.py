@@ -67,6 +67,12 @@ def test_readme_names_the_shipped_configs():
         assert f"`{path.name}`" in README
 
 
+def test_the_shipped_demo_config_runs(shell):
+    (shell.folder / "demo.yaml").write_text((ROOT / "configs" / "demo.yaml").read_text())
+    shell.ok("run", "demo.yaml", "--quiet")
+    assert (shell.folder / "demo.zarr" / "report.html").exists()
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; sys.argv=['pchem','--help']\n"
