@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import resource
 import sys
 import tempfile
+import zlib
 from pathlib import Path
 
 __all__ = ["available_workers", "peak_rss_bytes", "prepare_environment"]
@@ -18,22 +18,35 @@ def prepare_environment() -> None:
     """Set what must be set before numpy and numba are imported; the user's own values are kept.
 
     Inner thread pools are set to one thread, since the tiles are the parallelism. Compiled kernels are
-    cached in the user's cache folder, or in a temporary one where the home is read-only.
+    cached in ``NUMBA_CACHE_DIR``, by default in the user's cache folder, or in a temporary one where the home
+    is read-only; always in a folder of its own for each state of the kernels' source.
     """
     for name in _POOLS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("MPLBACKEND", "Agg")
-    if "NUMBA_CACHE_DIR" not in os.environ:
-        os.environ["NUMBA_CACHE_DIR"] = str(_cache_folder())
+    tag = _kernel_tag()
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given is None:
+        os.environ["NUMBA_CACHE_DIR"] = str(_cache_folder(tag))
+    elif Path(given).name != tag:
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(given) / tag)
 
 
-def _cache_folder() -> Path:
+def _kernel_tag() -> str:
+    """Return a name for this state of all kernels.
+
+    numba looks only at the file of a function itself: without this, a kernel would go on calling the old
+    version of one that it imports, after an upgrade or beside another copy of the package.
+    """
+    state = 0
+    for path in sorted(Path(__file__).parents[1].rglob("*_numba.py")):
+        state = zlib.crc32(path.read_bytes(), zlib.crc32(str(path).encode(), state))
+    return f"py{sys.version_info[0]}{sys.version_info[1]}-{state:08x}"
+
+
+def _cache_folder(tag: str) -> Path:
     from platformdirs import user_cache_path
 
-    # one folder per copy of the package: two versions side by side must not share kernels
-    spec = importlib.util.find_spec("pchem_pipeline")
-    origin = str(Path(spec.origin or "").parent) if spec else ""
-    tag = f"{sys.version_info[0]}{sys.version_info[1]}-{abs(_stable_hash(origin)):08x}"
     folder = user_cache_path("pchem_pipeline") / "kernels" / tag
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -43,12 +56,6 @@ def _cache_folder() -> Path:
         folder = Path(tempfile.gettempdir()) / f"pchem_pipeline-{os.getuid()}" / tag
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         return folder
-
-
-def _stable_hash(text: str) -> int:
-    import zlib
-
-    return zlib.crc32(text.encode())
 
 
 def available_workers() -> int:

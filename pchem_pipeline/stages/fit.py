@@ -70,10 +70,17 @@ def run(context: StageContext) -> None:
         flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
         flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
     )
+    if not context.executor.shares_memory:
+        _compile(context.store.array("histogram/counts").dtype)
     task = functools.partial(
         _do_tile, store=context.store.path, settings=context.config.fit, adc_limits=context.adc_limits
     )
     context.run_units(context.tiles(), task, needs="histogram")
+
+
+def _compile(dtype: np.dtype[Any]) -> None:
+    """Compile the kernels once, into the cache, before other processes do it all at the same time."""
+    fit_histograms(np.ones((1, 8), dtype), np.zeros(1, np.int32))
 
 
 def _do_tile(
