@@ -9,15 +9,15 @@ from pchem_pipeline.compute.environment import prepare_environment
 PACKAGE = Path(pchem_pipeline.__file__).parent
 CODE = (
     "import os; from pchem_pipeline.compute.environment import prepare_environment as p\n"
-    "p(); first = os.environ['NUMBA_CACHE_DIR']; p(); assert os.environ['NUMBA_CACHE_DIR'] == first; print(first)"
+    "p(); first = os.environ['NUMBA_CACHE_DIR']; p(); assert first == os.environ['NUMBA_CACHE_DIR']\n"
+    "print(first)"
 )
 
 
 def cache_folder(place, **environment):
     environment = {"PYTHONPATH": str(place), "PATH": "/usr/bin:/bin", **environment}
-    result = subprocess.run(
-        [sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", CODE]
+    result = subprocess.run(command, cwd="/", env=environment, capture_output=True, text=True, check=True)
     return Path(result.stdout.strip())
 
 
