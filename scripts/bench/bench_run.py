@@ -64,7 +64,8 @@ def main() -> None:
     print(f"{options.frames.name}: {size / 1e9:.2f} GB, mode {options.mode}, {options.workers} workers")
     print(f"{'stage':<12}{'wall s':>9}{'CPU s':>9}{'GB/s':>9}{'peak MiB so far':>17}")
     for record in records:
-        speed = f"{size / 1e9 / record['seconds']:.2f}" if record["seconds"] > 0.5 else ""
+        reads = record["stage"] in ("ingest", "histogram")
+        speed = f"{size / 1e9 / record['seconds']:.2f}" if reads else ""
         peak_mib = record["peak_rss_bytes"] / 2**20
         print(
             f"{record['stage']:<12}{record['seconds']:>9.1f}{record['cpu_seconds']:>9.1f}{speed:>9}{peak_mib:>17.0f}"
