@@ -174,7 +174,8 @@ def run(
         log_json=log_json, progress=progress, quiet=quiet,
     )  # fmt: skip
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
-    target, is_new = find_or_start(targets, store, {k: v for k, v in given.items() if v is not None})
+    known = {name: value for name, value in given.items() if value is not None}
+    target, is_new = find_or_start(targets, store, known, command.options.roi, write=not dry_run)
     if is_new:
         target, command = cropped(target, command)
     run_stages(target, target.stages, command)

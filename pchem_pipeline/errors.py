@@ -6,7 +6,9 @@ pixel is never an exception: it gets a word in ``fit_status``.
 
 from __future__ import annotations
 
+import shlex
 from enum import IntEnum
+from pathlib import Path
 
 __all__ = [
     "ConfigError",
@@ -17,7 +19,13 @@ __all__ = [
     "MissingDependencyError",
     "PchEmError",
     "StoreError",
+    "quoted",
 ]
+
+
+def quoted(path: Path) -> str:
+    """Return a path as it must be typed in a command that a message recommends."""
+    return shlex.quote(str(path))
 
 
 class ExitCode(IntEnum):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -12,9 +12,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import to_jsonable_python
 
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.errors import ConfigError, quoted
 
-__all__ = ["dump_config", "load_config", "parse_config", "setting_of"]
+__all__ = ["dump_config", "load_config", "make_config", "parse_config", "setting_of"]
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -41,7 +41,7 @@ def load_config(path: Path) -> RunConfig:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; write one with: pchem init {path}") from None
+        raise ConfigError(f"{path}: no such file; write one with: pchem init {quoted(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
     return parse_config(text, str(path))
@@ -59,6 +59,15 @@ def parse_config(text: str, name: str = "config") -> RunConfig:
         raise ConfigError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{name}: holds no settings; write a commented default with: pchem init")
+    return make_config(content, name)
+
+
+def make_config(content: Mapping[str, Any], name: str) -> RunConfig:
+    """Return the configuration with these settings; ``name`` is used in messages.
+
+    Raises:
+        ConfigError: a setting is wrong.
+    """
     try:
         return RunConfig.model_validate(content)
     except ValidationError as error:

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.frames.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit_status import MEANINGS
+from pchem_pipeline.stages.reporting import Reporter
 from pchem_pipeline.stages.sensor import SensorInfo
-from pchem_pipeline.stages.session import Target, find_run
+from pchem_pipeline.stages.session import Target, find_run, run_status
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.variables import Variable, variables_of
@@ -59,7 +60,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     target = find_run(path)
     store = RunStore.open(target.store)
     if "summary" not in store.attributes("maps"):
-        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {store.path}")
+        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+    _say_if_old(target)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -76,6 +78,13 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
         else:
             written += _write_csv(folder, store)
     return written
+
+
+def _say_if_old(target: Target) -> None:
+    """Warn where the maps are not those of the present settings and input."""
+    state = next(state for state in run_status(target) if state.stage == "maps")
+    if state.state != "complete":
+        Reporter("off").warning(f"maps: {state.words()}; they are written as they are")
 
 
 def _images(store: RunStore) -> list[MapImage]:

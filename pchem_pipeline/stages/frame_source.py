@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError, StoreError
+from pchem_pipeline.errors import InputError, StoreError, quoted
 from pchem_pipeline.stages.base import StageContext, open_store
 
 __all__ = ["FrameSource", "StoredFrames", "open_source", "read_ahead"]
@@ -79,7 +79,7 @@ def open_source(context: StageContext) -> FrameSource:
     sensor, store = context.sensor, context.store
     record = store.records.read("ingest")
     if record is None or len(context.tiles_done("ingest")) < record.keys:
-        raise StoreError(f"{store.path}: the input is not complete; run: pchem ingest {store.path}")
+        raise StoreError(f"{store.path}: the input is not complete; run: pchem ingest {quoted(store.path)}")
     expected = (sensor.n_frames, *sensor.shape)
     if sensor.mode == "copy":
         array = store.array("frames/dn")
@@ -88,7 +88,7 @@ def open_source(context: StageContext) -> FrameSource:
     if reader.shape != expected or reader.dtype != np.dtype(sensor.dtype):
         raise InputError(
             f"{reader.paths[0]}: the camera files changed since they were ingested (now {reader.shape} "
-            f"{reader.dtype}, then {expected} {sensor.dtype}); run: pchem ingest {store.path}"
+            f"{reader.dtype}, then {expected} {sensor.dtype}); run: pchem ingest {quoted(store.path)}"
         )
     return reader
 

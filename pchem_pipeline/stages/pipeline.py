@@ -15,7 +15,7 @@ from typing import Any, cast
 from pchem_pipeline.compute.environment import peak_rss_bytes
 from pchem_pipeline.config.load import setting_of
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import StoreError
+from pchem_pipeline.errors import StoreError, quoted
 from pchem_pipeline.stages.base import StageContext, StageModule, identity_of
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
@@ -130,8 +130,16 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
         if old["upstream"].get(name) != new["upstream"][name]:
             words.append(f"{name} was done again")
     if old["input"] != new["input"]:
-        words.append("the content of the input changed")
+        words += _input_changes(old["input"], new["input"])
     return words
+
+
+def _input_changes(old: Any, new: Any) -> list[str]:
+    """Say which facts of the input changed; digests are no words."""
+    facts = {**(old or {}), **(new or {})}
+    if "content" in facts:
+        return ["the content of the input changed"]
+    return _changes("input", old or {}, new or {})
 
 
 def _changes(key: str, old: Any, new: Any) -> list[str]:
@@ -155,12 +163,15 @@ def execute(name: str, context: StageContext) -> StageState:
     stage = load_stage(name)
     before = status(stage, context)
     chosen = context.options.tiles is not None or context.options.roi is not None
+    if chosen and before.state == "complete":
+        context.selected(())  # refuses tiles and regions that the sensor does not have
     if before.state == "complete" and not context.options.force:
         context.reporter.info(f"{name}: up to date")
         return before
     for upstream in stage.UPSTREAM:
         if context.store.records.read(upstream) is None:
-            raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {context.store.path}")
+            place = quoted(context.store.path)
+            raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from pchem_pipeline.errors import StoreError
+from pchem_pipeline.errors import StoreError, quoted
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["SensorInfo"]
@@ -57,5 +57,5 @@ class SensorInfo:
         """
         content = store.attributes("frames").get("sensor")
         if content is None:
-            raise StoreError(f"{store.path} has no input yet; run: pchem ingest {store.path}")
+            raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
         return cls(**{**content, "names": tuple(content["names"])})

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pchem_pipeline.compute.executor import SerialExecutor, make_executor
-from pchem_pipeline.config.load import dump_config, load_config, parse_config
+from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError, IncompleteRunError, StoreError
 from pchem_pipeline.stages.base import Options, StageContext
@@ -39,7 +39,7 @@ class Target:
         """Return the same run with other values in a section of its configuration."""
         content = self.config.model_dump(by_alias=True)
         content[section] = {**content[section], **values}
-        return replace(self, config=RunConfig.model_validate(content))
+        return replace(self, config=make_config(content, "the command line"))
 
 
 @dataclass(frozen=True)
@@ -147,19 +147,24 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
 
 
 def run_status(target: Target) -> list[StageState]:
-    """Return the state of every stage, without changing anything."""
+    """Return the state of every stage, and of ``electrons`` where it was run, without changing anything."""
     stages = pipeline_of(target.config)
     if not (target.store / "zarr.json").exists():
         return [StageState(name, "missing") for name in stages]
     context = _reading_context(target, Reporter("off", quiet=True), Options())
+    if context.store.records.read("electrons") is not None:
+        stages = (*stages, "electrons")
     states: list[StageState] = []
-    stale: str | None = None
+    stale: set[str] = set()
     for name in stages:
-        state = status(load_stage(name), context)
-        if stale is not None and state.state in ("complete", "partial"):
-            state = StageState(name, "stale", f"{stale} is stale", state.done, state.total)
-        if state.state == "stale" and stale is None:
-            stale = name
+        stage = load_stage(name)
+        state = status(stage, context)
+        # what a simulation writes, ingest reads
+        above = [upstream for upstream in stage.UPSTREAM or ("simulate",) if upstream in stale]
+        if above and state.state in ("complete", "partial"):
+            state = StageState(name, "stale", f"{above[0]} is stale", state.done, state.total)
+        if state.state == "stale":
+            stale.add(name)
         states.append(state)
     return states
 

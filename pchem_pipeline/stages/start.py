@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.config.load import dump_config, parse_config
+from pchem_pipeline.config.load import dump_config, make_config, parse_config
 from pchem_pipeline.config.template import commented_config
-from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.errors import ConfigError, quoted
+from pchem_pipeline.stages.pipeline import STAGES
 from pchem_pipeline.stages.session import Target, find_run
 from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["find_or_start", "write_template"]
 
@@ -34,12 +35,18 @@ def write_template(path: Path, files: Sequence[str], *, simulated: bool, force: 
 
 
 def find_or_start(
-    targets: Sequence[Path], store: Path | None, given: Mapping[str, Any]
+    targets: Sequence[Path],
+    store: Path | None,
+    given: Mapping[str, Any],
+    roi: tuple[int, int, int, int] | None = None,
+    *,
+    write: bool = True,
 ) -> tuple[Target, bool]:
     """Return the run that ``targets`` name, and whether it was made from camera files.
 
     One YAML file or one store is an existing run. Anything else is camera files: a YAML with the
-    settings in ``given`` is written beside the store, and used.
+    settings in ``given`` and the region ``roi`` is written beside the store (unless
+    ``write`` is off), and used.
 
     Raises:
         ConfigError: options do not fit the target, or the YAML exists with other settings.
@@ -60,16 +67,32 @@ def find_or_start(
         )
     place = (store or Path("run.zarr")).resolve()
     path = place.with_suffix(".yaml")
-    config = RunConfig.model_validate(
-        {"run": {"store": place.name}, "input": {"files": _file_list(targets, path.parent), **given}}
+    config = make_config(
+        {
+            "run": {"store": place.name},
+            "input": {"files": _file_list(targets, path.parent), "roi": roi, **given},
+        },
+        "the command line",
     )
     text = dump_config(config)
-    if path.exists() and path.read_text(encoding="utf-8") != text:
+    if path.exists() and path.read_text(encoding="utf-8") != text and not _came_to_nothing(place, path):
         raise ConfigError(
-            f"{path} exists with other settings; use them with: pchem run {path}, or choose another --store"
+            f"{path} exists with other settings; use them with: pchem run {quoted(path)}, "
+            "or choose another --store"
         )
-    write_atomic(path, text.encode())
+    if write:
+        write_atomic(path, text.encode())
     return Target(config, path.parent, place), True
+
+
+def _came_to_nothing(place: Path, path: Path) -> bool:
+    """Tell whether a run was tried, finished no stage, and nobody edited its YAML since."""
+    if not (place / ".pchem").is_dir():
+        return False
+    store = RunStore.open(place)
+    records = [store.records.read(name) for name in STAGES]
+    untouched = store.config_text() == path.read_text(encoding="utf-8")
+    return untouched and not any(record is not None and record.finished for record in records)
 
 
 def _file_list(targets: Sequence[Path], base_dir: Path) -> list[str]:

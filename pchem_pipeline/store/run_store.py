@@ -21,7 +21,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import LockedError, StoreError
+from pchem_pipeline.errors import LockedError, StoreError, quoted
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.variables import VARIABLES
@@ -78,7 +78,9 @@ class RunStore:
         import zarr
 
         if not (path / "zarr.json").exists():
-            raise StoreError(f"there is no run at {path}; make one with: pchem run FILES --store {path}")
+            raise StoreError(
+                f"there is no run at {path}; make one with: pchem run FILES --store {quoted(path)}"
+            )
         try:
             root = zarr.open_group(str(path), mode="r+" if writable else "r")
             schema = root.attrs.get("pchem_schema")

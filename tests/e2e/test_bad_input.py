@@ -120,6 +120,17 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     assert (shell.folder / "run.zarr" / "report.html").exists()
 
 
+def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
+    np.save(shell.folder / "a.npy", np.full((100, 8, 8), 100, np.uint16))
+    result = shell("run", "a.npy")
+    assert result.code == 3
+    assert "64 of 64 pixels have no value" in result.last
+    assert "again" not in result.stderr
+    assert "warning: no pixel has a value, so there is no ensemble" in result.stderr
+    assert (shell.folder / "run.zarr" / "report.html").exists()
+    assert {line.split()[1] for line in shell.ok("status", "run.yaml").stdout.splitlines()} == {"complete"}
+
+
 def test_a_corrupt_chunk_fails_its_tile_and_is_named(shell, frames):
     (shell.folder / "run.yaml").write_text(RUN)
     shell.ok("ingest", "run.yaml")

@@ -67,6 +67,13 @@ def test_xarray_opens_the_groups_with_units(finished):
 
 def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, finished):
     shutil.copytree(finished, shell.folder / "run.zarr")
+    (shell.folder / "run.yaml").write_text(RUN.replace("4.87", "5"))
+    rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
+    assert rows["maps"] == "stale - input.integration_time 4.87 -> 5.0"
+    assert rows["ensemble"] == "complete"  # it reads no maps
+    assert rows["report"] == "stale - maps is stale"
+    export = shell.ok("export", "run.yaml", "--format", "csv")
+    assert export.last.startswith("warning: maps: stale - input.integration_time")
     (shell.folder / "run.yaml").write_text(RUN + "fit: {gap_threshold: 6}\n")
     before = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
     result = shell.ok("status", "run.yaml")
@@ -149,6 +156,8 @@ def test_export_and_electrons(shell, frames, finished):
     electrons = RunStore.open(shell.folder / "run.zarr").read("electrons/electron_number")
     assert electrons.shape == (1200, 20, 28)
     assert 1 < electrons.mean() < 4
+    assert shell.ok("status", "run.zarr").stdout.splitlines()[-1] == "electrons  complete"
+    assert "electrons: complete -> nothing to do" in shell.ok("electrons", "run.zarr", "--dry-run").stderr
 
 
 def test_electron_numbers_are_mostly_the_true_ones(shell, camera, frames, finished):
@@ -168,7 +177,7 @@ def test_json_log_and_quiet(shell, frames):
 
 
 def test_without_home_and_without_integration_time(shell, frames):
-    shell.environment = {**shell.environment, "HOME": "/nonexistent", "XDG_CACHE_HOME": "/nonexistent"}
+    shell.environment = {**shell.environment, "HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null"}
     del shell.environment["NUMBA_CACHE_DIR"]
     shell.ok("run", "frames", "--roi", "0:8,0:8", "--quiet")
     summary = json.loads((shell.folder / "run.zarr" / "report.json").read_text())

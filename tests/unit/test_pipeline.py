@@ -14,7 +14,7 @@ from pchem_pipeline.errors import ConfigError, StoreError
 from pchem_pipeline.stages import pipeline
 from pchem_pipeline.stages.base import WHOLE, Options, StageContext, open_store
 from pchem_pipeline.stages.interrupt import InterruptedRunError, StopRequest, stop_on_signals
-from pchem_pipeline.stages.pipeline import execute, status
+from pchem_pipeline.stages.pipeline import differences, execute, status
 from pchem_pipeline.stages.reporting import Reporter
 from pchem_pipeline.stages.sensor import SensorInfo
 from pchem_pipeline.store.run_store import RunStore
@@ -162,6 +162,22 @@ def test_tiles_of_a_new_stage_leave_it_partial(make):
 def test_unknown_tiles_are_refused(make):
     with pytest.raises(ConfigError, match="no tile 9"):
         execute("fit", make(tiles="9.9"))
+
+
+def test_unknown_tiles_are_refused_even_where_nothing_is_to_be_done(make):
+    assert execute("fit", make()).state == "complete"
+    for wrong in ({"tiles": "9.9"}, {"roi": (0, 9, 90, 99)}):
+        with pytest.raises(ConfigError):
+            execute("fit", make(**wrong))
+    assert execute("fit", make(tiles="0.0")).state == "complete"
+
+
+def test_changes_of_the_input_are_said_in_words():
+    settings = {"version": 1, "settings": {}, "upstream": {}}
+    time, later = ({**settings, "input": {"integration_time": value}} for value in (4.87, 5.0))
+    assert differences(time, later) == ["input.integration_time 4.87 -> 5.0"]
+    digest, other = ({**settings, "input": {"content": value}} for value in ("ab", "cd"))
+    assert differences(digest, other) == ["the content of the input changed"]
 
 
 def test_dry_run_writes_nothing(make):

@@ -1,0 +1,78 @@
+"""How a run from camera files begins, and begins again."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pchem_pipeline import cli
+from pchem_pipeline.config.load import dump_config, load_config
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.stages.start import find_or_start
+from pchem_pipeline.store.records import StageRecord
+from pchem_pipeline.store.run_store import RunStore
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "f 1.tif"
+    path.touch()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"integration_time": 0.0}, r"input\.integration_time: .* greater than 0 \(given: 0\.0\)"),
+        ({"integration_time": float("nan")}, r"input\.integration_time: .* finite"),
+        ({"bit_depth": 40}, r"input\.bit_depth: .* 32 \(given: 40\)"),
+    ],
+)
+def test_a_wrong_option_is_one_line(tmp_path, file, given, words):
+    with pytest.raises(ConfigError, match=f"^the command line: {words}"):
+        find_or_start([file], tmp_path / "run.zarr", given)
+    assert not (tmp_path / "run.yaml").exists()
+
+
+def test_the_region_is_written_into_the_yaml(tmp_path, file):
+    target, _ = find_or_start([file], tmp_path / "run.zarr", {}, (0, 8, 8, 16))
+    assert load_config(tmp_path / "run.yaml") == target.config
+    assert target.config.input.roi == (0, 8, 8, 16)
+
+
+def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(cli.app, ["run", str(file), "--dry-run"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "ingest: missing -> would run" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def test_options_can_be_corrected_until_a_stage_is_finished(tmp_path, file):
+    place = tmp_path / "run.zarr"
+    target, _ = find_or_start([file], place, {"bit_depth": 8})
+    store = RunStore.create(place)
+    store.write_config(dump_config(target.config))
+    again, _ = find_or_start([file], place, {"bit_depth": 14})
+    assert load_config(tmp_path / "run.yaml") == again.config
+    store.write_config(dump_config(again.config))
+    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    with pytest.raises(ConfigError, match=r"exists with other settings.*'.*/run\.yaml'|run\.yaml"):
+        find_or_start([file], place, {"bit_depth": 12})
+
+
+def test_an_edited_yaml_is_never_replaced(tmp_path, file):
+    place = tmp_path / "run.zarr"
+    target, _ = find_or_start([file], place, {})
+    RunStore.create(place).write_config(dump_config(target.config))
+    edited = (tmp_path / "run.yaml").read_text().replace("bit_shift: null", "bit_shift: 4")
+    (tmp_path / "run.yaml").write_text(edited)
+    with pytest.raises(ConfigError, match="exists with other settings"):
+        find_or_start([file], place, {"bit_depth": 12})
+    assert (tmp_path / "run.yaml").read_text() == edited
+
+
+def test_commands_in_messages_can_be_pasted(tmp_path):
+    (tmp_path / "my run").mkdir()
+    with pytest.raises(Exception, match=r"--store '.*my run'"):
+        RunStore.open(Path(tmp_path / "my run"))
