@@ -9,7 +9,6 @@ import numpy as np
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.model.fit_status import FAILED
 from pchem_pipeline.stages.session import Command, find_run, run_stages
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
@@ -51,12 +50,13 @@ def run_demo(output: Path, *, size: int, n_frames: int, seed: int, quiet: bool =
 
 
 def comparison_table(store: RunStore) -> str:
-    """Return a table of estimated against true parameters of a simulated run.
+    """Return a table of estimated against true parameters of the good pixels of a simulated run.
 
     ``error / stderr`` is the standard deviation over pixels of (estimate - truth) / standard error: 1
     where the standard errors are right.
     """
-    good = (store.read("fit/fit_status") & int(FAILED)) == 0
+    quality = store.read("maps/quality")
+    good = quality == 0
     columns = ("true median", "estimated", "rms error", "stderr", "error/stderr")
     head = f"{'parameter':<24}" + "".join(f"{column:>14}" for column in columns)
     lines = [head, "-" * len(head)]
@@ -74,5 +74,9 @@ def comparison_table(store: RunStore) -> str:
         )
         label = f"{name}, {VARIABLES[f'maps/{name}'].unit}"
         lines.append(f"{label:<24}" + "".join(f"{number:>14.4g}" for number in numbers))
-    lines.append(f"{good.sum()} of {good.size} pixels fitted")
+    caution, failed = np.count_nonzero(quality == 1), np.count_nonzero(quality == 2)
+    lines.append(
+        f"{good.sum()} of {good.size} pixels are good (the table is of these), {caution} are to be used with "
+        f"caution, {failed} have no value"
+    )
     return "\n".join(lines)

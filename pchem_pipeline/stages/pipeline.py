@@ -160,6 +160,7 @@ def execute(name: str, context: StageContext) -> StageState:
     Raises:
         PchEmError: the stage cannot be done.
     """
+    clock = time.perf_counter(), _cpu_seconds()
     stage = load_stage(name)
     before = status(stage, context)
     chosen = context.options.tiles is not None or context.options.roi is not None
@@ -175,11 +176,21 @@ def execute(name: str, context: StageContext) -> StageState:
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
-    return _perform(stage, context, before, restart=not chosen)
+    return _perform(stage, context, before, restart=not chosen, clock=clock)
 
 
-def _perform(stage: StageModule, context: StageContext, before: StageState, *, restart: bool) -> StageState:
-    """Run a stage that is not up to date, and keep its record whatever happens."""
+def _perform(
+    stage: StageModule,
+    context: StageContext,
+    before: StageState,
+    *,
+    restart: bool,
+    clock: tuple[float, float],
+) -> StageState:
+    """Run a stage that is not up to date, and keep its record whatever happens.
+
+    The clock (wall, CPU) started before the state was looked at: hashing the input is part of the work.
+    """
     records = context.store.records
     content = fingerprint_content(stage, context)
     old = records.read(stage.NAME)
@@ -204,7 +215,7 @@ def _perform(stage: StageModule, context: StageContext, before: StageState, *, r
     )
     records.write(record)
     context.reporter.event("start", stage=stage.NAME, why=before.words())
-    wall, cpu = time.perf_counter(), _cpu_seconds()
+    wall, cpu = clock
     try:
         stage.run(context)
         record = replace(record, finished=True)
