@@ -10,7 +10,7 @@ import pytest
 
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.stages import pipeline
 from pchem_pipeline.stages.base import WHOLE, Options, StageContext, open_store
 from pchem_pipeline.stages.interrupt import InterruptedRunError, StopRequest, stop_on_signals
@@ -252,6 +252,17 @@ def test_a_full_disk_stops_the_run_at_once(make, monkeypatch):
     monkeypatch.setattr(RunStore, "write", full)
     with pytest.raises(StoreError, match="free some space"):
         execute("fit", make())
+    assert CALLS == ["0.0"]
+
+
+def test_vanished_camera_files_stop_the_run_at_once(make, monkeypatch):
+    def vanished(self, name, region, data):
+        raise InputError("frames.raw vanished; put it back")
+
+    monkeypatch.setattr(RunStore, "write", vanished)
+    with pytest.raises(InputError, match="put it back") as caught:
+        execute("fit", make())
+    assert caught.value.exit_code == 4
     assert CALLS == ["0.0"]
 
 
