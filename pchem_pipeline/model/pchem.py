@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 from pchem_pipeline.model import pchem_numba, polish_numba, workspace_numba
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.start import kernel_counts
 from pchem_pipeline.model.start_numba import regression_basis
 
 __all__ = ["EmTrace", "FitResult", "em_trace", "fit_histograms"]
@@ -72,7 +73,7 @@ class EmTrace(NamedTuple):
 
 
 def fit_histograms(
-    counts: NDArray[np.unsignedinteger],
+    counts: NDArray[np.integer],
     origin: NDArray[np.integer],
     under: NDArray[np.integer] | None = None,
     over: NDArray[np.integer] | None = None,
@@ -102,7 +103,7 @@ def fit_histograms(
         Estimates, covariances and a status word per pixel.
     """
     settings = settings or FitSettings()
-    counts = np.ascontiguousarray(counts)
+    counts = kernel_counts(counts)
     n = counts.shape[0]
     parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
     out = np.full((n, pchem_numba.N_OUT), np.nan)
@@ -189,7 +190,7 @@ def em_trace(counts: NDArray[np.integer], origin: int, start: ArrayLike, n_itera
     Returns:
         Log-likelihood and parameters at the start and after every step.
     """
-    counts = np.ascontiguousarray(counts)
+    counts = kernel_counts(counts)
     weights, cumulative = np.empty(counts.size), np.empty(counts.size + 1)
     histogram, centre, _ = workspace_numba.load(counts, weights, cumulative)
     exposure, gain, bias, sigma = (float(value) for value in np.asarray(start, np.float64))

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
@@ -235,7 +235,7 @@ class StageContext:
             InputError: the camera files are gone.
             StoreError: the store cannot be written.
         """
-        self.n_keys = sum(len(unit.keys) for unit in units)
+        self._know_total(sum(len(unit.keys) for unit in units))
         todo = self._ready(self.pending(units, by_tiles=by_tiles), needs)
         for unit in todo:
             for key in unit.keys:
@@ -260,6 +260,13 @@ class StageContext:
                     raise fatal[0] from fatal[0].__cause__
         self.stop.check()
         return self.store.records.summaries(self.stage, self.fingerprint)
+
+    def _know_total(self, n_keys: int) -> None:
+        """Keep how many markers the stage will have, before the first is set: a kill must not lose it."""
+        self.n_keys = n_keys
+        record = self.store.records.read(self.stage)
+        if record is not None and record.keys != n_keys:
+            self.store.records.write(replace(record, keys=n_keys))
 
     def _ready(self, units: list[AnyUnit], needs: str | None) -> list[AnyUnit]:
         """Split off the units that an upstream stage has not finished."""

@@ -111,7 +111,7 @@ def _grew(content: dict[str, Any], record: StageRecord) -> bool:
     """
     if record.keys == 1 or {**content, "upstream": 0} != {**record.content, "upstream": 0}:
         return False
-    old, new = record.content["upstream"], content["upstream"]
+    old, new = record.content.get("upstream", {}), content["upstream"]
     return all(_base(old.get(name)) == _base(new[name]) for name in new)
 
 
@@ -122,15 +122,16 @@ def _base(fingerprint: str | None) -> str | None:
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Say in words why two fingerprint contents differ."""
     words: list[str] = []
-    if old["version"] != new["version"]:
-        words.append(f"algorithm version {old['version']} -> {new['version']}")
-    for key in sorted(old["settings"].keys() | new["settings"].keys()):
-        words += _changes(key, old["settings"].get(key), new["settings"].get(key))
+    if old.get("version") != new["version"]:
+        words.append(f"algorithm version {old.get('version')} -> {new['version']}")
+    before: dict[str, Any] = old.get("settings", {})
+    for key in sorted(before.keys() | new["settings"].keys()):
+        words += _changes(key, before.get(key), new["settings"].get(key))
     for name in new["upstream"]:
-        if old["upstream"].get(name) != new["upstream"][name]:
+        if old.get("upstream", {}).get(name) != new["upstream"][name]:
             words.append(f"{name} was done again")
-    if old["input"] != new["input"]:
-        words += _input_changes(old["input"], new["input"])
+    if old.get("input") != new["input"]:
+        words += _input_changes(old.get("input"), new["input"])
     return words
 
 
@@ -194,7 +195,8 @@ def _perform(
     records = context.store.records
     content = fingerprint_content(stage, context)
     old = records.read(stage.NAME)
-    resumes = before.state in ("partial", "complete") and old is not None
+    # a stage that was stopped before its first unit may lack arrays
+    resumes = before.state in ("partial", "complete") and old is not None and old.keys > 0
     if resumes and context.options.force and restart:
         resumes = False
     context.stage, context.failed, context.notes, context.n_keys = stage.NAME, {}, [], 0

@@ -232,6 +232,34 @@ def test_work_after_the_last_unit_is_made_up_for(make):
     assert CALLS == []
 
 
+def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
+    """It may have made some of its arrays only."""
+    execute("fit", make())
+    context = make("fit: {gap_threshold: 9}")
+    context.stop.signal = signal.SIGTERM
+    monkeypatch.setattr(context, "create_maps", lambda names: context.stop.check())
+    with pytest.raises(InterruptedRunError):
+        execute("fit", context)
+    assert not context.store.has("fit/bias")
+    again = make("fit: {gap_threshold: 9}")
+    assert execute("fit", again).state == "complete"
+    assert again.fresh
+    assert again.store.read("fit/bias")[0, 0] == 9
+
+
+def test_the_total_is_known_while_a_stage_runs(make):
+    context, totals = make(), []
+
+    class Looking(SerialExecutor):
+        def map(self, function, items, on_result):
+            totals.append(context.store.records.read("fit").keys)
+            super().map(function, items, on_result)
+
+    context.executor = Looking()
+    execute("fit", context)
+    assert totals == [12]
+
+
 def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
     before = signal.getsignal(signal.SIGTERM)
     with stop_on_signals() as stop:
