@@ -86,6 +86,11 @@ class RunStore:
             schema = root.attrs.get("pchem_schema")
         except (ValueError, KeyError, TypeError, OSError) as error:
             raise StoreError(f"{path} is damaged ({error}); restore it or start the run again") from error
+        if schema is None:
+            raise StoreError(
+                f"{path} is a zarr store but no run; to read its frames: "
+                f"pchem run {quoted(path)} --store run.zarr"
+            )
         if schema != SCHEMA_VERSION:
             raise StoreError(
                 f"{path} has schema version {schema}, this program reads version {SCHEMA_VERSION}; "

@@ -66,6 +66,14 @@ def test_another_schema_version_is_refused_with_both_numbers(store):
         RunStore.open(store.path)
 
 
+def test_other_zarr_stores_are_no_runs(tmp_path):
+    import zarr
+
+    zarr.create_group(str(tmp_path / "camera.zarr"), zarr_format=3)
+    with pytest.raises(StoreError, match=r"no run; to read its frames: pchem run"):
+        RunStore.open(tmp_path / "camera.zarr")
+
+
 def test_a_half_written_store_is_refused(tmp_path):
     (tmp_path / "run.zarr").mkdir()
     (tmp_path / "run.zarr" / "zarr.json").write_text("{")
