@@ -15,12 +15,18 @@ numbers keyed on position, so that the simulated frames do not depend on how the
   drawing dwell times rather than frames so that this stays cheap.
 
 Halos and histories of several effects add up.
+
+The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
+:attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
+(:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.marginal`), so that the
+fit of the four parameters can run with it.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from pchem_pipeline.effects.plane import Plane
 from pchem_pipeline.errors import ConfigError
@@ -30,6 +36,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["Effect", "Plane", "register_effect", "registered_effects"]
 
@@ -44,10 +52,25 @@ class Effect(Section):
     Attributes:
         tag: name in the YAML and in verdicts; a ``Literal`` with one value, which is the default.
         plane: where in the signal chain it acts, and so what :meth:`apply` gets (see :class:`Plane`).
+        title: its name in the literature.
+        source: where it is described.
+        signature: the statistics (of :mod:`pchem_pipeline.discrepancy.catalogue`) that it moves first, the
+            most telling one first.
+        strength: the parameter that scales it; 0 is no effect (a clipping limit and its like have none: "").
+        power: near zero the statistics grow like ``strength ** power``.
+        separate: for each effect that it is confused with (tag), the measurement that tells them apart.
+        untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
     """
 
     tag: str
     plane: ClassVar[Plane]
+    title: ClassVar[str] = ""
+    source: ClassVar[str] = ""
+    signature: ClassVar[tuple[str, ...]] = ()
+    strength: ClassVar[str] = ""
+    power: ClassVar[float] = 1.0
+    separate: ClassVar[Mapping[str, str]] = {}
+    untestable: ClassVar[str] = ""
 
     @abstractmethod
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
@@ -61,6 +84,48 @@ class Effect(Section):
             A new array of the same shape and dtype.
         """
 
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at strengths met in practice, one for each of its kinds (signs, patterns).
+
+        Used as guesses where :meth:`estimate` has nothing better, and for demonstrations.
+        """
+        return ()
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return hypotheses about its parameters, the likeliest first; none where nothing speaks for it.
+
+        A hypothesis is only a guess: its strength is refined and its fingerprint compared with the evidence
+        afterwards, so a false one costs time and nothing else. The default is :meth:`typical` where the
+        leading statistics of the signature stand out.
+        """
+        return cls.typical() if evidence.strongest(*cls.signature[:2]) > 3.0 else ()
+
+    def scaled(self, factor: float) -> Self:
+        """Return a copy of ``factor`` times the strength, kept within the limits of its field.
+
+        Raises:
+            ConfigError: if the effect has no strength to scale.
+        """
+        if not self.strength:
+            raise ConfigError(f"effect {self.tag!r} has no strength to scale")
+        values = self.model_dump()
+        values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
+        return type(self).model_validate(values)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law of the pixels' samples with this effect: its place in the fit.
+
+        Args:
+            model: the law so far, of n pixels.
+            maps: parameters of these pixels, each (n,) (what is known before the fit with the effect).
+
+        Returns:
+            The law with the effect; the same one where it leaves a pixel's own histogram as it is.
+        """
+        return model
+
     def halo(self) -> int:
         """Return how many rows on either side a row depends on, px."""
         return 0
@@ -68,6 +133,15 @@ class Effect(Section):
     def history(self) -> int:
         """Return how many frames before it a frame depends on."""
         return 0
+
+
+def _within(effect: type[Effect], name: str, value: float) -> float:
+    """Return the value cut to the limits that the field states."""
+    for limit in effect.model_fields[name].metadata:
+        low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
+        value = max(value, low) if low is not None else value
+        value = min(value, high) if high is not None else value
+    return value
 
 
 EffectClass = TypeVar("EffectClass", bound=type[Effect])
