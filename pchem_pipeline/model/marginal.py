@@ -9,8 +9,9 @@ whole.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +36,7 @@ class MarginalModel:
 
     ``P(x) = sum_b w_b sum_k P(k; H f_b) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]`` with mean
     ``m = mu + (level_scale k (1 + curvature (k - 1) / 2) + level_shift_e + shift_e_l) / g + shift_dn_l +
-    shift_sigma_l sigma``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron k
+    shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron k
     + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 = sigma^2 - 1/12 is the analog
     part in DN^2 (cells are integrated exactly, so quantisation adds itself), and code edges
     ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there.
@@ -55,7 +56,14 @@ class MarginalModel:
         lobe_weights, lobe_shift_e, lobe_shift_dn, lobe_shift_sigma, lobe_width: components of the noise,
             shape (n or 1, l) each; weights sum to 1 along l.
         edge_first, edge_shift: shift of the lower edge of the codes from ``edge_first`` on, DN; 0 elsewhere.
+            The shifts of neighbouring edges must differ by less than 1 DN.
         clip_low, clip_high: smallest and largest code that comes out, or None.
+        free_lobes: amplitudes A, e-, of which one may be found in a pixel, with a weight q of its own; the
+            fit tries each, and keeps the best where the likelihood rises by enough. Empty: none is tried.
+        free_lobe_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps 1 - q;
+            the weights sum to 1 and q multiplies them. The default is a trap read by correlated double
+            sampling: -A, 0, +A with q/2, 1 - q, q/2.
+        free_lobe_alarm: probability that a pixel without such levels is given some.
     """
 
     law: CountLaw = "poisson"
@@ -78,6 +86,22 @@ class MarginalModel:
     edge_shift: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_low: int | None = None
     clip_high: int | None = None
+    free_lobes: tuple[float, ...] = ()
+    free_lobe_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
+    free_lobe_alarm: float = 1e-4
+
+    @property
+    def neutral(self) -> bool:
+        """Whether this is the PCD itself, cells integrated exactly."""
+        mine, plain = _values(self), _values(MarginalModel())
+        return all(np.array_equal(mine[name], plain[name]) for name in plain)
+
+    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> MarginalModel:
+        """Return the law of some of the pixels (an index, a mask or a slice along n)."""
+        return replace(
+            self,
+            **{name: values[pixels] for name in _PER_PIXEL if (values := getattr(self, name)).shape[0] != 1},
+        )
 
     def with_counts(self, law: CountLaw, dispersion: float) -> MarginalModel:
         """Return a copy with another law of the electron number."""
@@ -120,18 +144,101 @@ class MarginalModel:
             lobe_width=outer(self.lobe_width, like(width), product=True),
         )
 
-    def with_variance(self, *, dn2: ArrayLike = 0.0, e2: ArrayLike = 0.0) -> MarginalModel:
-        """Return a copy with more variance, DN^2 and e-^2, scalar or (n,)."""
+    def with_variance(
+        self,
+        *,
+        dn2: ArrayLike = 0.0,
+        e2: ArrayLike = 0.0,
+        per_electron: float = 0.0,
+        per_electron2: float = 0.0,
+    ) -> MarginalModel:
+        """Return a copy with more variance.
+
+        Args:
+            dn2, e2: DN^2 and e-^2, scalar or (n,).
+            per_electron, per_electron2: e-^2 per electron, and per electron squared.
+        """
         return replace(
             self,
+            variance_per_electron=self.variance_per_electron + per_electron,
+            variance_per_electron2=self.variance_per_electron2 + per_electron2,
             extra_variance_dn2=self.extra_variance_dn2 + np.atleast_1d(np.asarray(dn2, np.float64)),
             extra_variance_e2=self.extra_variance_e2 + np.atleast_1d(np.asarray(e2, np.float64)),
         )
 
-    def with_levels(self, *, scale: ArrayLike = 1.0, shift_e: ArrayLike = 0.0) -> MarginalModel:
-        """Return a copy with a comb stretched by ``scale`` and moved by ``shift_e`` e-, scalar or (n,)."""
+    def with_levels(
+        self, *, scale: ArrayLike = 1.0, shift_e: ArrayLike = 0.0, curvature: float = 0.0
+    ) -> MarginalModel:
+        """Return a copy with a comb stretched by ``scale``, moved by ``shift_e`` e- and bent.
+
+        Args:
+            scale: factor, scalar or (n,).
+            shift_e: e-, scalar or (n,).
+            curvature: relative change of the step per electron, added to what there is.
+        """
         return replace(
             self,
+            curvature=self.curvature + curvature,
             level_scale=self.level_scale * np.atleast_1d(np.asarray(scale, np.float64)),
             level_shift_e=self.level_shift_e + np.atleast_1d(np.asarray(shift_e, np.float64)),
         )
+
+    def with_edges(self, first: int, shift: ArrayLike) -> MarginalModel:
+        """Return a copy whose lower code edges are shifted, on top of what there is.
+
+        Args:
+            first: code of the first shift.
+            shift: DN, shape (m,).
+        """
+        more = np.asarray(shift, np.float64)
+        if self.edge_shift.size == 0:
+            return replace(self, edge_first=first, edge_shift=more)
+        low = min(first, self.edge_first)
+        high = max(first + more.size, self.edge_first + self.edge_shift.size)
+        both = np.zeros(high - low)
+        both[first - low : first - low + more.size] += more
+        both[self.edge_first - low : self.edge_first - low + self.edge_shift.size] += self.edge_shift
+        return replace(self, edge_first=low, edge_shift=both)
+
+    def with_clip(self, low: int | None = None, high: int | None = None) -> MarginalModel:
+        """Return a copy with codes cut to ``low`` .. ``high``, and to the limits that there are."""
+        lows = [c for c in (low, self.clip_low) if c is not None]
+        highs = [c for c in (high, self.clip_high) if c is not None]
+        return replace(
+            self,
+            clip_low=max(lows) if lows else None,
+            clip_high=min(highs) if highs else None,
+        )
+
+    def with_free_lobes(
+        self,
+        amplitudes_e: Sequence[float],
+        *,
+        pattern: Sequence[tuple[float, float]] | None = None,
+        alarm: float = 1e-4,
+    ) -> MarginalModel:
+        """Return a copy that looks for lobes of one of these amplitudes in every pixel, see ``free_lobes``."""
+        return replace(
+            self,
+            free_lobes=tuple(float(a) for a in amplitudes_e),
+            free_lobe_pattern=self.free_lobe_pattern if pattern is None else tuple(pattern),
+            free_lobe_alarm=alarm,
+        )
+
+
+#: Fields that may have one row per pixel.
+_PER_PIXEL = (
+    "level_scale",
+    "level_shift_e",
+    "extra_variance_e2",
+    "extra_variance_dn2",
+    "lobe_weights",
+    "lobe_shift_e",
+    "lobe_shift_dn",
+    "lobe_shift_sigma",
+    "lobe_width",
+)
+
+
+def _values(model: MarginalModel) -> dict[str, Any]:
+    return {f.name: getattr(model, f.name) for f in fields(model)}
