@@ -72,6 +72,38 @@ def _both(group: str, names: tuple[str, ...]) -> list[Variable]:
     return [make(group, name) for name in names for make in (_parameter, _stderr)]
 
 
+def _discrepancy() -> list[Variable]:
+    """Return what the figures of the discrepancy verdict are drawn from."""
+    rows = {"row": "y", "column": "x"}
+    found: list[tuple[str, tuple[str, ...], str, str, str]] = [
+        ("goodness", _MAP, "float32", "1", "goodness of fit of each pixel as a normal quantile; large: poor"),
+        ("score", ("score", *_MAP), "float32", "1", "efficient scores of each pixel, N(0, 1) by chance"),
+        ("block_spread", ("channel", *_MAP), "float32", "1", "scatter of the block means, normal quantile"),
+        ("lag1", ("channel", *_MAP), "float32", "1", "autocorrelation at lag 1 over its standard error"),
+        ("tail", ("side", *_MAP), "uint32", "1", "samples beyond all that the pixel's PCD allows"),
+        ("code_dn", ("code",), "int32", "DN", "digital number of the code axis"),
+        ("code_observed", ("code",), "float64", "1", "samples at each DN, all usable pixels"),
+        ("code_expected", ("code",), "float64", "1", "samples expected at each DN from the fitted PCDs"),
+        ("frame_number", ("frame",), "int64", "1", "frame number in the run"),
+        ("frame_charge", ("frame",), "float64", "1", "relative deviation of the exposure of each frame"),
+        ("frame_readout", ("frame",), "float64", "DN", "mean readout residual of each frame"),
+        ("frame_sd", ("channel",), "float64", "1", "sd by chance of frame_charge and frame_readout (DN)"),
+        ("frame_charge_model", ("frame",), "float64", "1", "path of frame_charge under the named effects"),
+        ("frame_readout_model", ("frame",), "float64", "DN", "path of frame_readout under the named effects"),
+        ("z_before", ("statistic",), "float64", "1", "statistics against the plain model"),
+        ("z_after", ("statistic",), "float64", "1", "statistics against the grown model"),
+    ]  # fmt: skip
+    for line, axis in rows.items():
+        words = f"means of the {line}s over their standard deviation by chance"
+        found += [
+            (f"{line}_rms", ("channel", axis), "float64", "1", f"rms over the frames of the {words}"),
+            (f"{line}_image", ("channel", "shown_frame", axis), "float32", "1", f"first frames: {words}"),
+        ]
+    return [
+        Variable(f"discrepancy/{name}", dims, dtype, unit, words) for name, dims, dtype, unit, words in found
+    ]
+
+
 _ALL: list[Variable] = [
     Variable("frames/dn", ("frame", "y", "x"), "*", "DN", "raw frames"),
     # counts per pixel; DN of bin b is origin + b
@@ -242,6 +274,9 @@ _ALL: list[Variable] = [
     Variable(
         "electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"
     ),
+    # where the model and the data disagree; axes: `score` as effects.evidence.SCORES, `channel` charge and
+    # readout, `side` below and above, `statistic` as discrepancy.catalogue.STATISTICS
+    *_discrepancy(),
     *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e", "analog_read_noise_e")],
     Variable(
         "truth/defect",
