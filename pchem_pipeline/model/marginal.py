@@ -36,9 +36,9 @@ class MarginalModel:
 
     ``P(x) = sum_b w_b sum_k P(k; H f_b) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]`` with mean
     ``m = mu + (level_scale k (1 + curvature (k - 1) / 2) + level_shift_e + shift_e_l) / g + shift_dn_l +
-    shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron k
-    + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 = sigma^2 - 1/12 is the analog
-    part in DN^2 (cells are integrated exactly, so quantisation adds itself), and code edges
+    shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron
+    k + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 = sigma^2 - 1/12 is the
+    analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and code edges
     ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there.
 
     Attributes:
@@ -155,8 +155,10 @@ class MarginalModel:
         """Return a copy with more variance.
 
         Args:
-            dn2, e2: DN^2 and e-^2, scalar or (n,).
-            per_electron, per_electron2: e-^2 per electron, and per electron squared.
+            dn2: DN^2, scalar or (n,).
+            e2: e-^2, scalar or (n,).
+            per_electron: e-^2 per electron.
+            per_electron2: e-^2 per electron squared.
         """
         return replace(
             self,
@@ -217,7 +219,7 @@ class MarginalModel:
         pattern: Sequence[tuple[float, float]] | None = None,
         alarm: float = 1e-4,
     ) -> MarginalModel:
-        """Return a copy that looks for lobes of one of these amplitudes in every pixel, see ``free_lobes``."""
+        """Return a copy that looks in every pixel for lobes of one of these amplitudes (``free_lobes``)."""
         return replace(
             self,
             free_lobes=tuple(float(a) for a in amplitudes_e),
