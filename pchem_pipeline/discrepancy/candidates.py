@@ -1,0 +1,167 @@
+"""The candidates: every effect's guesses about itself, what they would do, and how strong they would have to be."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
+from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.registry import broken_plugins, effect_classes
+from pchem_pipeline.errors import ConfigError, PchEmError
+
+__all__ = ["Laboratory", "Mapper", "candidate_classes", "serial"]
+
+FloatArray = NDArray[np.float64]
+Vector = Mapping[str, float]
+#: Runs replicates and returns their statistics in the same order; an exception in place of those that failed.
+Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
+
+_log = logging.getLogger(__name__)
+_MOST_HYPOTHESES = 6  # of one effect
+_REFINED = 12  # hypotheses of which the strength is refined by a second simulation
+_CLOSE = 0.15  # relative: a strength known so well is not simulated again
+_LARGEST_STEP = 30.0
+
+
+def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
+    """Do the work here, one after the other."""
+    found: list[Vector | Exception] = []
+    for replicate in replicates:
+        try:
+            found.append(replicate())
+        except PchEmError as error:
+            found.append(error)
+    return found
+
+
+def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
+    """Return the effects to consider by tag; those that no such frames can show are not among them.
+
+    Raises:
+        ConfigError: a candidate is unknown.
+    """
+    known = effect_classes()
+    wanted = tuple(known) if settings.candidates is None else settings.candidates
+    unknown = sorted(({*wanted, *settings.exclude}) - set(known))
+    if unknown:
+        broken = "; ".join(f"{name}: {why}" for name, why in broken_plugins().items())
+        raise ConfigError(
+            f"discrepancy.candidates: unknown effects {', '.join(unknown)}; known are {', '.join(known)}"
+            + (f" (left out: {broken})" if broken else "")
+        )
+    return {tag: known[tag] for tag in wanted if tag not in settings.exclude and not known[tag].untestable}
+
+
+@dataclass
+class Laboratory:
+    """Simulates what candidates would do on top of the present model.
+
+    Attributes:
+        maps: parameters of the pixels under the model.
+        model: effects that the model has.
+        acquisition: of the split that is simulated.
+        names: of the statistics.
+        mapper: who does the work.
+        prefix: begins the keys of its replicates.
+        seed: of the random numbers that all candidates share.
+        left_out: candidates that failed, and why.
+    """
+
+    maps: PixelMaps
+    model: tuple[Effect, ...]
+    acquisition: Acquisition
+    names: tuple[str, ...]
+    mapper: Mapper
+    prefix: str
+    seed: int
+    left_out: dict[str, str] = field(default_factory=dict)
+    _base: FloatArray | None = None
+
+    def guesses(self, classes: Mapping[str, type[Effect]], evidence: Evidence) -> list[Effect]:
+        """Ask every candidate for hypotheses; one that raises is left out."""
+        found: list[Effect] = []
+        for tag, effect in classes.items():
+            if tag in {present.tag for present in self.model} | self.left_out.keys():
+                continue
+            try:
+                found += list(effect.estimate(evidence))[:_MOST_HYPOTHESES]
+            # whatever a stranger's estimator raises must not stop the others
+            except Exception as error:
+                self._leave_out(tag, error)
+        return found
+
+    def fingerprints(self, effects: Sequence[Effect]) -> list[Hypothesis]:
+        """Simulate effects on the random numbers of the model without them; failures are left out."""
+        base = [] if self._base is not None else [self._replicate(())]
+        tasks = [self._replicate((effect,)) for effect in effects]
+        if not tasks:
+            return []
+        results = self.mapper([*base, *tasks])
+        if base:
+            first = results.pop(0)
+            if isinstance(first, Exception):
+                raise first
+            self._base = self._row(first)
+        assert self._base is not None
+        found = []
+        for effect, result in zip(effects, results, strict=True):
+            if isinstance(result, Exception):
+                self._leave_out(effect.tag, result)
+            else:
+                found.append(Hypothesis(effect, self._row(result) - self._base))
+        return found
+
+    def refined(
+        self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise, rounds: int = 1
+    ) -> list[Hypothesis]:
+        """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself."""
+        for _ in range(rounds):
+            scored = []
+            for hypothesis in hypotheses:
+                fit = fit_set([hypothesis], shift, noise)
+                scored.append((fit.log_score(shift, noise), float(fit.factors[0]), hypothesis))
+            scored.sort(key=lambda item: item[0], reverse=True)
+            kept = [h for _, factor, h in scored if factor > 0.0]
+            renewed = [
+                (h, h.rescaled(float(np.clip(factor, 1.0 / _LARGEST_STEP, _LARGEST_STEP))))
+                for _, factor, h in scored[:_REFINED]
+                if factor > 0.0 and h.effect.strength and abs(factor - 1.0) > _CLOSE
+            ]
+            fresh = {id(old): new for (old, _), new in self._renew(renewed)}
+            hypotheses = [fresh.get(id(h), h) for h in kept]
+        return list(hypotheses)
+
+    def _renew(
+        self, pairs: Sequence[tuple[Hypothesis, Effect]]
+    ) -> list[tuple[tuple[Hypothesis, Effect], Hypothesis]]:
+        changed = [pair for pair in pairs if pair[1] != pair[0].effect]
+        by_effect = {id(h.effect): h for h in self.fingerprints([effect for _, effect in changed])}
+        return [(pair, by_effect[id(pair[1])]) for pair in changed if id(pair[1]) in by_effect]
+
+    def _replicate(self, effects: tuple[Effect, ...]) -> Replicate:
+        text = json.dumps([e.model_dump(mode="json") for e in effects], sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        label = effects[0].tag if effects else "base"
+        return Replicate(
+            f"{self.prefix}-{label}-{digest}", self.maps, (*self.model, *effects), self.seed, self.acquisition
+        )
+
+    def _row(self, vector: Vector) -> FloatArray:
+        return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
+
+    def _leave_out(self, tag: str, error: Any) -> None:
+        self.left_out[tag] = (
+            f"{type(error).__name__}: {error}" if not isinstance(error, PchEmError) else str(error)
+        )
+        _log.warning("effect %s left out: %s", tag, self.left_out[tag])

@@ -1,0 +1,125 @@
+"""Optimal fingerprinting: how much of which effects best explains the shift of the statistics.
+
+The shift of the statistics against the null is regressed on the fingerprints of candidate effects, as climate
+science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c_e F_e + noise`` with ``c_e >= 0``.
+The noise has the covariance of the null replicates, and a relative error of each fingerprint on top, since the
+details of a real effect are never those of the library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize
+
+from pchem_pipeline.effects.base import Effect
+
+__all__ = ["Hypothesis", "Noise", "SetFit", "fit_set", "log_density"]
+
+FloatArray = NDArray[np.float64]
+
+_REWEIGHTINGS = 3
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect with parameters, and what it would do to the statistics.
+
+    Attributes:
+        effect: with guessed or refined parameters.
+        fingerprint: shift of the statistics at this strength, shape (m,).
+    """
+
+    effect: Effect
+    fingerprint: FloatArray
+
+    @property
+    def tag(self) -> str:
+        """Tag of the effect."""
+        return self.effect.tag
+
+    def rescaled(self, factor: float) -> Effect:
+        """Return the effect with the strength at which its fingerprint is ``factor`` times as large."""
+        if not self.effect.strength:
+            return self.effect
+        return self.effect.scaled(float(factor) ** (1.0 / self.effect.power))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Covariance of the difference of measured and predicted statistics.
+
+    Attributes:
+        covariance: of the statistics under the null, its estimation included, shape (m, m).
+        model_error: relative error of a fingerprint, no unit.
+    """
+
+    covariance: FloatArray
+    model_error: float
+
+    def of(self, prediction: FloatArray) -> FloatArray:
+        """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
+        extra = self.model_error**2 * np.sum(prediction**2, axis=0)
+        return self.covariance + np.diag(extra)
+
+
+@dataclass(frozen=True)
+class SetFit:
+    """A set of hypotheses fitted to the shift of one split.
+
+    Attributes:
+        hypotheses: the set.
+        factors: c_e of each, at least 0, shape (e,).
+        stderr: their standard errors, shape (e,).
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    factors: FloatArray
+    stderr: FloatArray
+
+    @property
+    def parts(self) -> FloatArray:
+        """Predicted shift by effect, shape (e, m)."""
+        return np.array([c * h.fingerprint for c, h in zip(self.factors, self.hypotheses, strict=True)])
+
+    def log_score(self, shift: FloatArray, noise: Noise) -> float:
+        """Return the Gaussian log density of a shift of statistics, up to a constant, nats."""
+        parts = self.parts
+        return log_density(shift - parts.sum(axis=0), noise.of(parts))
+
+    def distance(self, other: SetFit, noise: Noise) -> float:
+        """Return how far the predictions of two sets lie apart, in standard deviations of the statistics."""
+        mine, theirs = self.parts, other.parts
+        factor = linalg.cholesky(noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0)), lower=True)
+        white = linalg.solve_triangular(factor, mine.sum(axis=0) - theirs.sum(axis=0), lower=True)
+        return float(np.sqrt(white @ white))
+
+
+def log_density(residual: FloatArray, covariance: FloatArray) -> float:
+    """Return the Gaussian log density of a residual, up to a constant, nats."""
+    factor = linalg.cholesky(covariance, lower=True)
+    white = linalg.solve_triangular(factor, residual, lower=True)
+    return float(-0.5 * white @ white - np.sum(np.log(np.diag(factor))))
+
+
+def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> SetFit:
+    """Fit non-negative factors of the fingerprints to a shift by generalised least squares, reweighted.
+
+    Args:
+        hypotheses: one or more, of different effects.
+        shift: measured statistics minus null mean, shape (m,).
+        noise: covariance of the shift.
+    """
+    columns = np.array([h.fingerprint for h in hypotheses]).T
+    factors = np.ones(len(hypotheses))
+    stderr = np.full(len(hypotheses), np.inf)
+    for _ in range(_REWEIGHTINGS):
+        factor = linalg.cholesky(noise.of(columns.T * factors[:, None]), lower=True)
+        design = linalg.solve_triangular(factor, columns, lower=True)
+        target = linalg.solve_triangular(factor, shift, lower=True)
+        factors, _ = optimize.nnls(design, target)
+        stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
+    return SetFit(tuple(hypotheses), factors, stderr)

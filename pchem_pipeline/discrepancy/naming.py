@@ -1,0 +1,201 @@
+"""Which effects explain the shift of the statistics: sets compared by what they predict on held-out frames.
+
+Every set of up to three candidates is fitted on one split and scored on the other, both ways round. The scores,
+less a price for every effect, give each set a probability; an effect is named where the sets that hold it have
+nearly all of it, and what could as well stand in its place is named beside it where not.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, log_density
+
+__all__ = ["Choice", "Rival", "ScoredSet", "choose", "score_set"]
+
+FloatArray = NDArray[np.float64]
+
+_PRICE = 3.0  # nats for every effect in a set: an effect is not there unless something speaks for it
+_LARGEST_SET = 3
+_SHORTLIST = 9
+_SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
+
+
+@dataclass(frozen=True)
+class ScoredSet:
+    """A set of effects and how well it predicts.
+
+    Attributes:
+        fits: of the first and the second split.
+        score: held-out log score of both directions, nats, relative to no effect.
+    """
+
+    fits: tuple[SetFit, SetFit]
+    score: float
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The set."""
+        return self.fits[0].hypotheses
+
+    @property
+    def tags(self) -> frozenset[str]:
+        """Their tags."""
+        return frozenset(h.tag for h in self.hypotheses)
+
+    @property
+    def worth(self) -> float:
+        """Score less the price of its effects, nats."""
+        return self.score - _PRICE * len(self.hypotheses)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """An effect that could stand in the place of a chosen one.
+
+    Attributes:
+        hypothesis: of the rival.
+        score: log score of the best set with it in that place, relative to the chosen set, nats.
+        stderr: of that score: how far the two predictions lie apart, nats.
+        probability: of such sets among all.
+    """
+
+    hypothesis: Hypothesis
+    score: float
+    stderr: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the comparison came to.
+
+    Attributes:
+        best: the likeliest set.
+        rivals: for each of its effects, who could stand in its place, itself first.
+        probability: of each of its effects.
+        tried: all sets, the likeliest first.
+    """
+
+    best: ScoredSet
+    rivals: tuple[tuple[Rival, ...], ...]
+    probability: tuple[float, ...]
+    tried: tuple[ScoredSet, ...]
+
+
+def score_set(
+    hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
+) -> ScoredSet:
+    """Fit a set on each split and score it on the other."""
+    first, second = (fit_set(hypotheses, shift, noise) for shift in shifts)
+    return ScoredSet((first, second), first.log_score(shifts[1], noise) + second.log_score(shifts[0], noise))
+
+
+def choose(
+    hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
+) -> Choice | None:
+    """Compare all sets of up to three of the most promising hypotheses; None where none improves on nothing.
+
+    Args:
+        hypotheses: candidates; several may be of one effect.
+        shifts: measured statistics minus null mean of the two splits, shape (m,) each.
+        noise: covariance of a shift.
+    """
+    shortlist = _shortlist(hypotheses, shifts, noise)
+    sets = []
+    for size in range(1, _LARGEST_SET + 1):
+        for members in itertools.combinations(shortlist, size):
+            if len({h.tag for h in members}) == size:
+                scored = score_set(members, shifts, noise)
+                if _all_needed(scored):
+                    sets.append(scored)
+    base = sum(log_density(shift, noise.covariance) for shift in shifts)
+    sets = [s for s in sets if s.worth > base]
+    if not sets:
+        return None
+    sets.sort(key=lambda s: s.worth, reverse=True)
+    weights = np.exp([s.worth - sets[0].worth for s in sets])
+    weights /= weights.sum() + np.exp(base - sets[0].worth)
+    best = sets[0]
+    rivals, probabilities = [], []
+    for hypothesis in best.hypotheses:
+        others = best.tags - {hypothesis.tag}
+        probabilities.append(
+            float(sum(w for s, w in zip(sets, weights, strict=True) if hypothesis.tag in s.tags))
+        )
+        rivals.append(_rivals(hypothesis, others, best, sets, weights, noise))
+    return Choice(best, tuple(rivals), tuple(probabilities), tuple(sets))
+
+
+def _rivals(
+    hypothesis: Hypothesis,
+    others: frozenset[str],
+    best: ScoredSet,
+    sets: Sequence[ScoredSet],
+    weights: FloatArray,
+    noise: Noise,
+) -> tuple[Rival, ...]:
+    """Return what could stand in the place of a hypothesis of the best set, by probability."""
+    found: dict[str, Rival] = {}
+    for scored, weight in zip(sets, weights, strict=True):
+        new = scored.tags - others
+        if not new or not others <= scored.tags and len(new) > len(best.tags):
+            continue
+        for candidate in scored.hypotheses:
+            if candidate.tag not in new:
+                continue
+            if hypothesis.tag in new and candidate.tag != hypothesis.tag:
+                continue  # it comes beside the chosen one, not in its place
+            if candidate.tag in found:
+                old = found[candidate.tag]
+                found[candidate.tag] = Rival(
+                    old.hypothesis, old.score, old.stderr, old.probability + float(weight)
+                )
+            else:
+                apart = np.hypot(*(a.distance(b, noise) for a, b in zip(best.fits, scored.fits, strict=True)))
+                found[candidate.tag] = Rival(
+                    candidate, scored.worth - best.worth, float(apart), float(weight)
+                )
+    return tuple(sorted(found.values(), key=lambda r: (-r.probability, -r.score)))
+
+
+def _shortlist(
+    hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
+) -> list[Hypothesis]:
+    """Return the hypotheses that do best alone, and those that do best beside the best ones."""
+    chosen: list[Hypothesis] = []
+
+    def take(count: int, beside: Sequence[Hypothesis]) -> None:
+        scored = []
+        for hypothesis in hypotheses:
+            if any(hypothesis is h for h in chosen) or hypothesis.tag in {h.tag for h in beside}:
+                continue
+            scored.append((score_set([*beside, hypothesis], shifts, noise).score, hypothesis))
+        scored.sort(key=lambda pair: pair[0], reverse=True)
+        chosen.extend(h for _, h in scored[:count])
+
+    take(4, ())
+    if chosen:
+        best = chosen[0]
+        take(3, (best,))
+        second = max(
+            (h for h in chosen if h.tag != best.tag),
+            key=lambda h: score_set([best, h], shifts, noise).score,
+            default=None,
+        )
+        if second is not None:
+            take(_SHORTLIST - len(chosen), (best, second))
+    return chosen
+
+
+def _all_needed(scored: ScoredSet) -> bool:
+    """Tell whether every effect of the set is there in both splits together by more than its error."""
+    first, second = scored.fits
+    factor = (first.factors + second.factors) / 2.0
+    error = np.hypot(first.stderr, second.stderr) / 2.0
+    return bool(np.all(factor > _SMALLEST_FACTOR * error))

@@ -1,0 +1,111 @@
+"""What the statistics look like where the model is right: moments from replicates, and p-values.
+
+Replicates are simulated from the fitted model and refitted (parametric bootstrap), so whatever the fit absorbs
+is absorbed in them too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+__all__ = ["NullModel", "as_matrix", "look_elsewhere", "two_sided"]
+
+FloatArray = NDArray[np.float64]
+
+# of the correlations between statistics; their estimates from few replicates are noise, so pull them to 0
+_SHRINKAGE = 0.6
+# standard deviations of statistics are 1 by construction up to a few tenths; the replicates count for that
+# many fewer than this number of earlier ones
+_PRIOR_WEIGHT = 10.0
+_SMALLEST_STD = 0.6
+
+
+@dataclass(frozen=True)
+class NullModel:
+    """Mean and covariance of the statistics of one split under a model.
+
+    Attributes:
+        names: of the statistics, shape (m,).
+        mean: shape (m,).
+        std: standard deviations, shape (m,).
+        covariance: shrunk towards its diagonal, shape (m, m).
+        replicates: the vectors, shape (b, m).
+        effective_tests: number of independent statistics that the largest of them is worth.
+    """
+
+    names: tuple[str, ...]
+    mean: FloatArray
+    std: FloatArray
+    covariance: FloatArray
+    replicates: FloatArray
+    effective_tests: float
+
+    @classmethod
+    def from_replicates(cls, names: tuple[str, ...], vectors: FloatArray) -> NullModel:
+        """Estimate from replicates, shape (b, m)."""
+        mean = vectors.mean(axis=0)
+        std = _std(vectors - mean)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            correlation = np.corrcoef(vectors, rowvar=False)
+        correlation = np.where(np.isfinite(correlation), correlation, 0.0) * (1.0 - _SHRINKAGE)
+        np.fill_diagonal(correlation, 1.0)
+        return cls(names, mean, std, correlation * np.outer(std, std), vectors, _effective_tests(vectors))
+
+    @property
+    def n_replicates(self) -> int:
+        """Number of replicates."""
+        return int(self.replicates.shape[0])
+
+    def pulls(self, z: FloatArray, splits: int = 1) -> FloatArray:
+        """Return (z - mean) / std for the mean of ``splits`` independent vectors, the mean's own error included."""
+        return (z - self.mean) / (self.std * np.sqrt(1.0 / splits + 1.0 / self.n_replicates))
+
+    def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
+        """Return two-sided p-values of each statistic (Student's t: the deviation comes from few replicates)."""
+        return two_sided(self.pulls(z, splits), self.n_replicates - 1 + _PRIOR_WEIGHT)
+
+    def global_p(self, z: FloatArray, splits: int = 1) -> float:
+        """Return the probability that any statistic deviates as much as the most deviating one."""
+        return look_elsewhere(float(self.p_values(z, splits).min()), self.effective_tests)
+
+
+def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:
+    """Return two-sided p-values of Student's t, at least 1e-300."""
+    return np.asarray(np.maximum(2.0 * special.stdtr(freedom, -np.abs(pulls)), 1e-300))
+
+
+def look_elsewhere(p: float, tests: float) -> float:
+    """Return the chance that the smallest of ``tests`` independent p-values is ``p`` or less (Sidak)."""
+    return float(-np.expm1(tests * np.log1p(-min(p, 1.0 - 1e-16))))
+
+
+def as_matrix(names: Sequence[str], vectors: Sequence[Mapping[str, float]]) -> FloatArray:
+    """Return statistics as rows in the order of the names."""
+    return np.array([[vector[name] for name in names] for vector in vectors], np.float64)
+
+
+def _std(deviations: FloatArray) -> FloatArray:
+    n = deviations.shape[0]
+    variance = (np.sum(deviations**2, axis=0) + _PRIOR_WEIGHT) / (n - 1 + _PRIOR_WEIGHT)
+    return np.asarray(np.maximum(np.sqrt(variance), _SMALLEST_STD))
+
+
+def _effective_tests(vectors: FloatArray) -> float:
+    """Return the m for which the smallest of m independent p-values is spread like that of the replicates.
+
+    Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 - p)^m`` is
+    -1 / mean(log(1 - p_min)).
+    """
+    n, m = vectors.shape
+    total, squares = vectors.sum(axis=0), (vectors**2).sum(axis=0)
+    mean = (total - vectors) / (n - 1)
+    variance = (squares - vectors**2) - (n - 1) * mean**2
+    std = np.sqrt((np.maximum(variance, 0.0) + _PRIOR_WEIGHT) / (n - 2 + _PRIOR_WEIGHT))
+    pulls = (vectors - mean) / (np.maximum(std, _SMALLEST_STD) * np.sqrt(1.0 + 1.0 / (n - 1)))
+    smallest = two_sided(pulls, n - 2 + _PRIOR_WEIGHT).min(axis=1)
+    return float(np.clip(-1.0 / np.mean(np.log1p(-smallest)), 1.0, 4.0 * m))

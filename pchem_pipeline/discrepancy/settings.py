@@ -1,0 +1,68 @@
+"""YAML section ``discrepancy``: how to look for what the model is missing."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pchem_pipeline.settings import Section
+
+__all__ = ["DiscrepancySettings"]
+
+
+class DiscrepancySettings(Section):
+    """Comparison of the frames with replicates simulated from the fitted model, and naming of effects."""
+
+    replicates: int = Field(
+        default=60,
+        ge=20,
+        le=2000,
+        description="simulated and refitted stacks behind the null distribution; each is a third of the frames",
+    )
+    grown_replicates: int = Field(
+        default=24, ge=12, le=2000, description="the same for each model that effects were added to"
+    )
+    block_frames: int | None = Field(
+        default=None,
+        ge=8,
+        description="frames in a block; blocks go in turn to train, test and final. null: a sixtieth of the run, "
+        "within 20 to 100",
+    )
+    max_samples: int = Field(
+        default=1 << 25,
+        ge=1 << 14,
+        description="frames x pixels looked at; of a larger stack, a window in its middle and frames spread over "
+        "the run in whole blocks",
+    )
+    significance: float = Field(
+        default=0.005,
+        gt=0,
+        le=0.1,
+        description="a disagreement counts when one as large comes by chance, anywhere among the statistics, with "
+        "a smaller probability",
+    )
+    certainty: float = Field(
+        default=0.98,
+        gt=0.5,
+        lt=1,
+        description="probability among the candidates from which on an effect is named alone",
+    )
+    model_error: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="relative error allowed to the fingerprint of a candidate (its details are never quite those "
+        "of the sensor), no unit",
+    )
+    max_rounds: int = Field(
+        default=3, ge=1, le=10, description="rounds of naming and adding; each round may add several effects"
+    )
+    material: float = Field(
+        default=0.0,
+        ge=0,
+        description="nats per sample: a smaller remaining gap is reported as immaterial and not pursued; 0: pursue all",
+    )
+    candidates: tuple[str, ...] | None = Field(
+        default=None, description="effects (tags) to consider; null: all that are known, plug-ins included"
+    )
+    exclude: tuple[str, ...] = Field(default=(), description="effects (tags) to leave out")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="root of the replicates' random numbers")

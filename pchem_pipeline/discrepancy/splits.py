@@ -1,0 +1,78 @@
+"""The frames in three parts that never mix: one to fit, one to score, one for the last word."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import InputError
+
+__all__ = ["MINIMUM_FRAMES", "Splits", "block_length", "split_frames"]
+
+#: fewer frames leave too few blocks for anything slow, and too few samples for a fit of each third
+MINIMUM_FRAMES = 600
+_SHORTEST, _LONGEST, _BLOCKS = 20, 100, 60
+# the order changes from group to group, so that no part is always the earlier one
+_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2))
+
+
+@dataclass(frozen=True)
+class Splits:
+    """Positions (along the first axis of the stack) of the frames of each part, equally many each.
+
+    Attributes:
+        train: to estimate on.
+        test: to score on.
+        final: used for the remaining gap only.
+        block_frames: frames in a block of consecutive ones.
+    """
+
+    train: NDArray[np.int64]
+    test: NDArray[np.int64]
+    final: NDArray[np.int64]
+    block_frames: int
+
+
+def block_length(n_frames: int, wanted: int | None = None) -> int:
+    """Return the frames in a block: even, so that even and odd frames stay in balance.
+
+    Raises:
+        InputError: the frames are too few for the blocks.
+    """
+    length = wanted or min(max(n_frames // _BLOCKS, _SHORTEST), _LONGEST)
+    length += length % 2
+    needed = max(MINIMUM_FRAMES, 9 * length)
+    if n_frames < needed:
+        raise InputError(
+            f"{n_frames} frames are too few to look for a discrepancy (blocks of {length} in three parts need "
+            f"{needed}); take more frames"
+            + ("" if wanted is None or n_frames < MINIMUM_FRAMES else ", or lower discrepancy.block_frames")
+        )
+    return length
+
+
+def split_frames(numbers: NDArray[np.int64], block_frames: int) -> Splits:
+    """Deal whole blocks of consecutive frames to train, test and final in turn.
+
+    Args:
+        numbers: frame numbers, increasing, shape (n,).
+        block_frames: frames in a block.
+
+    Returns:
+        Positions of the frames of each part; a rest of fewer than three blocks is left out.
+    """
+    # a block never spans a gap in the numbering
+    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
+    starts = [
+        start
+        for run in np.split(np.arange(numbers.size), breaks)
+        for start in range(int(run[0]), int(run[-1]) + 2 - block_frames, block_frames)
+    ]
+    parts: tuple[list[int], list[int], list[int]] = ([], [], [])
+    for group in range(len(starts) // 3):
+        for part, start in zip(_ORDERS[group % 6], starts[3 * group : 3 * group + 3], strict=True):
+            parts[part].append(start)
+    positions = [(np.asarray(part, np.int64)[:, None] + np.arange(block_frames)).ravel() for part in parts]
+    return Splits(*positions, block_frames=block_frames)

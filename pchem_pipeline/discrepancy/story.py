@@ -1,0 +1,252 @@
+"""From the rounds of the search to the verdict: what is named, what is ambiguous, what stays unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.gap import Gap, GapMetric
+from pchem_pipeline.discrepancy.naming import Choice, Rival
+from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.result import Candidate, Discrepancy, Pull, Step, Verdict
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.where import Place
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.evidence import Evidence
+from pchem_pipeline.effects.registry import effect_classes
+
+__all__ = ["Round", "tell"]
+
+FloatArray = NDArray[np.float64]
+
+_MOST_PULLS = 12
+_MOST_UNEXPLAINED = 8
+#: a named effect must leave less of the gap than this, or the rest must lie below the floor
+_LARGEST_REST = 0.2
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of naming and adding.
+
+    Attributes:
+        choice: what the comparison of the sets came to.
+        added: the chosen set at refined strengths.
+        hypotheses: all candidates of the round.
+        null: of the model before it.
+        grown: of the model after it.
+    """
+
+    choice: Choice
+    added: SetFit
+    hypotheses: tuple[Hypothesis, ...]
+    null: NullModel
+    grown: NullModel
+
+
+def tell(
+    rounds: Sequence[Round],
+    *,
+    first: NullModel,
+    last: NullModel,
+    z: Mapping[str, FloatArray],
+    places: Sequence[Place],
+    train: Evidence,
+    model: tuple[Effect, ...],
+    settings: DiscrepancySettings,
+    still: bool,
+    left_out: Mapping[str, str],
+    n_replicates: int,
+    examined: Mapping[str, Any],
+) -> Discrepancy:
+    """Put the verdict together; see :class:`~pchem_pipeline.discrepancy.result.Discrepancy`."""
+    n_samples = int(examined["final"]) * int(train.maps.usable.sum())
+    metric = GapMetric(first, n_samples)
+    before = metric.gap(z["final"], first.mean, first.replicates)
+    after = metric.gap(z["final"], last.mean, last.replicates)
+    steps = _steps(rounds, metric, z, settings, before, after)
+    both = (z["train"] + z["test"]) / 2.0
+    pulls = first.pulls(both, splits=2), last.pulls(both, splits=2)
+    rest = [(name, float(pull)) for name, pull in zip(first.names, pulls[1], strict=True)]
+    rest.sort(key=lambda item: -abs(item[1]))
+    verdict = _verdict(steps, bool(places), still, before, after)
+    if verdict == "unexplained":
+        steps = tuple(_demoted(step) for step in steps)
+    named = {s.effect.tag for s in steps if s.effect is not None}
+    tentative = {h.tag for r in rounds for h in r.added.hypotheses} - named
+    return Discrepancy(
+        verdict=verdict,
+        sentence=_sentence(verdict, steps, before, after, places),
+        steps=steps,
+        model=tuple(e for e in model if e.tag not in tentative),
+        gap_before=before,
+        gap_after=after,
+        where=tuple(places),
+        unexplained=tuple(rest[:_MOST_UNEXPLAINED]) if still else (),
+        untestable={tag: c.untestable for tag, c in effect_classes().items() if c.untestable},
+        left_out=dict(left_out),
+        global_p=(first.global_p(both, 2), last.global_p(both, 2)),
+        examined=dict(examined),
+        n_replicates=n_replicates,
+        maps=train.maps,
+        evidence=train,
+        statistics=(first.names, pulls[0], pulls[1]),
+    )
+
+
+def _steps(
+    rounds: Sequence[Round],
+    metric: GapMetric,
+    z: Mapping[str, FloatArray],
+    settings: DiscrepancySettings,
+    before: Gap,
+    after: Gap,
+) -> tuple[Step, ...]:
+    """Return one step for every added effect, the weightiest of a round first."""
+    steps: list[Step] = []
+    mean = metric.null.mean
+    gap = before
+    for index, this in enumerate(rounds):
+        shift = (z["train"] + z["test"]) / 2.0 - this.null.mean
+        parts = this.added.parts
+        order = np.argsort([-_weight(part, this.null) for part in parts])
+        mean = this.null.mean
+        for place, member in enumerate(order):
+            mean = mean + parts[member]
+            last_of_all = index == len(rounds) - 1 and place == len(order) - 1
+            last_of_round = place == len(order) - 1
+            if last_of_all:
+                now = after
+            elif last_of_round:
+                now = metric.gap(z["final"], this.grown.mean, this.grown.replicates)
+            else:
+                now = metric.gap(z["final"], mean, this.null.replicates)
+            steps.append(_step(this, int(member), metric, z["final"], shift, gap, now, settings))
+            gap = now
+    return tuple(steps)
+
+
+def _weight(part: FloatArray, null: NullModel) -> float:
+    return float(np.sum((part / null.std) ** 2))
+
+
+def _step(
+    this: Round,
+    member: int,
+    metric: GapMetric,
+    z_final: FloatArray,
+    shift: FloatArray,
+    before: Gap,
+    after: Gap,
+    settings: DiscrepancySettings,
+) -> Step:
+    added = this.added.hypotheses[member]
+    # the choice and the refined set hold the same effects in the same order
+    rivals = this.choice.rivals[member]
+    others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
+    kept = _ambiguous_set(rivals, settings.certainty)
+    named = len(kept) == 1
+    candidates = tuple(
+        Candidate(
+            added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect,
+            r.score,
+            r.stderr,
+            r.probability,
+        )
+        for r in (rivals if named else kept)
+    )
+
+    def gap_with(hypothesis: Hypothesis) -> tuple[str, float]:
+        noise = Noise(this.null.covariance / 2.0, settings.model_error)
+        fit = fit_set([*others, hypothesis], shift, noise)
+        mean = this.null.mean + fit.parts.sum(axis=0)
+        return hypothesis.tag, metric.gap(z_final, mean, this.null.replicates).value
+
+    runner_up, placebo = _comparisons(this, added, rivals)
+    pull_before = (z_final - this.null.mean) / this.null.std
+    pull_after = (z_final - this.null.mean - this.added.parts.sum(axis=0)) / this.null.std
+    telling = np.argsort(-np.abs(added.fingerprint / this.null.std))[:_MOST_PULLS]
+    factor_error = float(this.added.stderr[member])
+    value = (
+        getattr(added.effect, added.effect.strength, float("nan")) if added.effect.strength else float("nan")
+    )
+    return Step(
+        effect=added.effect if named else None,
+        candidates=candidates,
+        strength_stderr=abs(float(value)) * factor_error / added.effect.power,
+        before=before,
+        after=after,
+        runner_up=None if runner_up is None else gap_with(runner_up),
+        placebo=None if placebo is None else gap_with(placebo),
+        pulls=tuple(Pull(this.null.names[i], float(pull_before[i]), float(pull_after[i])) for i in telling),
+    )
+
+
+def _ambiguous_set(rivals: Sequence[Rival], certainty: float) -> list[Rival]:
+    """Return the likeliest rivals that together have the wanted share of what all have."""
+    total = sum(r.probability for r in rivals)
+    kept: list[Rival] = []
+    share = 0.0
+    for rival in rivals:
+        kept.append(rival)
+        share += rival.probability / total
+        if share >= certainty:
+            break
+    return kept
+
+
+def _comparisons(
+    this: Round, added: Hypothesis, rivals: Sequence[Rival]
+) -> tuple[Hypothesis | None, Hypothesis | None]:
+    """Return the runner-up, and a candidate that is no relative of the named effect, for a placebo."""
+    runner_up = next((r.hypothesis for r in rivals if r.hypothesis.tag != added.tag), None)
+    in_set = {h.tag for h in this.added.hypotheses}
+    relatives = set(type(added.effect).separate)
+    pool = [h for h in this.hypotheses if h.tag not in in_set]
+    if runner_up is None:
+        runner_up = next((h for s in this.choice.tried for h in s.hypotheses if h.tag not in in_set), None)
+    placebo = next(
+        (h for h in pool if h.tag not in relatives and added.tag not in type(h.effect).separate), None
+    )
+    return runner_up, placebo
+
+
+def _verdict(steps: Sequence[Step], disagrees: bool, still: bool, before: Gap, after: Gap) -> Verdict:
+    if not steps:
+        return "unexplained" if still else "consistent"
+    if still and after.value > after.floor and after.value > _LARGEST_REST * before.value:
+        return "unexplained"
+    return "ambiguous" if any(s.effect is None for s in steps) else "named"
+
+
+def _demoted(step: Step) -> Step:
+    from dataclasses import replace
+
+    return replace(step, effect=None)
+
+
+def _sentence(
+    verdict: Verdict, steps: Sequence[Step], before: Gap, after: Gap, places: Sequence[Place]
+) -> str:
+    closed = f"{1e6 * before.value:.3g} -> {1e6 * max(after.value, 0.0):.3g} micronats per sample (floor {1e6 * after.floor:.2g})"
+    titles = [type(s.effect).title or s.effect.tag for s in steps if s.effect is not None]
+    if verdict == "consistent":
+        return "The frames agree with the model in every statistic tested."
+    if verdict == "named":
+        return f"The model was missing {_and(titles)}; with it the gap on unseen frames went {closed}."
+    if verdict == "ambiguous":
+        sets = [" or ".join(c.effect.tag for c in s.candidates) for s in steps if s.effect is None]
+        also = f"{_and(titles)} is missing, and " if titles else ""
+        return f"The model lacks something that these frames cannot tell apart: {also}{_and(sets)}."
+    lead = f" (largest in {places[0].statistic})" if places else ""
+    nearest = f"; nearest known: {steps[0].candidates[0].effect.tag}" if steps else ""
+    return f"The frames disagree with the model{lead}, and no known effect explains it{nearest}."
+
+
+def _and(items: Sequence[str]) -> str:
+    return ", ".join(items[:-1]) + (" and " if len(items) > 1 else "") + items[-1] if items else ""

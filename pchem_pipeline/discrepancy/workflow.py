@@ -1,0 +1,304 @@
+"""Discover, name, add, show, and again: from a stack of frames to a verdict and a better model.
+
+Arrays in, verdict out. The frames are split in three; effects are estimated on the first part, compared on the
+first two by cross-validation, and the gap that remains is measured on the third, which nothing else ever sees.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, serial
+from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
+from pchem_pipeline.discrepancy.naming import Choice, choose
+from pchem_pipeline.discrepancy.null import NullModel, as_matrix, two_sided
+from pchem_pipeline.discrepancy.observe import observe
+from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.result import Discrepancy
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
+from pchem_pipeline.discrepancy.story import Round, tell
+from pchem_pipeline.discrepancy.where import Place, locate
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+from pchem_pipeline.errors import InputError
+
+__all__ = ["find_discrepancies"]
+
+FloatArray = NDArray[np.float64]
+
+_REPLICATION = 0.02  # in each split by itself, and in the same direction
+_EXACT = ("frame.repeated",)  # tests without false positives: one split is enough
+_FEWEST_PIXELS = 32
+_REFINEMENTS = 2
+_CLOSE = 0.08  # relative: strengths known so well are not simulated again
+
+
+def find_discrepancies(
+    stack: NDArray[np.unsignedinteger],
+    numbers: NDArray[np.int64] | None = None,
+    settings: DiscrepancySettings | None = None,
+    *,
+    n_run: int | None = None,
+    bit_depth: int | None = None,
+    integration_time: float = 1.0,
+    model: Sequence[Effect] = (),
+    mapper: Mapper = serial,
+) -> Discrepancy:
+    """Find where frames disagree with the fitted model, name the effects, and add them.
+
+    Args:
+        stack: frames (frame, y, x), DN, unsigned.
+        numbers: frame numbers in the run, increasing, shape (n,); None: 0, 1, 2, ...
+        settings: the section ``discrepancy``; the defaults if None.
+        n_run: frames of the whole run; None: up to the last of ``numbers``.
+        bit_depth: bits of the ADC; None: as many as the largest DN needs, and one more.
+        integration_time: s.
+        model: effects that the model has already; none of them is added again.
+        mapper: runs the simulated stacks; None of the answers depends on how.
+
+    Returns:
+        The verdict, with everything that supports it.
+
+    Raises:
+        InputError: the frames or usable pixels are too few.
+        ConfigError: a candidate is unknown.
+        PchEmError: the present model cannot be simulated.
+    """
+    settings = settings or DiscrepancySettings()
+    numbers = np.arange(stack.shape[0], dtype=np.int64) if numbers is None else numbers
+    length = block_length(stack.shape[0], settings.block_frames)
+    splits = split_frames(numbers, length)
+    if bit_depth is None:
+        bit_depth = min(int(stack.max()).bit_length() + 1, 24)
+    search = _Search(
+        stack,
+        numbers,
+        splits,
+        settings,
+        n_run or int(numbers[-1]) + 1,
+        bit_depth,
+        integration_time,
+        tuple(model),
+        mapper,
+    )
+    return search.run()
+
+
+@dataclass
+class _Search:
+    """The state of the workflow."""
+
+    stack: NDArray[np.unsignedinteger]
+    numbers: NDArray[np.int64]
+    splits: Splits
+    settings: DiscrepancySettings
+    n_run: int
+    bit_depth: int
+    integration_time: float
+    model: tuple[Effect, ...]
+    mapper: Mapper
+    left_out: dict[str, str] = field(default_factory=dict)
+    n_replicates: int = 0
+
+    def run(self) -> Discrepancy:
+        """Go through the rounds."""
+        classes = candidate_classes(self.settings)
+        train, test, final = (self._observe(part) for part in self._parts())
+        self._check(train)
+        maps = train.maps
+        null, names = self._null(maps, "r0", self.settings.replicates, (train, test, final))
+        z = {k: self._row(e, names) for k, e in (("train", train), ("test", test), ("final", final))}
+        both = (z["train"] + z["test"]) / 2.0
+        first = null
+        rounds: list[Round] = []
+        places = locate(train, null, both, self.settings.significance)
+        while len(rounds) < self.settings.max_rounds and self._disagrees(null, z, names):
+            number = len(rounds)
+            laboratory = self._laboratory(maps, names, number)
+            shifts = (z["train"] - null.mean, z["test"] - null.mean)
+            hypotheses = self._hypotheses(laboratory, classes, train, shifts, null)
+            choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
+            self.left_out |= laboratory.left_out
+            if choice is None:
+                break
+            added = self._added(laboratory, choice, shifts, null)
+            self.model = (*self.model, *(h.effect for h in added.hypotheses))
+            grown, _ = self._null(
+                maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), names
+            )
+            rounds.append(Round(choice, added, tuple(hypotheses), null, grown))
+            null = grown
+        return self._result(rounds, first, null, names, z, places, train)
+
+    # -- pieces ---------------------------------------------------------------------------------
+
+    def _parts(self) -> tuple[NDArray[np.int64], ...]:
+        return self.splits.train, self.splits.test, self.splits.final
+
+    def _observe(self, part: NDArray[np.int64]) -> Evidence:
+        return observe(
+            self.stack[part], self.numbers[part], n_run=self.n_run, block_frames=self.splits.block_frames
+        )
+
+    def _check(self, train: Evidence) -> None:
+        usable = int(train.maps.usable.sum())
+        if usable < _FEWEST_PIXELS:
+            raise InputError(
+                f"{usable} of {train.maps.usable.size} pixels have a usable fit on the train frames, fewer than "
+                f"{_FEWEST_PIXELS}; nothing can be compared: look at fit_status, or take more frames"
+            )
+
+    def _acquisition(self) -> Acquisition:
+        return Acquisition(
+            self.numbers[self.splits.train],
+            self.n_run,
+            self.splits.block_frames,
+            self.bit_depth,
+            self.integration_time,
+        )
+
+    def _null(
+        self,
+        maps: PixelMaps,
+        prefix: str,
+        count: int,
+        measured: Sequence[Evidence],
+        names: tuple[str, ...] | None = None,
+    ) -> tuple[NullModel, tuple[str, ...]]:
+        """Simulate and observe the present model ``count`` times."""
+        text = "|".join(e.model_dump_json() for e in self.model)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        tasks = [
+            Replicate(
+                f"{prefix}-null-{digest}-{i}", maps, self.model, self._seed(prefix, i), self._acquisition()
+            )
+            for i in range(count)
+        ]
+        self.n_replicates += count
+        vectors = []
+        for result in self.mapper(tasks):
+            if isinstance(result, Exception):
+                raise result
+            vectors.append(result)
+        if names is None:
+            common = set(STATISTICS).intersection(*vectors, *(e.z for e in measured))
+            names = tuple(name for name in STATISTICS if name in common)
+        return NullModel.from_replicates(names, as_matrix(names, vectors)), names
+
+    def _seed(self, purpose: str, index: int = 0) -> int:
+        text = f"{self.settings.seed}/{purpose}/{index}"
+        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
+
+    def _row(self, evidence: Evidence, names: tuple[str, ...]) -> FloatArray:
+        return as_matrix(names, [evidence.z])[0]
+
+    def _disagrees(self, null: NullModel, z: Mapping[str, FloatArray], names: tuple[str, ...]) -> bool:
+        """Tell whether some statistic deviates more than chance allows, and does so in both splits."""
+        both = (z["train"] + z["test"]) / 2.0
+        if null.global_p(both, splits=2) > self.settings.significance:
+            return False
+        p = null.p_values(both, splits=2)
+        pulls = (null.pulls(z["train"]), null.pulls(z["test"]))
+        alone = [two_sided(pull, null.n_replicates) for pull in pulls]
+        same = (alone[0] < _REPLICATION) & (alone[1] < _REPLICATION) & (pulls[0] * pulls[1] > 0)
+        same |= np.isin(names, _EXACT)
+        limit = 1.0 - (1.0 - self.settings.significance) ** (1.0 / null.effective_tests)
+        return bool(np.any(same & (p < limit)))
+
+    def _noise(self, null: NullModel, splits: int) -> Noise:
+        scale = 1.0 / splits + 1.0 / null.n_replicates
+        return Noise(null.covariance * scale, self.settings.model_error)
+
+    def _laboratory(self, maps: PixelMaps, names: tuple[str, ...], number: int) -> Laboratory:
+        return Laboratory(
+            maps,
+            self.model,
+            self._acquisition(),
+            names,
+            self._counted,
+            f"r{number}",
+            self._seed("fingerprint", number),
+            dict(self.left_out),
+        )
+
+    def _counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
+        self.n_replicates += len(replicates)
+        return self.mapper(replicates)
+
+    def _hypotheses(
+        self,
+        laboratory: Laboratory,
+        classes: Mapping[str, type[Effect]],
+        evidence: Evidence,
+        shifts: tuple[FloatArray, FloatArray],
+        null: NullModel,
+    ) -> list[Hypothesis]:
+        guesses = laboratory.guesses(classes, evidence)
+        hypotheses = laboratory.fingerprints(guesses)
+        shift = (shifts[0] + shifts[1]) / 2.0
+        return laboratory.refined(hypotheses, shift, self._noise(null, 2))
+
+    def _added(
+        self,
+        laboratory: Laboratory,
+        choice: Choice,
+        shifts: tuple[FloatArray, FloatArray],
+        null: NullModel,
+    ) -> Any:
+        """Refine the strengths of the chosen set together, on both splits."""
+        noise = self._noise(null, 2)
+        shift = (shifts[0] + shifts[1]) / 2.0
+        fit = fit_set(choice.best.hypotheses, shift, noise)
+        for _ in range(_REFINEMENTS):
+            if np.all(np.abs(fit.factors - 1.0) < _CLOSE):
+                break
+            effects = [h.rescaled(max(c, 1e-3)) for h, c in zip(fit.hypotheses, fit.factors, strict=True)]
+            renewed = laboratory.fingerprints(effects)
+            if len(renewed) < len(effects):
+                break
+            fit = fit_set(renewed, shift, noise)
+        final = [
+            Hypothesis(h.rescaled(max(c, 1e-3)), h.fingerprint * c)
+            for h, c in zip(fit.hypotheses, fit.factors, strict=True)
+        ]
+        return fit_set(final, shift, noise)
+
+    def _result(
+        self,
+        rounds: list[Round],
+        first: NullModel,
+        last: NullModel,
+        names: tuple[str, ...],
+        z: Mapping[str, FloatArray],
+        places: list[Place],
+        train: Evidence,
+    ) -> Discrepancy:
+        return tell(
+            rounds,
+            first=first,
+            last=last,
+            z=z,
+            places=places,
+            train=train,
+            model=self.model,
+            settings=self.settings,
+            still=self._disagrees(last, z, names),
+            left_out=self.left_out,
+            n_replicates=self.n_replicates,
+            examined={
+                "frames": int(self.numbers.size),
+                "rows": [0, self.stack.shape[1]],
+                "columns": [0, self.stack.shape[2]],
+                "train": int(self.splits.train.size),
+                "test": int(self.splits.test.size),
+                "final": int(self.splits.final.size),
+            },
+        )
