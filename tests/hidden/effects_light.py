@@ -1,0 +1,196 @@
+"""Hidden effects of the light, the dark current and the electrons."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from hidden.base import Course, Hidden, telegraph
+
+
+class ExposureDrift(Hidden):
+    """The exposure of all pixels drifts; strength: relative, end to end."""
+
+    tag: ClassVar[str] = "exposure_drift"
+    s95: ClassVar[float] = 0.004
+
+    def draw(self):
+        self.course = Course(self)
+
+    def exposure(self, t, h):
+        return h * (1 + self.strength * self.course(t))
+
+
+class Persistence(Hidden):
+    """The image of an earlier exposure fades; strength: e- per frame at its brightest, first frame.
+
+    The study has no s95 for it. A tenth of the pixels at 0.1 e- shifts the trend of the frame means by about
+    six standard errors.
+    """
+
+    tag: ClassVar[str] = "persistence"
+    s95: ClassVar[float] = 0.1
+
+    def draw(self):
+        ny, nx = self.sensor.shape
+        y, x = np.meshgrid(np.arange(ny) / ny, np.arange(nx) / nx, indexing="ij")
+        kind = self.pick("pattern", "disc", "bar", "spots")
+        cy, cx = self.rng.uniform(0.25, 0.75, 2)
+        if kind == "disc":
+            image = np.hypot(y - cy, x - cx) < self.rng.uniform(0.15, 0.3)
+        elif kind == "bar":
+            image = np.abs((y - cy) if self.rng.random() < 0.5 else (x - cx)) < self.rng.uniform(0.06, 0.15)
+        else:
+            image = np.zeros((ny, nx))
+            for _ in range(self.rng.integers(4, 10)):
+                sy, sx, width = *self.rng.random(2), self.rng.uniform(0.02, 0.06)
+                image += np.exp(-((y - sy) ** 2 + (x - sx) ** 2) / (2 * width**2))
+        self.image = image / max(image.max(), 1e-9)
+        self.affected = self.image > 0.1
+        n = self.sensor.n_frames
+        self.tau = self.rng.uniform([0.02, 0.15], [0.1, 0.6]) * n
+        self.share = self.rng.dirichlet([1.0, 3.0])
+        self.parameters |= {"tau_frames": self.tau.tolist(), "share": self.share.tolist()}
+
+    def exposure(self, t, h):
+        left = float(self.share @ np.exp(-max(t, 0) / self.tau))
+        return h + self.strength * left * self.image
+
+
+class DarkCurrentRts(Hidden):
+    """The dark current of some pixels blinks; strength: fraction of pixels."""
+
+    tag: ClassVar[str] = "dark_current_rts"
+    s95: ClassVar[float] = 0.0027
+    scaling: ClassVar[tuple[float, float, float]] = (0.75, 0.75, 0.5)
+    most: ClassVar[float] = 0.3
+
+    def draw(self):
+        self.where = self.some_pixels(self.strength)
+        n, nt = self.where[0].size, self.sensor.n_frames
+        median = self.between("median_step_e", 0.5, 1.0)
+        defects = self.pick("levels", 2, 3, p=(0.75, 0.25)) - 1
+        self.extra = np.zeros((nt, n))
+        for i in range(n):
+            for _ in range(defects):
+                tau = np.exp(self.rng.uniform(np.log(20), np.log(max(nt / 10, 40)), 2))
+                step = median * np.exp(0.35 * self.rng.standard_normal())
+                self.extra[:, i] += step * telegraph(self.rng, nt, *tau)
+
+    def exposure(self, t, h):
+        h = h.copy()
+        h[self.where] += self.extra[max(t, 0)]
+        return h
+
+
+class ExposureFlicker(Hidden):
+    """The exposure of all pixels varies from frame to frame; strength: relative, rms."""
+
+    tag: ClassVar[str] = "exposure_flicker"
+    s95: ClassVar[float] = 0.005
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+    most: ClassVar[float] = 0.3
+
+    def draw(self):
+        law = self.pick("law", "normal", "uniform", "two_level")
+        n = self.sensor.n_frames
+        if law == "normal":
+            deviation = self.rng.standard_normal(n)
+        elif law == "uniform":
+            deviation = self.rng.uniform(-np.sqrt(3), np.sqrt(3), n)
+        else:
+            deviation = self.rng.choice([-1.0, 1.0], n)
+        self.factor = np.maximum(1 + self.strength * deviation, 0)
+
+    def exposure(self, t, h):
+        return h * self.factor[max(t, 0)]
+
+
+class OverdispersedCounts(Hidden):
+    """The exposure varies from sample to sample: Var K = H + a H^2; strength: a."""
+
+    tag: ClassVar[str] = "overdispersed_counts"
+    s95: ClassVar[float] = 0.0016
+
+    def draw(self):
+        self.law = self.pick("law", "gamma", "lognormal", p=(0.6, 0.4))
+
+    def exposure(self, t, h):
+        if self.law == "gamma":
+            return h * self.rng.standard_gamma(1 / self.strength, h.shape) * self.strength
+        width = np.sqrt(np.log1p(self.strength))
+        return h * np.exp(width * self.rng.standard_normal(h.shape) - width**2 / 2)
+
+
+class BranchingCounts(Hidden):
+    """Each electron sets free Poisson(l) more in the same pixel, and those again; strength: l."""
+
+    tag: ClassVar[str] = "branching_counts"
+    s95: ClassVar[float] = 0.0013
+    most: ClassVar[float] = 0.5
+
+    def electrons(self, t, k):
+        total, young = k.copy(), k
+        while young.any():
+            young = self.rng.poisson(self.strength * young)
+            total += young
+        return total
+
+
+class OpticalCrosstalk(Hidden):
+    """Each electron sets one free in one of the four neighbours with probability p; strength: p."""
+
+    tag: ClassVar[str] = "optical_crosstalk"
+    s95: ClassVar[float] = 0.0028
+    most: ClassVar[float] = 0.5
+
+    def electrons(self, t, k):
+        emitted = self.rng.binomial(k, self.strength)
+        y, x = np.nonzero(emitted)
+        times = emitted[y, x]
+        y, x = np.repeat(y, times), np.repeat(x, times)
+        step = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])[self.rng.integers(0, 4, y.size)]
+        y, x = y + step[:, 0], x + step[:, 1]
+        inside = (y >= 0) & (y < k.shape[0]) & (x >= 0) & (x < k.shape[1])
+        k = k.copy()
+        np.add.at(k, (y[inside], x[inside]), 1)
+        return k
+
+
+class CosmicRays(Hidden):
+    """Particles cross some frames; strength: tracks per frame."""
+
+    tag: ClassVar[str] = "cosmic_rays"
+    s95: ClassVar[float] = 0.003
+    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 1.0)
+
+    def draw(self):
+        self.alpha = self.between("alpha_share", 0.0, 0.4)
+        # 80 electrons per micrometre of silicon, pixels of 1.1 to 4 micrometres
+        self.per_pixel = 80 * self.between("pixel_um", 1.1, 4.0)
+        expected = self.strength * self.sensor.n_frames
+        n = max(1, self.rng.poisson(expected), round(expected / 2))
+        self.hits = np.bincount(self.rng.integers(0, self.sensor.n_frames, n), minlength=self.sensor.n_frames)
+        self.parameters["tracks"] = int(n)
+
+    def _deposit(self) -> np.ndarray:
+        ny, nx = self.sensor.shape
+        cy, cx = self.rng.uniform(0, ny), self.rng.uniform(0, nx)
+        charge = np.zeros((ny, nx))
+        if self.rng.random() < self.alpha:
+            y, x = np.meshgrid(np.arange(ny), np.arange(nx), indexing="ij")
+            width = self.rng.uniform(0.5, 1.3)
+            return 3000 * np.exp(-((y + 0.5 - cy) ** 2 + (x + 0.5 - cx) ** 2) / (2 * width**2))
+        length = np.exp(self.rng.normal(np.log(4), 0.7))
+        angle = self.rng.uniform(0, 2 * np.pi)
+        along = np.arange(0, max(length, 0.5), 0.05)
+        y, x = (cy + along * np.sin(angle)).astype(int), (cx + along * np.cos(angle)).astype(int)
+        inside = (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
+        np.add.at(charge, (y[inside], x[inside]), 0.05 * self.per_pixel)
+        return charge * np.exp(0.3 * self.rng.standard_normal(charge.shape))
+
+    def electrons(self, t, k):
+        for _ in range(self.hits[t] if t >= 0 else 0):
+            k = k + self.rng.poisson(self._deposit())
+        return k

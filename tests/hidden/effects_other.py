@@ -1,0 +1,125 @@
+"""Hidden effects that a stationary dark stack cannot show, and some outside the package's library."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from hidden.base import Hidden
+
+
+class ChargeLag(Hidden):
+    """Each electron stays behind for a frame with probability q, and again; strength: q. Invisible."""
+
+    tag: ClassVar[str] = "charge_lag"
+    s95: ClassVar[float] = 0.05
+    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+    most: ClassVar[float] = 0.4
+    warmup: ClassVar[int] = 40
+
+    def draw(self):
+        self.left = np.zeros(self.sensor.shape, np.int64)
+
+    def electrons(self, t, k):
+        there = k + self.left
+        self.left = self.rng.binomial(there, self.strength)
+        return there - self.left
+
+
+class ChargeDiffusion(Hidden):
+    """Each electron moves to one of the four neighbours with probability q; strength: q. Invisible."""
+
+    tag: ClassVar[str] = "charge_diffusion"
+    s95: ClassVar[float] = 0.05
+    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+    most: ClassVar[float] = 0.6
+
+    def electrons(self, t, k):
+        stay = k.copy()
+        arrived = np.zeros_like(k)
+        left_over = 1.0
+        for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            moved = self.rng.binomial(stay, self.strength / 4 / left_over)
+            left_over -= self.strength / 4
+            stay -= moved
+            shifted = np.roll(moved, way, axis)
+            # what leaves the sensor does not come back on the other side
+            edge = (slice(None),) * axis + (0 if way == 1 else -1,)
+            shifted[edge] = 0
+            arrived += shifted
+        return stay + arrived
+
+
+class SpuriousCharge(Hidden):
+    """Electrons that no light and no dark current made; strength: e- per sample. Invisible."""
+
+    tag: ClassVar[str] = "spurious_charge"
+    s95: ClassVar[float] = 0.075
+    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+
+    def electrons(self, t, k):
+        return k + self.rng.poisson(self.strength, k.shape)
+
+
+class TrapLimitedLag(Hidden):
+    """One trap per pixel holds at most one electron; strength: chance that an empty one catches one."""
+
+    tag: ClassVar[str] = "trap_limited_lag"
+    s95: ClassVar[float] = 0.01
+    most: ClassVar[float] = 0.9
+    warmup: ClassVar[int] = 60
+
+    def draw(self):
+        self.release = self.between("release", 0.1, 0.6)
+        self.full = np.zeros(self.sensor.shape, bool)
+
+    def electrons(self, t, k):
+        freed = self.full & (self.rng.random(k.shape) < self.release)
+        caught = ~self.full & (k > 0) & (self.rng.random(k.shape) < self.strength)
+        self.full = (self.full & ~freed) | caught
+        return k + freed - caught
+
+
+class SelfTriggerCut(Hidden):
+    """Samples without an electron are partly not taken, but awaited anew; strength: that part."""
+
+    tag: ClassVar[str] = "self_trigger_cut"
+    s95: ClassVar[float] = 0.003
+    most: ClassVar[float] = 0.9
+
+    def electrons(self, t, k):
+        again = (k == 0) & (self.rng.random(k.shape) < self.strength)
+        return np.where(again, self.rng.poisson(self.sensor.exposure), k)
+
+
+class OutputCrosstalk(Hidden):
+    """The right half sees a part of what the left half's output reads at the same time; strength: part."""
+
+    tag: ClassVar[str] = "output_crosstalk"
+    s95: ClassVar[float] = 0.002
+    most: ClassVar[float] = 0.2
+
+    def draw(self):
+        nx = self.sensor.shape[1]
+        self.affected[:, : nx - nx // 2] = False
+
+    def signal(self, t, v):
+        v, half = v.copy(), v.shape[1] // 2
+        v[:, v.shape[1] - half :] += self.strength * v[:, :half][:, ::-1]
+        return v
+
+
+class CheckerboardOffset(Hidden):
+    """Two colours of pixels, like a chessboard, swap the sign of an offset from frame to frame; DN."""
+
+    tag: ClassVar[str] = "checkerboard_offset"
+    s95: ClassVar[float] = 0.08
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+
+    def draw(self):
+        y, x = np.indices(self.sensor.shape)
+        self.colour = np.where((y + x) % 2 == 0, 1.0, -1.0)
+
+    def voltage(self, t, dn):
+        return dn + (self.strength if t % 2 == 0 else -self.strength) * self.colour

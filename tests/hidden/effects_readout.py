@@ -1,0 +1,225 @@
+"""Hidden effects of the pedestal, the converter and the data path."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from hidden.base import Course, Hidden, telegraph
+
+
+class BiasDrift(Hidden):
+    """The bias of all pixels drifts; strength: DN, end to end."""
+
+    tag: ClassVar[str] = "bias_drift"
+    s95: ClassVar[float] = 0.022
+
+    def draw(self):
+        self.course = Course(self)
+
+    def voltage(self, t, dn):
+        return dn + self.strength * self.course(t)
+
+
+class BiasJumps(Hidden):
+    """The bias of parts of the sensor jumps, each part at its own times; strength: height, DN."""
+
+    tag: ClassVar[str] = "bias_jumps"
+    s95: ClassVar[float] = 0.021
+
+    def draw(self):
+        (ny, nx), nt = self.sensor.shape, self.sensor.n_frames
+        parts = self.pick("parts", "quadrants", "top_bottom", "left_right", p=(0.7, 0.15, 0.15))
+        rows = (np.arange(ny) >= ny / 2)[:, None] * (parts != "left_right")
+        columns = (np.arange(nx) >= nx / 2)[None, :] * (parts != "top_bottom")
+        self.part = 2 * rows + columns
+        rate = self.between("jumps_per_run", 3, 12)
+        kind = self.pick("kind", "telegraph", "steps")
+        self.course = np.zeros((nt, 4))
+        for part in range(4):
+            if kind == "telegraph":
+                course = telegraph(self.rng, nt, nt / rate, nt / rate)
+                if np.ptp(course) == 0:
+                    course[self.rng.integers(nt // 5, nt - nt // 5) :] = 1 - course[0]
+            else:
+                steps = np.zeros(nt)
+                times = self.rng.integers(nt // 20, nt - nt // 20, max(1, self.rng.poisson(rate / 2)))
+                np.add.at(steps, times, self.rng.choice([-1.0, 1.0], times.size))
+                course = np.cumsum(steps)
+            self.course[:, part] = self.strength * (course - course.mean())
+
+    def voltage(self, t, dn):
+        return dn + self.course[max(t, 0)][self.part]
+
+
+class FrameNoise(Hidden):
+    """All pixels of a frame share a deviation; strength: DN rms."""
+
+    tag: ClassVar[str] = "frame_noise"
+    s95: ClassVar[float] = 0.031
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+
+    def voltage(self, t, dn):
+        return dn + self.strength * self.rng.standard_normal()
+
+
+class RowNoise(Hidden):
+    """All pixels of a row of a frame share a deviation; strength: DN rms."""
+
+    tag: ClassVar[str] = "row_noise"
+    s95: ClassVar[float] = 0.093
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+
+    def voltage(self, t, dn):
+        return dn + self.strength * self.rng.standard_normal((dn.shape[0], 1))
+
+
+class ColumnNoise(Hidden):
+    """All pixels of a column of a frame share a deviation; strength: DN rms."""
+
+    tag: ClassVar[str] = "column_noise"
+    s95: ClassVar[float] = 0.079
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.25, 0.25)
+
+    def voltage(self, t, dn):
+        return dn + self.strength * self.rng.standard_normal((1, dn.shape[1]))
+
+
+class PeriodicPickup(Hidden):
+    """A sine picked up while rows are read; strength: amplitude, DN."""
+
+    tag: ClassVar[str] = "periodic_pickup"
+    s95: ClassVar[float] = 0.023
+
+    def draw(self):
+        along = self.pick("along", "rows", "columns", "frames", p=(0.7, 0.15, 0.15))
+        ny, nx = self.sensor.shape
+        line = self.between("cycles_per_line", 0.03, 0.47) if along != "frames" else 0.0
+        self.per_frame = self.between("cycles_per_frame", 0.03, 0.47)
+        start = self.between("phase", 0, 2 * np.pi)
+        place = np.arange(nx)[None, :] if along == "columns" else np.arange(ny)[:, None]
+        self.place = 2 * np.pi * line * place + start
+
+    def voltage(self, t, dn):
+        return dn + self.strength * np.sin(self.place + 2 * np.pi * self.per_frame * t)
+
+
+class ReadoutAlternation(Hidden):
+    """Even and odd frames differ, as with two banks of converters; strength: half the difference, DN."""
+
+    tag: ClassVar[str] = "readout_alternation"
+    s95: ClassVar[float] = 0.006
+
+    def draw(self):
+        self.half = self.sign() * self.strength
+
+    def voltage(self, t, dn):
+        return dn + (self.half if t % 2 == 0 else -self.half)
+
+
+class AdcDnl(Hidden):
+    """Codes of uneven width; strength: deviation of the width, LSB.
+
+    A pattern that fewer codes carry, or an irregular one, is made stronger so that it is as visible as the
+    alternation of all codes.
+    """
+
+    tag: ClassVar[str] = "adc_dnl"
+    s95: ClassVar[float] = 0.0015
+    most: ClassVar[float] = 0.9
+
+    def draw(self):
+        kind = self.pick("kind", "bit", "random", "one_code", p=(0.6, 0.25, 0.15))
+        codes = np.arange(2**self.sensor.bits + 2)
+        if kind == "bit":
+            bit = self.pick("bit", 0, 1, 2, 3, p=(0.4, 0.25, 0.2, 0.15))
+            error = min(self.strength * np.sqrt(2.0**bit), 0.45)
+            edges = self.sign() * error * ((codes >> bit) & 1)
+        elif kind == "random":
+            edges = np.clip(
+                2.5 / np.sqrt(2) * self.strength * self.rng.standard_normal(codes.size), -0.4, 0.4
+            )
+        else:
+            low, high = self.sensor.code_range
+            code = int(self.rng.uniform(low + 0.1 * (high - low), high - 0.3 * (high - low)))
+            wider = min(8 * self.strength, 0.45)
+            edges = np.where(codes > code, wider / 2, np.where(codes == code, -wider / 2, 0.0))
+            # the next ones make up for it
+            edges[code + 2 :] = 0.0
+            self.parameters["code"] = code
+        self.edges = edges
+
+    def convert(self, t, dn, code):
+        lower, upper = code - 0.5 + self.edges[code], code + 0.5 + self.edges[code + 1]
+        return code - (dn < lower) + (dn >= upper)
+
+
+class AdcInl(Hidden):
+    """The converter's curve bends smoothly; strength: amplitude, LSB."""
+
+    tag: ClassVar[str] = "adc_inl"
+    s95: ClassVar[float] = 0.016
+
+    def draw(self):
+        self.low, self.high = self.sensor.code_range
+        if self.pick("kind", "sine", "cubic", p=(0.75, 0.25)) == "sine":
+            self.turns, self.phase = self.between("turns", 1.2, 3.5), self.between("phase", 0, 2 * np.pi)
+        else:
+            self.turns = 0.0
+        self.side = self.sign()
+
+    def voltage(self, t, dn):
+        u = (dn - self.low) / (self.high - self.low)
+        if self.turns:
+            return dn + self.strength * np.sin(2 * np.pi * self.turns * u + self.phase)
+        w = 2 * np.clip(u, -0.2, 1.2) - 1
+        # Chebyshev: within +-1 over the range
+        return dn + self.side * self.strength * (4 * w**3 - 3 * w)
+
+
+class Clipping(Hidden):
+    """Nothing below, or nothing above, one code; strength: part of the samples that it catches."""
+
+    tag: ClassVar[str] = "clipping"
+    s95: ClassVar[float] = 7e-6
+    scaling: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
+    most: ClassVar[float] = 0.05
+
+    def draw(self):
+        self.side = self.pick("side", "low", "high")
+
+    def finish(self, frames):
+        caught = self.strength * (6 / 7 if self.side == "low" else 8 / 7) * frames.size
+        counts = np.bincount(frames.ravel(), minlength=2**self.sensor.bits)
+        # beyond[c]: samples that a limit at code c would catch; the limit that comes nearest to what is asked
+        total = np.cumsum(counts if self.side == "low" else counts[::-1])
+        beyond = np.concatenate([[0], total[:-1]])
+        beyond = beyond if self.side == "low" else beyond[::-1]
+        limit = int(np.argmin(np.abs(np.log(np.maximum(beyond, 0.01) / caught))))
+        touched = frames < limit if self.side == "low" else frames > limit
+        frames[touched] = limit
+        self.affected = touched.any(axis=0)
+        self.parameters |= {"limit_dn": limit, "samples": int(touched.sum())}
+
+
+class RepeatedFrames(Hidden):
+    """Frames, or rows of frames, come twice; strength: number of frames."""
+
+    tag: ClassVar[str] = "repeated_frames"
+    s95: ClassVar[float] = 1.0
+    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+
+    def draw(self):
+        n = max(1, round(self.strength))
+        self.rows = slice(None)
+        if self.pick("what", "frames", "rows", p=(0.8, 0.2)) == "rows":
+            start = int(self.rng.integers(0, self.sensor.shape[0] // 2))
+            self.rows = slice(start, start + self.sensor.shape[0] // 4)
+        times = self.rng.choice(np.arange(1, self.sensor.n_frames), n, replace=False)
+        self.times = set(times.tolist())
+        self.parameters["frames"] = sorted(self.times)
+
+    def record(self, t, frames):
+        if t in self.times:
+            frames[t, self.rows] = frames[t - 1, self.rows]
