@@ -184,6 +184,42 @@ def run(
 
 
 @app.command()
+def discrepancy(
+    target: Target,
+    refit: Annotated[
+        bool,
+        typer.Option(
+            "--refit/--no-refit", help="fit, maps, ensemble and report with the grown model at once"
+        ),
+    ] = True,
+    force: Force = False,
+    dry_run: DryRun = False,
+    roi: Annotated[
+        str | None, typer.Option(help="look at the pixels y0:y1,x0:x1 only [default: all, or a window]")
+    ] = None,
+    workers: Workers = None,
+    backend: Backend = None,
+    log_json: LogJson = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Find what the model is missing, name it, and add it to the model.
+
+    Simulates the fitted model many times and compares. What is named goes into model.effects of the run's YAML.
+    """
+    from pchem_pipeline.stages.growing import find_and_grow
+    from pchem_pipeline.stages.session import find_run
+
+    command = _command(
+        force=force, dry_run=dry_run, tiles=None, roi=roi, workers=workers, backend=backend,
+        log_json=log_json, progress=progress, quiet=quiet,
+    )  # fmt: skip
+    text = find_and_grow(find_run(target), command, refit=refit)
+    if text:
+        typer.echo(text)
+
+
+@app.command()
 def status(target: Target) -> None:
     """Print how far each stage is, and why one is stale."""
     from pchem_pipeline.stages.session import find_run, run_status

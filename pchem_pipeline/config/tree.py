@@ -7,6 +7,8 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.settings import ModelSettings
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.model.ensemble_settings import EnsembleSettings, MapsSettings
 from pchem_pipeline.model.histogram_settings import HistogramSettings
@@ -47,14 +49,28 @@ class RunConfig(Section):
     )
     input: InputSettings = Field(default_factory=InputSettings, description="camera files")
     histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="counting")
+    model: ModelSettings = Field(default_factory=ModelSettings, description="what is added to the PCD")
     fit: FitSettings = Field(default_factory=FitSettings, description="PCH-EM")
     maps: MapsSettings = Field(default_factory=MapsSettings, description="parameter maps")
     ensemble: EnsembleSettings = Field(default_factory=EnsembleSettings, description="ensemble distributions")
+    discrepancy: DiscrepancySettings = Field(
+        default_factory=DiscrepancySettings, description="search for what the model is missing"
+    )
     report: ReportSettings = Field(default_factory=ReportSettings, description="report.html and figures")
     compute: ComputeSettings = Field(default_factory=ComputeSettings, description="who does the work")
 
     @field_validator(
-        "run", "input", "histogram", "fit", "maps", "ensemble", "report", "compute", mode="before"
+        "run",
+        "input",
+        "histogram",
+        "model",
+        "fit",
+        "maps",
+        "ensemble",
+        "discrepancy",
+        "report",
+        "compute",
+        mode="before",
     )
     @classmethod
     def _empty_section(cls, value: object) -> object:

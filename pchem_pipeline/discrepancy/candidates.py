@@ -1,4 +1,4 @@
-"""The candidates: every effect's guesses about itself, what they would do, and how strong they would have to be."""
+"""The candidates: every effect's guesses about itself, what they would do, and how strong they must be."""
 
 from __future__ import annotations
 

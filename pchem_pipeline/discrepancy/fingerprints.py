@@ -1,9 +1,9 @@
 """Optimal fingerprinting: how much of which effects best explains the shift of the statistics.
 
 The shift of the statistics against the null is regressed on the fingerprints of candidate effects, as climate
-science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c_e F_e + noise`` with ``c_e >= 0``.
-The noise has the covariance of the null replicates, and a relative error of each fingerprint on top, since the
-details of a real effect are never those of the library.
+science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c_e F_e + noise`` with ``c_e
+>= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top,
+since the details of a real effect are never those of the library.
 """
 
 from __future__ import annotations

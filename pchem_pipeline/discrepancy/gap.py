@@ -1,11 +1,11 @@
 """The gap between data and model in nats per sample, its floor, and its interval.
 
-``gap = sum_f (D_f - E_f) / (2 N)``: D_f is the squared distance of the statistics of a family from what the model
-gives, in its covariance, E_f the distance that replicates of the model itself have, N the number of samples. It
-estimates the Kullback-Leibler divergence per sample between the laws of the statistics, so it does not grow with
-the data; more data only lowers the floor, the 95 % quantile of what the model has against itself. One covariance,
-that of the model before anything was added, measures all models of a comparison: otherwise an effect that makes
-the statistics scatter would shrink the gap by widening the noise.
+``gap = sum_f (D_f - E_f) / (2 N)``: D_f is the squared distance of the statistics of a family from what the
+model gives, in its covariance, E_f the distance that replicates of the model itself have, N the number of
+samples. It estimates the Kullback-Leibler divergence per sample between the laws of the statistics, so it
+does not grow with the data; more data only lowers the floor, the 95 % quantile of what the model has against
+itself. One covariance, that of the model before anything was added, measures all models of a comparison:
+otherwise an effect that makes the statistics scatter would shrink the gap by widening the noise.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Which effects explain the shift of the statistics: sets compared by what they predict on held-out frames.
 
-Every set of up to three candidates is fitted on one split and scored on the other, both ways round. The scores,
-less a price for every effect, give each set a probability; an effect is named where the sets that hold it have
-nearly all of it, and what could as well stand in its place is named beside it where not.
+Every set of up to three candidates is fitted on one split and scored on the other, both ways round. The
+scores, less a price for every effect, give each set a probability; an effect is named where the sets that
+hold it have nearly all of it, and what could as well stand in its place is named beside it where not.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _rivals(
     found: dict[str, Rival] = {}
     for scored, weight in zip(sets, weights, strict=True):
         new = scored.tags - others
-        if not new or not others <= scored.tags and len(new) > len(best.tags):
+        if not new or (not others <= scored.tags and len(new) > len(best.tags)):
             continue
         for candidate in scored.hypotheses:
             if candidate.tag not in new:

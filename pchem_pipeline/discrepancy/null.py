@@ -1,7 +1,7 @@
 """What the statistics look like where the model is right: moments from replicates, and p-values.
 
-Replicates are simulated from the fitted model and refitted (parametric bootstrap), so whatever the fit absorbs
-is absorbed in them too.
+Replicates are simulated from the fitted model and refitted (parametric bootstrap), so whatever the fit
+absorbs is absorbed in them too.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class NullModel:
         return int(self.replicates.shape[0])
 
     def pulls(self, z: FloatArray, splits: int = 1) -> FloatArray:
-        """Return (z - mean) / std for the mean of ``splits`` independent vectors, the mean's own error included."""
+        """Return (z - mean) / std for the mean of ``splits`` vectors, with the error of the mean."""
         return (z - self.mean) / (self.std * np.sqrt(1.0 / splits + 1.0 / self.n_replicates))
 
     def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
-        """Return two-sided p-values of each statistic (Student's t: the deviation comes from few replicates)."""
+        """Return two-sided p-values (Student's t: the standard deviation comes from few replicates)."""
         return two_sided(self.pulls(z, splits), self.n_replicates - 1 + _PRIOR_WEIGHT)
 
     def global_p(self, z: FloatArray, splits: int = 1) -> float:
@@ -98,8 +98,8 @@ def _std(deviations: FloatArray) -> FloatArray:
 def _effective_tests(vectors: FloatArray) -> float:
     """Return the m for which the smallest of m independent p-values is spread like that of the replicates.
 
-    Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 - p)^m`` is
-    -1 / mean(log(1 - p_min)).
+    Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 -
+    p)^m`` is -1 / mean(log(1 - p_min)).
     """
     n, m = vectors.shape
     total, squares = vectors.sum(axis=0), (vectors**2).sum(axis=0)

@@ -97,7 +97,7 @@ def simulate_frames(
 
 
 def truth_of(maps: PixelMaps) -> TruthMaps:
-    """Return fitted maps as the truth of a simulated sensor; unusable pixels get the medians of the others."""
+    """Return fitted maps as the truth of a simulated sensor; unusable pixels get medians."""
     values = {}
     for item in fields(PixelMaps):
         if item.name != "usable":

@@ -16,7 +16,7 @@ class DiscrepancySettings(Section):
         default=60,
         ge=20,
         le=2000,
-        description="simulated and refitted stacks behind the null distribution; each is a third of the frames",
+        description="simulated and refitted stacks behind the null distribution; each has a third of the ",
     )
     grown_replicates: int = Field(
         default=24, ge=12, le=2000, description="the same for each model that effects were added to"
@@ -24,21 +24,21 @@ class DiscrepancySettings(Section):
     block_frames: int | None = Field(
         default=None,
         ge=8,
-        description="frames in a block; blocks go in turn to train, test and final. null: a sixtieth of the run, "
-        "within 20 to 100",
+        description="frames in a block; blocks go in turn to train, test and final. null: a sixtieth of "
+        "the run, within 20 to 100",
     )
     max_samples: int = Field(
         default=1 << 25,
         ge=1 << 14,
-        description="frames x pixels looked at; of a larger stack, a window in its middle and frames spread over "
-        "the run in whole blocks",
+        description="frames x pixels looked at; of a larger stack, a window in its middle and blocks of "
+        "frames spread over the run",
     )
     significance: float = Field(
         default=0.005,
         gt=0,
         le=0.1,
-        description="a disagreement counts when one as large comes by chance, anywhere among the statistics, with "
-        "a smaller probability",
+        description="a disagreement counts when one as large comes by chance, anywhere among the "
+        "statistics, with a smaller probability",
     )
     certainty: float = Field(
         default=0.98,
@@ -50,8 +50,8 @@ class DiscrepancySettings(Section):
         default=0.1,
         ge=0,
         le=1,
-        description="relative error allowed to the fingerprint of a candidate (its details are never quite those "
-        "of the sensor), no unit",
+        description="relative error allowed to the fingerprint of a candidate (its details are never "
+        "quite those of the sensor), no unit",
     )
     max_rounds: int = Field(
         default=3, ge=1, le=10, description="rounds of naming and adding; each round may add several effects"
@@ -59,10 +59,11 @@ class DiscrepancySettings(Section):
     material: float = Field(
         default=0.0,
         ge=0,
-        description="nats per sample: a smaller remaining gap is reported as immaterial and not pursued; 0: pursue all",
+        description="nats per sample: a smaller remaining gap is not pursued; 0: pursue all",
     )
     candidates: tuple[str, ...] | None = Field(
         default=None, description="effects (tags) to consider; null: all that are known, plug-ins included"
     )
     exclude: tuple[str, ...] = Field(default=(), description="effects (tags) to leave out")
+    add: bool = Field(default=True, description="put the named effects into model.effects of the run's YAML")
     seed: int = Field(default=1, ge=0, lt=2**63, description="root of the replicates' random numbers")

@@ -46,8 +46,8 @@ def block_length(n_frames: int, wanted: int | None = None) -> int:
     needed = max(MINIMUM_FRAMES, 9 * length)
     if n_frames < needed:
         raise InputError(
-            f"{n_frames} frames are too few to look for a discrepancy (blocks of {length} in three parts need "
-            f"{needed}); take more frames"
+            f"{n_frames} frames are too few to look for a discrepancy: blocks of {length} in three parts "
+            f"need {needed}; take more frames"
             + ("" if wanted is None or n_frames < MINIMUM_FRAMES else ", or lower discrepancy.block_frames")
         )
     return length

@@ -233,7 +233,8 @@ def _demoted(step: Step) -> Step:
 def _sentence(
     verdict: Verdict, steps: Sequence[Step], before: Gap, after: Gap, places: Sequence[Place]
 ) -> str:
-    closed = f"{1e6 * before.value:.3g} -> {1e6 * max(after.value, 0.0):.3g} micronats per sample (floor {1e6 * after.floor:.2g})"
+    gaps = [1e6 * value for value in (before.value, max(after.value, 0.0), after.floor)]
+    closed = "{:.3g} -> {:.3g} micronats per sample (floor {:.2g})".format(*gaps)
     titles = [type(s.effect).title or s.effect.tag for s in steps if s.effect is not None]
     if verdict == "consistent":
         return "The frames agree with the model in every statistic tested."

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
 from pchem_pipeline.effects.evidence import Evidence, TimeSeries
 

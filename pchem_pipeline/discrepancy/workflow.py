@@ -1,7 +1,8 @@
 """Discover, name, add, show, and again: from a stack of frames to a verdict and a better model.
 
-Arrays in, verdict out. The frames are split in three; effects are estimated on the first part, compared on the
-first two by cross-validation, and the gap that remains is measured on the third, which nothing else ever sees.
+Arrays in, verdict out. The frames are split in three; effects are estimated on the first part, compared on
+the first two by cross-validation, and the gap that remains is measured on the third, which nothing else ever
+sees.
 """
 
 from __future__ import annotations
@@ -152,8 +153,8 @@ class _Search:
         usable = int(train.maps.usable.sum())
         if usable < _FEWEST_PIXELS:
             raise InputError(
-                f"{usable} of {train.maps.usable.size} pixels have a usable fit on the train frames, fewer than "
-                f"{_FEWEST_PIXELS}; nothing can be compared: look at fit_status, or take more frames"
+                f"{usable} of {train.maps.usable.size} pixels have a usable fit on the train frames, "
+                f"fewer than {_FEWEST_PIXELS}: nothing can be compared; see fit_status, or take more frames"
             )
 
     def _acquisition(self) -> Acquisition:

@@ -120,6 +120,7 @@ class StageContext:
         fresh: True where the stage starts anew and must create its arrays.
         failed: unit key to reason, filled by :meth:`run_units`.
         n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
+        config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
     """
 
@@ -135,6 +136,7 @@ class StageContext:
     fresh: bool = True
     failed: dict[str, str] = field(default_factory=dict)
     n_keys: int = 0
+    config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -221,13 +223,16 @@ class StageContext:
         unit_name: str = "tile",
         needs: str | None = None,
         by_tiles: bool = True,
+        total: int | None = None,
     ) -> dict[str, dict[str, Any]]:
         """Run ``task`` on every unit that is chosen and not done yet, and mark each.
 
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
         every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same
         tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
-        ``--tiles`` and ``--roi`` do not choose, such as blocks of frames. Returns the summaries of all
+        ``--tiles`` and ``--roi`` do not choose, such as blocks of frames. A stage that learns only on its way
+        what its units are calls this several times and says in ``total`` how many markers that makes so far;
+        it resumes also under ``--force``, which has made it start anew. Returns the summaries of all
         finished units by key, earlier runs included.
 
         Raises:
@@ -235,15 +240,15 @@ class StageContext:
             InputError: the camera files are gone.
             StoreError: the store cannot be written.
         """
-        self._know_total(sum(len(unit.keys) for unit in units))
-        todo = self._ready(self.pending(units, by_tiles=by_tiles), needs)
+        self._know_total(sum(len(unit.keys) for unit in units) if total is None else total)
+        todo = self._ready(self._pending_of(units, by_tiles, total), needs)
         for unit in todo:
             for key in unit.keys:
                 self.store.records.unmark(self.stage, self.fingerprint, key)
         marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
         fatal: list[BaseException] = []
-        total = len(self.selected(units) if by_tiles else units)
-        with self.reporter.progress(self.stage, total, unit_name, total - len(todo)) as advance:
+        shown = len(self.selected(units) if by_tiles else units)
+        with self.reporter.progress(self.stage, shown, unit_name, shown - len(todo)) as advance:
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
                 advance()
@@ -260,6 +265,12 @@ class StageContext:
                     raise fatal[0] from fatal[0].__cause__
         self.stop.check()
         return self.store.records.summaries(self.stage, self.fingerprint)
+
+    def _pending_of(self, units: Sequence[AnyUnit], by_tiles: bool, total: int | None) -> list[AnyUnit]:
+        if total is None:
+            return self.pending(units, by_tiles=by_tiles)
+        done = self.store.records.done(self.stage, self.fingerprint)
+        return [unit for unit in units if not set(unit.keys) <= done]
 
     def _know_total(self, n_keys: int) -> None:
         """Keep how many markers the stage will have, before the first is set: a kill must not lose it."""

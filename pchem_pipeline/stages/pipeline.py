@@ -20,10 +20,13 @@ from pchem_pipeline.stages.base import StageContext, StageModule, identity_of
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["STAGES", "StageState", "execute", "load_stage", "pipeline_of", "status"]
+__all__ = ["OPTIONAL_STAGES", "STAGES", "StageState", "execute", "load_stage", "pipeline_of", "status"]
 
 #: Every stage of a run, in the order of the data.
 STAGES = ("simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report")
+
+#: Stages that are run on demand only.
+OPTIONAL_STAGES = ("electrons", "discrepancy")
 
 _LIBRARIES = ("numpy", "scipy", "numba", "zarr", "dask", "tifffile", "astropy", "h5py", "matplotlib")
 

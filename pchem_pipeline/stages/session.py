@@ -14,7 +14,14 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError, IncompleteRunError, StoreError
 from pchem_pipeline.stages.base import Options, StageContext
 from pchem_pipeline.stages.interrupt import StopRequest, stop_on_signals
-from pchem_pipeline.stages.pipeline import StageState, execute, load_stage, pipeline_of, status
+from pchem_pipeline.stages.pipeline import (
+    OPTIONAL_STAGES,
+    StageState,
+    execute,
+    load_stage,
+    pipeline_of,
+    status,
+)
 from pchem_pipeline.stages.reporting import ProgressMode, Reporter
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
@@ -24,11 +31,12 @@ __all__ = ["Command", "Target", "cropped", "find_run", "run_stages", "run_status
 
 @dataclass(frozen=True)
 class Target:
-    """A run: its configuration, the folder its paths refer to, and its store."""
+    """A run: its configuration, the folder its paths refer to, its store, and its YAML file if it has one."""
 
     config: RunConfig
     base_dir: Path
     store: Path
+    config_path: Path | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -76,13 +84,19 @@ def find_run(path: Path) -> Target:
         if text is None:
             raise StoreError(f"{path} holds no configuration; give the YAML file that made it")
         location = read_json(path / ".pchem" / "location.json") or {}
-        return Target(parse_config(text, str(path)), Path(location.get("base_dir", path.parent)), path)
+        written = location.get("config")
+        return Target(
+            parse_config(text, str(path)),
+            Path(location.get("base_dir", path.parent)),
+            path,
+            None if written is None else Path(written),
+        )
     if path.suffix.lower() not in (".yaml", ".yml"):
         what = "is neither a YAML file nor a run" if path.exists() else "does not exist"
         raise ConfigError(f"{path} {what}; give a config.yaml or the store of a run")
     config = load_config(path)
     base_dir = path.resolve().parent
-    return Target(config, base_dir, base_dir / config.run.store)
+    return Target(config, base_dir, base_dir / config.run.store, path.resolve())
 
 
 def with_overrides(target: Target, command: Command) -> Target:
@@ -138,12 +152,25 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         stack.enter_context(store.locked())
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(target.config))
-        write_json(store.path / ".pchem" / "location.json", {"base_dir": os.fspath(target.base_dir)})
+        write_json(store.path / ".pchem" / "location.json", _location(target))
         executor = make_executor(target.config.compute)
         stack.callback(executor.close)
         yield StageContext(
-            target.config, target.base_dir, store, executor, reporter, stop, options=command.options
+            target.config,
+            target.base_dir,
+            store,
+            executor,
+            reporter,
+            stop,
+            options=command.options,
+            config_path=target.config_path,
         )
+
+
+def _location(target: Target) -> dict[str, str]:
+    """Return where the run's paths refer to, and its YAML file."""
+    place = {"base_dir": os.fspath(target.base_dir)}
+    return place if target.config_path is None else {**place, "config": os.fspath(target.config_path)}
 
 
 def run_status(target: Target) -> list[StageState]:
@@ -152,8 +179,7 @@ def run_status(target: Target) -> list[StageState]:
     if not (target.store / "zarr.json").exists():
         return [StageState(name, "missing") for name in stages]
     context = _reading_context(target, Reporter("off", quiet=True), Options())
-    if context.store.records.read("electrons") is not None:
-        stages = (*stages, "electrons")
+    stages += tuple(name for name in OPTIONAL_STAGES if context.store.records.read(name) is not None)
     states: list[StageState] = []
     stale: set[str] = set()
     for name in stages:

@@ -82,7 +82,7 @@ def find_or_start(
         )
     if write:
         write_atomic(path, text.encode())
-    return Target(config, path.parent, place), True
+    return Target(config, path.parent, place, path), True
 
 
 def _came_to_nothing(place: Path, path: Path) -> bool:

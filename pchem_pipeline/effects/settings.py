@@ -1,0 +1,20 @@
+"""YAML section ``model``: what the model of the data holds beyond the PCD."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pchem_pipeline.effects.registry import EffectList
+from pchem_pipeline.settings import Section
+
+__all__ = ["ModelSettings"]
+
+
+class ModelSettings(Section):
+    """The model with which the pixels are fitted."""
+
+    effects: EffectList = Field(
+        default=(),
+        description="effects beyond the PCD with which pixels are fitted and ensembles predicted; "
+        "pchem discrepancy adds those that it names",
+    )
