@@ -205,7 +205,7 @@ def discrepancy(
 ) -> None:
     """Find what the model is missing, name it, and add it to the model.
 
-    Simulates the fitted model many times and compares. What is named goes into model.effects of the run's YAML.
+    Simulates the fitted model many times and compares. What is named goes into model.effects of the YAML.
     """
     from pchem_pipeline.stages.growing import find_and_grow
     from pchem_pipeline.stages.session import find_run

@@ -16,7 +16,7 @@ class DiscrepancySettings(Section):
         default=60,
         ge=20,
         le=2000,
-        description="simulated and refitted stacks behind the null distribution; each has a third of the ",
+        description="simulated and refitted stacks behind the null distribution, a third of the run each",
     )
     grown_replicates: int = Field(
         default=24, ge=12, le=2000, description="the same for each model that effects were added to"
