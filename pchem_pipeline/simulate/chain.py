@@ -18,7 +18,7 @@ import numpy as np
 from pchem_pipeline.effects.context import EffectContext
 from pchem_pipeline.effects.plane import Plane
 from pchem_pipeline.errors import ConfigError, PchEmError
-from pchem_pipeline.simulate.chain_numba import simulate_rows
+from pchem_pipeline.simulate.chain_numba import draw_rows, simulate_rows
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,
     make_key,
@@ -148,18 +148,14 @@ class _Block:
     def run(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Return digital numbers and electron numbers of the block."""
         settings, truth = self.settings, self.truth
-        columns = np.arange(settings.shape[1])
-        frames, ys, xs = (to_words(axis) for axis in (self.frames, self.rows, columns))
-        u, v = uniform_pair(make_key(settings.seed, _SAMPLE_PURPOSE), frames, ys, xs)
-
         context = self._context()
-        exposure = self._apply(
-            Plane.EXPOSURE, np.array(np.broadcast_to(truth.quanta_exposure, u.shape)), context
-        )
+        if _of_plane(settings.effects, Plane.EXPOSURE):
+            exposure, charge, noise = self._varying_exposure(context)
+        else:
+            exposure, charge, noise = self._constant_exposure()
         context = replace(context, exposure=_frozen(exposure))
-        charge = self._apply(Plane.CHARGE, poisson_quantile(u, exposure), context)
+        charge = self._apply(Plane.CHARGE, charge, context)
         context = replace(context, charge=_frozen(charge))
-        noise = truth.analog_read_noise_e * normal_quantile(v)
         context = replace(context, read_noise=_frozen(noise))
         analog = self._apply(Plane.ANALOG, charge + noise, context)
         at_adc = self._apply(Plane.ADC, analog / truth.conversion_gain + truth.bias, context)
@@ -171,6 +167,31 @@ class _Block:
                 f"an effect on the readout returned {dn.max()} DN, above the ADC's {top}; correct it"
             )
         return dn, charge
+
+    def _words(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.uint64]]:
+        """Return the counter words of the block's frames, rows and columns."""
+        columns = np.arange(self.settings.shape[1])
+        return to_words(self.frames), to_words(self.rows), to_words(columns)
+
+    def _varying_exposure(
+        self, context: EffectContext
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return exposure, electron number and read noise (frame, y, x), e-, each sample by itself."""
+        truth = self.truth
+        u, v = uniform_pair(make_key(self.settings.seed, _SAMPLE_PURPOSE), *self._words())
+        exposure = np.array(np.broadcast_to(truth.quanta_exposure, u.shape))
+        exposure = self._apply(Plane.EXPOSURE, exposure, context)
+        return exposure, poisson_quantile(u, exposure), truth.analog_read_noise_e * normal_quantile(v)
+
+    def _constant_exposure(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return the same where no effect touches the exposure: the numbers are equal, and come sooner."""
+        truth, words = self.truth, self._words()
+        shape = tuple(axis.size for axis in words)
+        charge, noise = np.empty(shape, np.int64), np.empty(shape)
+        key = make_key(self.settings.seed, _SAMPLE_PURPOSE)
+        maps = truth.quanta_exposure, truth.analog_read_noise_e
+        draw_rows(*maps, *words, *key, charge, noise)
+        return np.broadcast_to(truth.quanta_exposure, shape), charge, noise
 
     def _streams(self, purpose: str) -> KeyedStreams:
         columns = np.arange(self.settings.shape[1])

@@ -12,7 +12,7 @@ from pchem_pipeline.simulate.streams_numba import (
     uniform_row,
 )
 
-__all__ = ["simulate_rows"]
+__all__ = ["draw_rows", "simulate_rows"]
 
 # tables up to this length are searched from the bottom, longer ones by bisection
 _LINEAR = 48
@@ -77,3 +77,28 @@ def simulate_rows(  # type: ignore[no-untyped-def]
             if t < electrons.shape[0]:
                 for x in range(nx):
                     electrons[t, y, x] = k[x]
+
+
+@njit(nogil=True, cache=True)
+def draw_rows(exposure, noise, frames, ys, xs, k0, k1, charge, read_noise):  # type: ignore[no-untyped-def]
+    """Fill ``charge`` and ``read_noise`` (frame, y, x), e-, with the draws of :func:`simulate_rows`.
+
+    For chains whose exposure is the same in all frames: a table for each pixel is built once.
+    """
+    nx = xs.size
+    zero = np.uint64(0)
+    u = np.empty(nx)
+    v = np.empty(nx)
+    z = np.empty(nx)
+    first = np.empty(nx, np.int64)
+    length = np.empty(nx, np.int64)
+    for y in range(ys.size):
+        tables = np.empty((nx, _widest(exposure[y])))
+        for x in range(nx):
+            first[x], length[x] = poisson_table(exposure[y, x], tables[x])
+        for t in range(frames.size):
+            uniform_row(frames[t], ys[y], xs, zero, k0, k1, u, v)
+            normal_from_uniform(v, z)
+            for x in range(nx):
+                charge[t, y, x] = first[x] + _look_up(tables[x], length[x], u[x])
+                read_noise[t, y, x] = noise[y, x] * z[x]
