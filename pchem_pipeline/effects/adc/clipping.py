@@ -2,12 +2,14 @@
 
 Black-level clamping, a limited ramp or a full column amplifier end the scale before the ADC does: every
 value beyond the limit becomes the limit, ``x = min(max(x, low), high)``, so the likelihood of that code is
-the whole tail beyond it (a censored observation). The cut at 0 and at ``2**bit_depth - 1`` is not this
-effect: the ADC always makes it.
+the whole tail beyond it (a censored observation, Tobin 1958). The cut at 0 and at ``2**bit_depth - 1`` is not
+this effect: the ADC always makes it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -19,8 +21,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import CodeResiduals, Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["Clipping"]
+
+# counts expected beyond the limit, and standard errors of the pile-up at it
+_EXPECTED_BEYOND = 8.0
+_PILE_UP = 4.0
 
 
 @register_effect
@@ -33,6 +41,18 @@ class Clipping(Effect):
 
     tag: Literal["clipping"] = Field(default="clipping", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
+    title: ClassVar[str] = "clipping (black-level clamping, saturation)"
+    source: ClassVar[str] = "Tobin 1958, Econometrica 26, 24 (censored observations); EMVA 1288 (saturation)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "code.top",
+        "code.bottom",
+        "code.largest",
+        "shape.goodness.cnt",
+    )
+    separate: ClassVar[Mapping[str, str]] = {
+        "adc_dnl": "a shifted bias: a limit stays where it is, and nothing comes from beyond it",
+        "adc_inl": "a shifted bias or more light: a limit is one code, a bent curve all of them",
+    }
     low: int | None = Field(
         default=None, ge=0, description="smallest DN that comes out; null: that of the ADC"
     )
@@ -53,3 +73,35 @@ class Clipping(Effect):
         # the limits are whole DN, so to limit before rounding is to limit after it
         result: NDArray[Any] = np.clip(values, self.low, self.high)
         return result
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the extreme codes at which counts pile up while those expected beyond are missing.
+
+        Nothing is typical of a limit, which is a code of this very sensor: the default guesses are none.
+        """
+        code = evidence.code
+        high = code.maximum if _piles_up(code, code.maximum, above=True) else None
+        low = code.minimum if code.minimum > 0 and _piles_up(code, code.minimum, above=False) else None
+        if high is None and low is None:
+            return ()
+        if high is None or low is None:
+            return (cls(low=low, high=high),)
+        return cls(low=low, high=high), cls(high=high), cls(low=low)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law that counts at the limits what lies beyond them."""
+        lows = [limit for limit in (model.clip_low, self.low) if limit is not None]
+        highs = [limit for limit in (model.clip_high, self.high) if limit is not None]
+        return replace(model, clip_low=max(lows, default=None), clip_high=min(highs, default=None))
+
+
+def _piles_up(code: CodeResiduals, limit: int, *, above: bool) -> bool:
+    """Return whether a code holds what is missing beyond it."""
+    at = limit - code.first
+    if not 0 <= at < code.observed.size:
+        return False
+    beyond = slice(at + 1, None) if above else slice(0, at)
+    missing = float(code.expected[beyond].sum() - code.observed[beyond].sum())
+    excess = float(code.observed[at] - code.expected[at])
+    return missing > _EXPECTED_BEYOND and excess > _PILE_UP * np.sqrt(float(code.expected[at]) + 1.0)

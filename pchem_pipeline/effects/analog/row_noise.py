@@ -7,16 +7,20 @@ because the eye finds stripes long before the pixel statistics do.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.common_modes import add_offset, line_excess, mean_variance, responsivity
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["RowNoise"]
 
@@ -32,10 +36,35 @@ class RowNoise(Effect):
 
     tag: Literal["row_noise"] = Field(default="row_noise", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    row_noise_dn: float = Field(ge=0, description="standard deviation of the rows' offsets, DN")
+    title: ClassVar[str] = "row noise (row temporal noise)"
+    source: ClassVar[str] = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
+    signature: ClassVar[tuple[str, ...]] = ("space.row.readout.variance", "space.x.rr")
+    strength: ClassVar[str] = "row_noise_dn"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "periodic_pickup": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
+        "interpixel_capacitance": "pixels far apart in a row: they are as correlated as neighbours",
+        "frame_noise": "means of rows within a frame: frame noise shifts them all alike",
+    }
+    row_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        offset = self.row_noise_dn * context.random.normal(("frame", "y"))
-        result: NDArray[Any] = values + offset * context.truth["conversion_gain"]
-        return result
+        return add_offset(values, self.row_noise_dn * context.random.normal(("frame", "y")), context)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.35 DN."""
+        return (cls(row_noise_dn=0.35),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the excess variance of row means within their frames (moment estimate)."""
+        if evidence.time is None:
+            return ()
+        excess, error = line_excess(evidence.time.row_readout, mean_variance(evidence, axis=1))
+        return (cls(row_noise_dn=excess**0.5 / responsivity(evidence)),) if excess > 3.0 * error else ()
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
+        return model.with_variance(dn2=self.row_noise_dn**2)

@@ -1,0 +1,196 @@
+"""Differential nonlinearity of the ADC: codes of unequal width.
+
+The lower edge of code c lies at ``c - 1/2 + d_c`` (IEEE Std 1241): shifts of edges from the matching of
+comparators and capacitors, the same code by code for everything that goes through that ADC. An error of the
+weight of one binary bit repeats with the bit's period (period 16 in EMCCD bias frames, Harpsoe et al. 2012,
+A&A 542, A23; binary offsets in many instruments, Boone et al. 2018, PASP 130, 064504).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.codes import code_range, edge_shifts, roughness, usable_codes
+from pchem_pipeline.effects.edges import merged_edges
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["AdcDnl"]
+
+_CHUNK = 1024
+# edges further away would change their order
+_FARTHEST = 0.499
+
+
+@register_effect
+class AdcDnl(Effect):
+    """Shifts of the code edges.
+
+    Signature: counts per DN, summed over the pixels, deviate with alternating sign from code to code; every
+    pixel's histogram fits worse, since the pattern is fixed in DN and not at a pixel's peaks.
+    """
+
+    tag: Literal["adc_dnl"] = Field(default="adc_dnl", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ADC
+    title: ClassVar[str] = "differential nonlinearity of the ADC (DNL), bit weight error"
+    source: ClassVar[str] = (
+        "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"
+    )
+    signature: ClassVar[tuple[str, ...]] = (
+        "code.rough",
+        "code.alternating",
+        "code.period2",
+        "code.period4",
+        "code.period8",
+        "code.period16",
+        "shape.goodness.mean",
+    )
+    strength: ClassVar[str] = "dnl_lsb"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
+        "adc_inl": "a ramp or a shifted bias over many codes: DNL is new from code to code, INL smooth",
+    }
+    dnl_lsb: float = Field(
+        ge=-1,
+        le=1,
+        description="random: rms deviation of the code widths, LSB; edges: scale of `edges`, LSB; bit: error "
+        "of the bit's weight, sign included, LSB",
+    )
+    pattern: Literal["random", "bit", "edges"] = Field(
+        default="random", description="random: by code; bit: one binary weight; edges: as listed"
+    )
+    per_column: bool = Field(
+        default=False, description="random pattern: an ADC of its own for each column, with its own shifts"
+    )
+    bit: int = Field(default=0, ge=0, le=23, description="bit pattern: which bit, 0 the least significant")
+    first_code: int = Field(default=0, ge=0, description="edges pattern: code of the first of `edges`, DN")
+    edges: tuple[float, ...] = Field(
+        default=(),
+        max_length=1 << 16,
+        description="edges pattern: shift of the lower edge of each code, in units of dnl_lsb",
+    )
+
+    @model_validator(mode="after")
+    def _edges_where_they_belong(self) -> Self:
+        if (self.pattern == "edges") != bool(self.edges):
+            raise ValueError("adc_dnl: pattern edges and the list `edges` belong together; give both or none")
+        if self.per_column and self.pattern != "random":
+            raise ValueError(f"adc_dnl: per_column is for pattern random, not {self.pattern}; leave it out")
+        return self
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal at the ADC (frame, y, x), DN, moved against the edges' shifts."""
+        below = np.floor(values).astype(np.int64)
+        if not values.size:
+            return values.copy()
+        # between two whole numbers lies one edge, that of the upper one
+        first, last = int(below.min()) + 1, int(below.max()) + 1
+        columns = np.arange(context.shape[1]) if self.per_column else None
+        shift = self._shifts(first, last, context, columns)
+        index = below - (first - 1)
+        moved = shift[index] if columns is None else shift[index, columns]
+        result: NDArray[Any] = values - moved
+        return result
+
+    def _shifts(
+        self, first: int, last: int, context: EffectContext, columns: NDArray[np.int64] | None
+    ) -> NDArray[np.float64]:
+        """Return the shifts of the edges of codes ``first .. last``, DN: (codes,) or (codes, x)."""
+        if self.pattern != "random":
+            return self._listed(np.arange(first, last + 1))
+        parts = []
+        for chunk in range(first // _CHUNK, last // _CHUNK + 1):
+            # a negative code has no edge in the ADC, but the signal may lie there before it is cut
+            draw = chunk & 0xFFFF
+            if columns is None:
+                parts.append(context.random.generator(draw=draw).standard_normal(_CHUNK))
+            else:
+                drawn = [
+                    context.random.generator(x=int(x), draw=draw).standard_normal(_CHUNK) for x in columns
+                ]
+                parts.append(np.stack(drawn, axis=1))
+        begin = first - first // _CHUNK * _CHUNK
+        chosen = np.concatenate(parts)[begin : begin + last - first + 1]
+        # a width is the difference of two edges
+        shift = chosen * (self.dnl_lsb / np.sqrt(2.0))
+        return np.asarray(np.clip(shift, -_FARTHEST, _FARTHEST), np.float64)
+
+    def _listed(self, codes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the shifts of the edges of these codes that need no random numbers, DN."""
+        if self.pattern == "bit":
+            shift = (codes >> self.bit & 1) - 0.5
+        else:
+            place = codes - self.first_code
+            inside = (place >= 0) & (place < len(self.edges))
+            shift = np.where(inside, np.array(self.edges)[place.clip(0, len(self.edges) - 1)], 0.0)
+        return np.asarray(np.clip(self.dnl_lsb * shift, -_FARTHEST, _FARTHEST), np.float64)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.006 LSB: random by code, and wrong weights of the bits that show in few codes."""
+        bits = [cls(dnl_lsb=0.006, pattern="bit", bit=bit) for bit in (0, 1, 2, 3)]
+        return cls(dnl_lsb=0.006), *bits
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return one wrong bit where that explains the residuals, and the shifts of all edges as they are."""
+        codes, residuals, expected = usable_codes(evidence.code)
+        variance, significance = roughness(residuals, expected)
+        if significance < 3.0:
+            return ()
+        shifts = edge_shifts(residuals, expected, variance)
+        size = float(np.sqrt(np.mean(np.diff(shifts) ** 2)))
+        if size <= 0:
+            return ()
+        listed = tuple(np.round(shifts / size, 4).tolist())
+        found = cls(dnl_lsb=min(size, 1.0), pattern="edges", first_code=int(codes[0]), edges=listed)
+        bit = _best_bit(codes, residuals, expected)
+        return (found,) if bit is None else (cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0]), found)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with the edges moved.
+
+        Random shifts are those of a simulation and unknown in a measurement: only a bit or a list can say
+        where the edges are, and a random pattern leaves the law as it is.
+        """
+        if self.pattern == "random":
+            return model
+        first, last = code_range(maps)
+        if self.pattern == "edges":
+            first, last = self.first_code, self.first_code + len(self.edges) - 1
+        start, shifts = merged_edges(model, first, self._listed(np.arange(first, last + 1)))
+        return replace(model, edge_first=start, edge_shift=shifts)
+
+
+def _best_bit(
+    codes: NDArray[np.int64], residuals: NDArray[np.float64], expected: NDArray[np.float64]
+) -> tuple[int, float] | None:
+    """Return the bit whose wrong weight explains the rough part of the residuals, and the error, LSB."""
+    weight = np.sqrt((expected[:-1] * expected[1:]) / (expected[:-1] + expected[1:]))
+    rough = np.diff(residuals) * weight
+    total, best = float((rough**2).sum()), None
+    for bit in range(8):
+        edges = (np.arange(codes[0], codes[-1] + 2) >> bit & 1) - 0.5
+        pattern = np.diff(np.diff(edges)) * weight
+        square = float((pattern**2).sum())
+        if square <= 0:
+            continue
+        error = float((pattern * rough).sum()) / square
+        gain = error**2 * square
+        # what is left must not be much rougher than the counts, or it is not one bit
+        left = (total - gain) / rough.size
+        if gain > 25.0 and left < 1.5 and (best is None or gain > best[2]):
+            best = (bit, max(-1.0, min(1.0, error)), gain)
+    return None if best is None else best[:2]

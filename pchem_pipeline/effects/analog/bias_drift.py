@@ -1,0 +1,176 @@
+"""Drift of the bias: one slow offset common to all pixels.
+
+The pedestal follows the temperature of the readout electronics and the ageing of its references: ``x += b_t``
+with b_t slow against a frame (pedestal drift; Rauscher 2015, PASP 127, 1144). The linear shape is the usual
+warming up; a shape of its own (``path``) is what a measured run really did; a random walk is what another run
+of the same camera may do. A slow sine is ``periodic_pickup`` at a few cycles per run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.common_modes import (
+    add_offset,
+    quantile_means,
+    responsivity,
+    run_position,
+    with_offsets,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps, TimeSeries
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["BiasDrift"]
+
+_NODES = (3, 5, 9, 17, 33)
+_FRAMES_PER_NODE = 12
+_LOBES = 7
+
+
+@register_effect
+class BiasDrift(Effect):
+    """Slow offset of all pixels, zero on average over the run.
+
+    Signature: block means of the readout residual move together, by the same number of DN in every pixel,
+    whatever its exposure; those of the charge do not move. A pixel's own histogram is smeared over the path.
+    """
+
+    tag: Literal["bias_drift"] = Field(default="bias_drift", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "bias (pedestal) drift"
+    source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (pedestal drift); Janesick 2001, ch. 7"
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.readout.trend",
+        "frame.readout.slow",
+        "frame.readout.lag1",
+        "time.lag1.readout.mean",
+    )
+    strength: ClassVar[str] = "drift_dn"
+    separate: ClassVar[Mapping[str, str]] = {
+        "exposure_drift": "a map of exposures: charge drifts in proportion to it, the bias everywhere alike",
+        "gain_drift": "a bright and a dark region: gain drift grows with the signal, bias drift does not",
+        "bias_jumps": "means of the quadrants, frame by frame: jumps are sudden and each quadrant's own",
+        "flicker_noise": "block means of single pixels: flicker is each pixel's own, a drift common to all",
+    }
+    drift_dn: float = Field(
+        ge=-1e6,
+        le=1e6,
+        description="linear: bias at the end less that at the start, DN; path: its scale, DN; walk: standard "
+        "deviation of the end less the start, DN",
+    )
+    shape: Literal["linear", "path", "walk"] = Field(
+        default="linear", description="linear; path: as listed in `path`; walk: random walk"
+    )
+    path: tuple[float, ...] = Field(
+        default=(),
+        max_length=4096,
+        description="bias at equally spaced frames from first to last of the run, in units of drift_dn",
+    )
+
+    @model_validator(mode="after")
+    def _path_where_it_belongs(self) -> Self:
+        if self.shape == "path" and len(self.path) < 2:
+            raise ValueError("bias_drift: shape path needs `path` with 2 values or more")
+        if self.shape != "path" and self.path:
+            raise ValueError(f"bias_drift: `path` is for shape path, not {self.shape}; leave one of them out")
+        return self
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the offset referred to the input."""
+        if self.shape == "walk":
+            offset = _walk(context)
+        else:
+            offset = self._path_at(run_position(context.frames, context.n_frames))
+        return add_offset(values, (self.drift_dn * offset)[:, None, None], context)
+
+    def _path_at(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
+        nodes = np.array(self.path or (-0.5, 0.5))
+        mean = (nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1)
+        return np.asarray(np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes) - mean)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.09 DN: rising, falling, there and back."""
+        bow = cls(drift_dn=0.09, shape="path", path=(-0.5, 0.5, -0.5))
+        return cls(drift_dn=0.09), cls(drift_dn=-0.09), bow
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the regression of the frames' means on time: linear, and a path where it explains more.
+
+        The number of nodes of the path is that of the smallest Bayesian information criterion.
+        """
+        if evidence.time is None or evidence.time.frames.size < 8:
+            return ()
+        time, alpha = evidence.time, responsivity(evidence)
+        position = run_position(time.frames, time.n_run)
+        slope, error = _slope(position, time.frame_readout)
+        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > 3.0 * error else []
+        path = _best_path(position, time)
+        if path is None:
+            return linear
+        size = float(np.ptp(path)) or 1.0
+        bent = cls(drift_dn=size / alpha, shape="path", path=tuple(np.round(path / size, 6).tolist()))
+        # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
+        walk = float(np.sqrt((np.diff(path) ** 2).sum())) / alpha
+        return [bent, *linear, cls(drift_dn=walk, shape="walk")]
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law smeared over the path (a variance where the drift is small against the noise)."""
+        if self.shape == "walk":
+            # mean square of a walk around its own mean: a sixth of the variance of its end
+            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
+        offsets = self.drift_dn * self._path_at(np.linspace(0.0, 1.0, 1001))
+        return with_offsets(model, maps, quantile_means(offsets, _LOBES))
+
+
+def _walk(context: EffectContext) -> NDArray[np.float64]:
+    """Return a random walk over the run with an end of unit variance, at the block's frames."""
+    steps = context.random.generator().standard_normal(context.n_frames)
+    walk = np.cumsum(steps) / np.sqrt(context.n_frames)
+    return np.asarray(walk[context.frames.clip(0, context.n_frames - 1)] - walk.mean())
+
+
+def _slope(position: NDArray[np.float64], means: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the slope of the means against the position, and its standard error, DN per run."""
+    centred = position - position.mean()
+    square = float((centred**2).sum())
+    if square <= 0:
+        return 0.0, np.inf
+    slope = float((centred * means).sum() / square)
+    left = means - means.mean() - slope * centred
+    return slope, float(np.sqrt((left**2).sum() / max(means.size - 2, 1) / square))
+
+
+def _best_path(position: NDArray[np.float64], time: TimeSeries) -> NDArray[np.float64] | None:
+    """Return the values of the piecewise linear path at its nodes, DN; None if a line does as well."""
+    means = time.frame_readout
+    best, least = None, _criterion(means, np.stack([np.ones_like(position), position], 1))[0] - 10.0
+    for count in _NODES:
+        if position.size < _FRAMES_PER_NODE * count:
+            break
+        knots = np.linspace(0.0, 1.0, count)
+        hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
+        criterion, values = _criterion(means, hats)
+        if criterion < least:
+            best, least = values, criterion
+    return best
+
+
+def _criterion(means: NDArray[np.float64], basis: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return the Bayesian information criterion of a least-squares fit, and its coefficients."""
+    values: NDArray[np.float64] = np.linalg.lstsq(basis, means, rcond=1e-6)[0].astype(np.float64)
+    rest = float(((means - basis @ values) ** 2).sum())
+    n = means.size
+    return float(n * np.log(max(rest, 1e-300) / n) + basis.shape[1] * np.log(n)), values

@@ -1,0 +1,220 @@
+"""Jumps of the bias: the level of an output changes suddenly, at random times.
+
+Each of the four quadrants, as if it had an amplifier of its own, sits on one of several levels and jumps to
+another. The bias jumps of the CCDs of HST/WFPC2 (a tenth of a DN and more; WFPC2 Data Handbook) and the
+"popcorn mesa" noise of HgCdTe arrays are of this kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.change_points import find_changes, noise_variance, segment_means
+from pchem_pipeline.effects.common_modes import add_offset, quantile_means, responsivity, with_offsets
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps, TimeSeries
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["BiasJumps"]
+
+Path = tuple[tuple[int, float], ...]
+
+_QUADRANTS = 4
+_LOBES = 7
+_SWEEPS = 4
+
+
+@register_effect
+class BiasJumps(Effect):
+    """Piecewise constant offset of each quadrant, independent of the others.
+
+    Quadrants are top left, top right, bottom left, bottom right; an odd middle row or column belongs to the
+    bottom or right.
+
+    Signature: means of the readout residual wander in one quadrant and not in the others, in sudden steps;
+    the charge does not. A pixel's own histogram becomes copies of itself at the levels.
+    """
+
+    tag: Literal["bias_jumps"] = Field(default="bias_jumps", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "bias jumps (popcorn mesa noise of an output)"
+    source: ClassVar[str] = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.readout.quadrants",
+        "frame.readout.slow",
+        "frame.readout.lag1",
+        "time.lag1.readout.mean",
+    )
+    strength: ClassVar[str] = "amplitude_dn"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "bias_drift": "means of the quadrants, frame by frame: a drift is slow and common to all of them",
+        "flicker_noise": "means of the quadrants: flicker of single pixels averages out",
+        "rts_noise": "histograms of single pixels: RTS shows in few of them, jumps in all of a quadrant",
+    }
+    amplitude_dn: float = Field(
+        ge=0, le=1e6, description="distance between neighbouring levels, DN; the scale of `path` if given"
+    )
+    rate: float = Field(default=1e-3, ge=0, le=0.5, description="jumps per frame of each quadrant")
+    levels: int = Field(default=2, ge=2, le=64, description="number of evenly spaced levels")
+    path: tuple[Path, ...] = Field(
+        default=(),
+        description="the jumps as they were, instead of random ones: for each quadrant (top left, top right, "
+        "bottom left, bottom right) a list of [frame, level from that frame on in units of amplitude_dn]",
+    )
+
+    @field_validator("path")
+    @classmethod
+    def _four_in_order(cls, path: tuple[Path, ...]) -> tuple[Path, ...]:
+        if len(path) not in (0, _QUADRANTS):
+            raise ValueError(f"bias_jumps: path needs one list for each of 4 quadrants, got {len(path)}")
+        for quadrant in path:
+            if any(a[0] >= b[0] for a, b in pairwise(quadrant)):
+                raise ValueError("bias_jumps: frames of a path must increase; sort them")
+        return path
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
+        levels = self._levels(context)
+        half_y, half_x = context.shape[0] // 2, context.shape[1] // 2
+        quadrant = 2 * (context.rows >= half_y)[:, None] + (np.arange(context.shape[1]) >= half_x)
+        return add_offset(values, self.amplitude_dn * levels[:, quadrant], context)
+
+    def _levels(self, context: EffectContext) -> NDArray[np.float64]:
+        """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, quadrant)."""
+        frames = context.frames.clip(0, context.n_frames - 1)
+        found = np.zeros((frames.size, _QUADRANTS))
+        for quadrant in range(_QUADRANTS):
+            if self.path:
+                starts, levels = _steps(self.path[quadrant], context.n_frames)
+            else:
+                starts, levels = self._drawn(context, quadrant)
+            if levels.size:
+                found[:, quadrant] = levels[np.searchsorted(starts[1:], frames, side="right")]
+        return found
+
+    def _drawn(self, context: EffectContext, quadrant: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the frames at which random levels begin, the first being 0, and the levels."""
+        generator = context.random.generator(draw=quadrant)
+        starts, first = [np.zeros(1, np.int64)], generator.integers(self.levels)
+        size = int(self.rate * context.n_frames * 1.2) + 16
+        while self.rate > 0 and starts[-1][-1] < context.n_frames:
+            starts.append(starts[-1][-1] + np.cumsum(generator.geometric(self.rate, size)))
+        frames = np.concatenate(starts)
+        # a jump always goes to another level
+        moves = generator.integers(1, self.levels, frames.size - 1)
+        levels = (first + np.concatenate([[0], np.cumsum(moves)])) % self.levels
+        return frames, np.asarray(levels - (self.levels - 1) / 2.0, np.float64)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.085 DN, with rare and with frequent jumps."""
+        return cls(amplitude_dn=0.085, rate=1e-3), cls(amplitude_dn=0.085, rate=1e-2)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the change points of the quadrants' means, and random jumps of that size and rate.
+
+        What is common to the quadrants is taken out first, so that neither a drift nor frame noise is
+        taken for jumps.
+        """
+        if evidence.time is None or evidence.time.frames.size < 16:
+            return ()
+        series, cuts = _contrasts(evidence.time)
+        number = sum(c.size for c in cuts)
+        if not number:
+            return ()
+        means = [segment_means(one, c) for one, c in zip(series.T, cuts, strict=True)]
+        steps = np.concatenate([np.diff(m) for m in means])
+        size = float(np.sqrt((steps**2).mean())) / responsivity(evidence)
+        rate = min(max(number / (_QUADRANTS * evidence.time.frames.size), 1e-6), 0.5)
+        path = tuple(
+            _as_path(evidence.time.frames, c, m / responsivity(evidence) / size)
+            for c, m in zip(cuts, means, strict=True)
+        )
+        return cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law of copies at the levels (a variance where they are close against the noise).
+
+        The pixels' places are not known here, so a path counts with the mean law of the quadrants.
+        """
+        if self.path:
+            values = _values(self.path)
+        else:
+            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
+        return with_offsets(model, maps, self.amplitude_dn * quantile_means(values, _LOBES))
+
+
+def _steps(path: Path, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the frames at which levels begin and the levels, zero on average over the run."""
+    starts = np.array([frame for frame, _ in path], np.int64)
+    levels = np.array([level for _, level in path], np.float64)
+    if not levels.size:
+        return starts, levels
+    # the first level holds from the beginning of the run
+    lasting = np.diff(np.concatenate([[0], starts[1:].clip(0, n_frames), [n_frames]]))
+    return starts, levels - float((levels * lasting).sum() / n_frames)
+
+
+def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
+    """Return the levels that the paths go through, each as often as it lasts, zero on average.
+
+    The length of the run is not known here: the last level is taken to last as long as the others do.
+    """
+    last = max((path[-1][0] for path in paths if path), default=0)
+    end = last + max(1, last // max(1, max(len(path) for path in paths)))
+    found = [np.zeros(1)]
+    for path in paths:
+        starts, levels = _steps(path, end)
+        if levels.size:
+            lasting = np.diff(np.concatenate([[0], starts[1:], [end]]))
+            found.append(np.repeat(levels, np.maximum(lasting * 512 // end, 1)))
+    return np.concatenate(found)
+
+
+def _contrasts(time: TimeSeries) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """Return the quadrants' means of r without what they have in common, (n, 4), and their change points.
+
+    The common mode is the median of the other three, each without its own jumps as far as they are known;
+    it is left in where it is no more than the noise of the quadrants.
+    """
+    means = time.quadrant_readout.astype(np.float64)
+    steps = np.zeros_like(means)
+    common = np.zeros_like(means)
+    cuts = [np.zeros(0, np.int64)] * _QUADRANTS
+    for _ in range(_SWEEPS):
+        for q in range(_QUADRANTS):
+            common[:, q] = np.median(np.delete(means - steps, q, axis=1), axis=1)
+            series = means[:, q] - common[:, q]
+            cuts[q] = find_changes(series, noise_variance(series))
+            lengths = np.diff(np.concatenate([[0], cuts[q], [series.size]]))
+            steps[:, q] = np.repeat(segment_means(series, cuts[q]), lengths)
+    if not _is_white((means - steps).mean(axis=1)):
+        return means - common, cuts
+    return means, [find_changes(one, noise_variance(one)) for one in means.T]
+
+
+def _is_white(series: NDArray[np.float64]) -> bool:
+    """Return whether means of 16 values scatter as those of independent values do."""
+    bins = series[: series.size // 16 * 16].reshape(-1, 16).mean(axis=1)
+    allowed = 1.0 + 3.0 * np.sqrt(2.0 / max(bins.size, 1))
+    return bool(bins.size < 2 or 16.0 * bins.var() < allowed * noise_variance(series))
+
+
+def _as_path(
+    frames: NDArray[np.int64], cuts: NDArray[np.int64], levels: NDArray[np.float64]
+) -> tuple[tuple[int, float], ...]:
+    """Return the levels with the frames at which they begin; the middle of a gap between blocks of frames."""
+    starts = [int(frames[0]), *((frames[cuts - 1] + frames[cuts] + 1) // 2).tolist()]
+    return tuple(zip(starts, np.round(levels, 6).tolist(), strict=True))

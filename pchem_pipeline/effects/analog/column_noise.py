@@ -1,0 +1,70 @@
+"""Column noise: one random offset for each column of each frame, common to its pixels.
+
+With one amplifier and ADC per column, what a column's reference or sampling capacitor picks up once per frame
+shifts the whole column: ``x += n_column,t`` with ``n_column,t ~ N(0, s^2)``, new in every frame. Offsets that
+do not change from frame to frame are part of the bias map and not this effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.common_modes import add_offset, line_excess, mean_variance, responsivity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["ColumnNoise"]
+
+
+@register_effect
+class ColumnNoise(Effect):
+    """Random offset per column and frame, in DN since the disturbance sits behind the pixels' gains.
+
+    Signature: the variance of the column means of the readout residual exceeds that of ``n_y`` independent
+    pixels by ``column_noise_dn^2``; neighbours along y are correlated. A pixel's own histogram only
+    broadens: its read noise becomes ``(sigma^2 + column_noise_dn^2)^(1/2)`` DN.
+    """
+
+    tag: Literal["column_noise"] = Field(default="column_noise", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "column noise (column temporal noise)"
+    source: ClassVar[str] = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
+    signature: ClassVar[tuple[str, ...]] = ("space.column.readout.variance", "space.y.rr")
+    strength: ClassVar[str] = "column_noise_dn"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "interpixel_capacitance": "pixels far apart in a column: they are as correlated as neighbours",
+        "frame_noise": "means of columns within a frame: frame noise shifts them all alike",
+        "row_noise": "means of rows and of columns within a frame, one beside the other",
+    }
+    column_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the columns' offsets, DN")
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
+        return add_offset(values, self.column_noise_dn * context.random.normal(("frame", "x")), context)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.32 DN."""
+        return (cls(column_noise_dn=0.32),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the excess variance of column means within their frames (moment estimate)."""
+        if evidence.time is None:
+            return ()
+        excess, error = line_excess(evidence.time.column_readout, mean_variance(evidence, axis=0))
+        return (cls(column_noise_dn=excess**0.5 / responsivity(evidence)),) if excess > 3.0 * error else ()
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
+        return model.with_variance(dn2=self.column_noise_dn**2)

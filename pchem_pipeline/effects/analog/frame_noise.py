@@ -1,0 +1,99 @@
+"""Frame noise: one random offset for each frame, common to all its pixels.
+
+Noise of a reference that is sampled once per frame shifts the whole frame: ``x += f_t`` with
+``f_t ~ N(0, s^2)``, new in every frame. It is what remains of pedestal noise after a correction by rows, and
+why overscan or optically black pixels are subtracted frame by frame (Janesick 2001, Scientific
+Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144 draws such pedestals).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.common_modes import add_offset, mean_variance, responsivity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps, TimeSeries
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["FrameNoise"]
+
+
+@register_effect
+class FrameNoise(Effect):
+    """Random offset per frame, in DN since the disturbance sits behind the pixels' gains.
+
+    Signature: frame means of the readout residual scatter more than ``n`` independent pixels do, by
+    ``frame_noise_dn^2``, white from frame to frame; those of the charge do not. A pixel's own histogram
+    only broadens: its read noise becomes ``(sigma^2 + frame_noise_dn^2)^(1/2)`` DN.
+    """
+
+    tag: Literal["frame_noise"] = Field(default="frame_noise", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "frame noise (frame-to-frame offset noise)"
+    source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144"
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.readout.variance",
+        "frame.readout.largest",
+        "space.x.rr",
+        "space.y.rr",
+    )
+    strength: ClassVar[str] = "frame_noise_dn"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "exposure_flicker": "frames without light and at short exposure: flicker of the exposure vanishes",
+        "periodic_pickup": "a spectrum of frame means of a longer run: pickup is a line, noise is flat",
+        "bias_drift": "a longer run: a drift grows with the time between two frames, noise does not",
+    }
+    frame_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
+        return add_offset(values, self.frame_noise_dn * context.random.normal(("frame",)), context)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.12 DN."""
+        return (cls(frame_noise_dn=0.12),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the excess variance of successive frames, so that a slow drift does not count.
+
+        Half the mean squared difference of successive frame means, even and odd frames centred apart.
+        """
+        if evidence.time is None:
+            return ()
+        expected = float(mean_variance(evidence))
+        steps = _steps(evidence.time)
+        if steps.size < 8 or not expected > 0:
+            return ()
+        excess = float((steps**2).mean() / 2.0 - expected)
+        # successive differences share a frame: their squares are correlated by 1/4
+        error = expected * np.sqrt(3.0 / steps.size)
+        if excess < 3.0 * error:
+            return ()
+        return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
+        return model.with_variance(dn2=self.frame_noise_dn**2)
+
+
+def _steps(time: TimeSeries) -> NDArray[np.float64]:
+    """Return differences of the frame means of successive frames, DN, without even-odd contrast."""
+    means = time.frame_readout.astype(np.float64).copy()
+    for parity in (0, 1):
+        chosen = time.frames % 2 == parity
+        if chosen.any():
+            means[chosen] -= means[chosen].mean()
+    successive = np.diff(time.frames) == 1
+    return np.asarray(np.diff(means)[successive], np.float64)

@@ -1,0 +1,136 @@
+"""Periodic pickup: a sine from outside, sampled row by row as the sensor is read.
+
+Switching supplies, clocks and mains reach the video signal, ``x += a sin(2 pi (f_y y + f_x x + f_t t) +
+phi)``. The phase runs on from row to row and frame to frame, or is new in every frame if the frames are not
+evenly spaced. The herring-bone pattern of the STIS CCD (Jansen et al. 2003, HST Calibration Workshop) is the
+classic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.common_modes import add_offset, chebyshev_nodes, responsivity, with_offsets
+from pchem_pipeline.effects.lines import coherent_line, incoherent_line
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["PeriodicPickup"]
+
+Pickup = TypeVar("Pickup", bound="PeriodicPickup")
+
+_LOBES = 5
+
+
+@register_effect
+class PeriodicPickup(Effect):
+    """Sine along rows, columns and frames.
+
+    Signature: the spectrum of the row means (over frames and rows) of the readout residual has one line, and
+    frame means have one where the phase does not advance along the rows; the charge has none. A pixel's own
+    histogram is smeared by the arcsine law of a sine at random phase.
+    """
+
+    tag: Literal["periodic_pickup"] = Field(default="periodic_pickup", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "periodic pickup (pattern noise, EMI)"
+    source: ClassVar[str] = (
+        "Jansen et al. 2003, HST Calibration Workshop (herring-bone noise of the STIS CCD)"
+    )
+    signature: ClassVar[tuple[str, ...]] = (
+        "space.row.readout.line",
+        "frame.readout.line",
+        "space.column.readout.line",
+        "space.row.readout.variance",
+    )
+    strength: ClassVar[str] = "amplitude_dn"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "row_noise": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
+        "frame_noise": "a spectrum of the frame means: pickup is a line, frame noise is flat",
+        "readout_alternation": "another frame rate: pickup moves away from half the frame rate",
+        "bias_drift": "a second run: the phase of pickup is another, a warming up repeats itself",
+    }
+    amplitude_dn: float = Field(ge=0, le=1e6, description="amplitude of the sine, DN")
+    cycles_per_row: float = Field(
+        default=0.0, ge=-0.5, le=0.5, description="f_y: advance of the phase from row to row, cycles"
+    )
+    cycles_per_frame: float = Field(
+        default=0.0, ge=-0.5, le=0.5, description="f_t: advance of the phase from frame to frame, cycles"
+    )
+    cycles_per_column: float = Field(
+        default=0.0,
+        ge=-0.5,
+        le=0.5,
+        description="f_x: advance of the phase from column to column, cycles; 0 with column-parallel readout",
+    )
+    phase: float = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
+    random_phase: bool = Field(default=False, description="true: a new random phase in every frame")
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the sine referred to the input."""
+        turn = 2j * np.pi
+        start = np.exp(turn * self.cycles_per_frame * context.frames + 1j * self.phase)[:, None, None]
+        if self.random_phase:
+            start = start * np.exp(turn * context.random.uniform(("frame",)))
+        # a product of unit vectors: as exact as the sine of the sum, and no sine for every sample
+        along = start * np.exp(turn * self.cycles_per_row * context.rows)[None, :, None]
+        if self.cycles_per_column:
+            along = along * np.exp(turn * self.cycles_per_column * np.arange(context.shape[1]))
+        return add_offset(values, self.amplitude_dn * along.imag, context)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.092 DN: along rows and frames, frames alone, at random phase, along columns."""
+        return (
+            cls(amplitude_dn=0.092, cycles_per_row=0.17, cycles_per_frame=0.23),
+            cls(amplitude_dn=0.092, cycles_per_frame=0.23),
+            cls(amplitude_dn=0.092, cycles_per_row=0.17, random_phase=True),
+            cls(amplitude_dn=0.092, cycles_per_column=0.17, cycles_per_frame=0.23),
+        )
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the highest lines of the periodograms of the row and of the column means.
+
+        Over frames and lines together (the phase runs on), and within frames (random phase).
+        """
+        if evidence.time is None:
+            return ()
+        time, alpha = evidence.time, responsivity(evidence)
+        found: list[tuple[float, Self]] = []
+        for name, means in (("cycles_per_row", time.row_readout), ("cycles_per_column", time.column_readout)):
+            line = coherent_line(means, time.frames, time.n_run)
+            if line is not None:
+                fields: dict[str, Any] = {name: line.along, "cycles_per_frame": line.per_frame}
+                fields |= {"amplitude_dn": line.amplitude / alpha, "phase": line.phase}
+                found.append((line.excess, cls(**fields)))
+            loose = incoherent_line(means)
+            if loose is not None:
+                fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
+                found.append((loose.excess, cls(**fields)))
+        return _without_doubles(found)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law smeared by the arcsine law (a variance where the amplitude is small)."""
+        return with_offsets(model, maps, self.amplitude_dn * chebyshev_nodes(_LOBES))
+
+
+def _without_doubles(found: Sequence[tuple[float, Pickup]]) -> list[Pickup]:
+    """Return the hypotheses, the strongest first; rows and columns both see a line along frames alone."""
+    kept: list[Pickup] = []
+    for _, pickup in sorted(found, key=lambda pair: -pair[0]):
+        along = pickup.cycles_per_row or pickup.cycles_per_column
+        if along or not any(other.cycles_per_frame == pickup.cycles_per_frame for other in kept):
+            kept.append(pickup)
+    return kept[:4]

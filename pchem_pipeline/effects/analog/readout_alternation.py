@@ -1,0 +1,81 @@
+"""Readout alternation: even and odd frames differ by a constant offset.
+
+Two banks of sampling capacitors or ADCs that take turns, or two frame buffers with their own references,
+leave ``x += (-1)^t d``. (Banks that take turns along columns or rows leave a fixed pattern, which is part of
+the bias map.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.common_modes import add_offset, mean_variance, responsivity, with_offsets
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["ReadoutAlternation"]
+
+
+@register_effect
+class ReadoutAlternation(Effect):
+    """Offset of alternating sign, the same in every pixel: ``+alternation_dn`` in frames 0, 2, 4, ...
+
+    Signature: the mean readout residual of even frames exceeds that of odd ones by ``2 alternation_dn``;
+    lag 1 is anticorrelated as much as lag 2 is correlated. A pixel's own histogram becomes two copies
+    ``2 |alternation_dn|`` apart.
+    """
+
+    tag: Literal["readout_alternation"] = Field(
+        default="readout_alternation", description="name of the effect"
+    )
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "even-odd readout alternation (ping-pong offset)"
+    source: ClassVar[str] = "Black and Hodges 1980, IEEE J. Solid-State Circuits 15, 1022 (interleaved ADCs)"
+    signature: ClassVar[tuple[str, ...]] = ("frame.readout.alternating", "frame.readout.lag1")
+    strength: ClassVar[str] = "alternation_dn"
+    separate: ClassVar[Mapping[str, str]] = {
+        "periodic_pickup": "another frame rate: pickup moves away from half the frame rate",
+        "frame_noise": "a spectrum of frame means: alternation is all at half the frame rate",
+    }
+    alternation_dn: float = Field(
+        ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the offset referred to the input; draws nothing."""
+        sign = 1.0 - 2.0 * (context.frames % 2)
+        return add_offset(values, (self.alternation_dn * sign)[:, None, None], context)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.024 DN, with both signs."""
+        return cls(alternation_dn=0.024), cls(alternation_dn=-0.024)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return half the difference of the means of even and odd frames."""
+        if evidence.time is None:
+            return ()
+        means = evidence.time.frame_readout
+        even = evidence.time.frames % 2 == 0
+        n_even, n_odd = int(even.sum()), int((~even).sum())
+        if min(n_even, n_odd) < 4:
+            return ()
+        size = float(means[even].mean() - means[~even].mean()) / 2.0
+        scatter = float((means[even].var() * n_even + means[~even].var() * n_odd) / (n_even + n_odd))
+        error = np.sqrt(max(scatter, float(mean_variance(evidence))) * (1.0 / n_even + 1.0 / n_odd)) / 2.0
+        return (cls(alternation_dn=size / responsivity(evidence)),) if abs(size) > 3.0 * error else ()
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law of two copies, equally likely (a variance where they are close together)."""
+        return with_offsets(model, maps, self.alternation_dn * np.array([-1.0, 1.0]))

@@ -1,0 +1,115 @@
+"""Repeated frames: a frame that is delivered twice.
+
+A frame buffer that is read again before the next frame is in it, or a driver that fills a gap, hands out
+the frame before once more: every sample is the same. In analog data that never happens by chance, so a
+single case is proof (an equality test without false alarms).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["RepeatedFrames"]
+
+# longer runs of repeats are left out of the simulation if they are rarer than this
+_RARE = 1e-12
+
+
+@register_effect
+class RepeatedFrames(Effect):
+    """Frame t is, sample by sample, frame t - 1 as it was delivered (which may itself be a repeat).
+
+    Signature: pairs of successive frames that are equal everywhere; then also correlations at lag 1, in
+    charge and readout alike. A pixel's own histogram does not change, only fewer of its samples count.
+    """
+
+    tag: Literal["repeated_frames"] = Field(default="repeated_frames", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.READOUT
+    title: ClassVar[str] = "repeated (duplicated) frames"
+    source: ClassVar[str] = (
+        "GenICam / GigE Vision frame identifiers; exact-equality test of successive frames"
+    )
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.repeated",
+        "time.lag1.charge.mean",
+        "time.lag1.readout.mean",
+    )
+    strength: ClassVar[str] = "probability"
+    separate: ClassVar[Mapping[str, str]] = {
+        "analog_memory": "equality of successive frames, sample by sample: memory never makes them equal",
+        "flicker_noise": "equality of successive frames, sample by sample: correlated noise is never equal",
+    }
+    probability: float = Field(
+        default=0.0, ge=0, le=0.5, description="probability that a frame repeats the one before, no unit"
+    )
+    frames: tuple[int, ...] = Field(
+        default=(), max_length=1 << 20, description="numbers of frames that repeat the one before, besides"
+    )
+
+    @field_validator("frames")
+    @classmethod
+    def _after_the_first(cls, frames: tuple[int, ...]) -> tuple[int, ...]:
+        if any(frame < 1 for frame in frames):
+            raise ValueError("repeated_frames: frame 0 is the first and repeats none; list frames from 1 on")
+        return tuple(sorted(set(frames)))
+
+    def history(self) -> int:
+        """Return how long a run of repeats can get, frames."""
+        random = math.ceil(math.log(_RARE) / math.log(self.probability)) if self.probability > 0 else 0
+        return random + self._longest_listed()
+
+    def _longest_listed(self) -> int:
+        """Return the length of the longest run of successive numbers in ``frames``."""
+        if not self.frames:
+            return 0
+        breaks = np.flatnonzero(np.diff(self.frames) != 1) + 1
+        return int(np.diff(np.concatenate([[0], breaks, [len(self.frames)]])).max())
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the digital numbers (frame, y, x), DN, with repeats in place of their frames."""
+        frames = context.frames
+        repeats = np.isin(frames, np.array(self.frames, np.int64))
+        if self.probability > 0:
+            repeats |= context.random.uniform(("frame",))[:, 0, 0] < self.probability
+        # the first frame of the run has none before it
+        repeats &= frames > 0
+        index = np.arange(frames.size)
+        source = np.maximum.accumulate(np.where(repeats, -1, index))
+        # an original is looked for no further back than history reaches, so that it is the same one
+        # whatever block is simulated; in a longer run of repeats the later ones are left as they are
+        source = np.where((source < 0) | (index - source > self.history()), index, source)
+        result: NDArray[Any] = values[source]
+        return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at one frame in a thousand."""
+        return (cls(probability=1e-3),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the fraction of frames that equal the one before, and the list of them."""
+        if evidence.time is None or not evidence.time.repeated.size:
+            return ()
+        pairs = int((np.diff(evidence.time.frames) == 1).sum())
+        listed = tuple(evidence.time.repeated.tolist())
+        probability = min(len(listed) / max(pairs, 1), 0.5)
+        return cls(probability=probability), cls(frames=listed)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the same law: a repeat is one more sample of it, though not a new one."""
+        return model
