@@ -1,0 +1,168 @@
+"""The cases of the study of the discrepancy workflow, in an order of which every beginning is balanced."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+EFFECTS = (
+    "rts_noise", "bias_drift", "bias_jumps", "frame_noise", "row_noise", "column_noise",
+    "periodic_pickup", "readout_alternation", "flicker_noise", "heavy_tailed_noise", "noise_skew",
+    "signal_dependent_noise", "nonlinearity", "gain_drift", "adc_dnl", "adc_inl", "clipping",
+    "interpixel_capacitance", "analog_memory", "exposure_drift", "persistence", "dark_current_rts",
+    "exposure_flicker", "overdispersed_counts", "branching_counts", "optical_crosstalk", "cosmic_rays",
+    "repeated_frames",
+)  # fmt: skip
+UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
+OUTSIDE = ("trap_limited_lag", "self_trigger_cut", "output_crosstalk", "checkerboard_offset")
+#: effects that a stationary stack hardly tells apart: the one for the other is no invention
+TWINS = (
+    ("overdispersed_counts", "branching_counts"),
+    ("nonlinearity", "adc_inl"),
+    ("exposure_drift", "persistence"),
+)
+# the first members come from different planes, the rest are drawn
+_PAIRS = (
+    ("row_noise", "overdispersed_counts"),
+    ("interpixel_capacitance", "row_noise"),
+    ("exposure_drift", "bias_drift"),
+    ("frame_noise", "exposure_flicker"),
+    ("column_noise", "adc_dnl"),
+    ("rts_noise", "flicker_noise"),
+    ("analog_memory", "readout_alternation"),
+    ("signal_dependent_noise", "periodic_pickup"),
+    ("optical_crosstalk", "dark_current_rts"),
+    ("nonlinearity", "clipping"),
+    ("cosmic_rays", "noise_skew"),
+    ("repeated_frames", "bias_jumps"),
+    ("gain_drift", "branching_counts"),
+    ("heavy_tailed_noise", "adc_inl"),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One stack with something hidden, and how to look at it.
+
+    Attributes:
+        kind: single, null, untestable, outside, pair or left_out.
+        hidden: tags.
+        level: times the strength that is found in 95 % of stacks.
+        index: number of the repetition.
+        shape: rows, columns and frames.
+        exclude: candidates that the workflow goes without.
+    """
+
+    kind: str
+    hidden: tuple[str, ...]
+    level: float
+    index: int
+    shape: tuple[int, int, int]
+    exclude: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """Its name in the results."""
+        size = "x".join(map(str, self.shape))
+        return f"{self.kind}/{'+'.join(self.hidden) or '-'}/{self.level:g}/{self.index}/{size}"
+
+    @property
+    def seed(self) -> int:
+        """Of its sensor, its sub-parameters and its noise."""
+        name = f"{self.kind}/{self.hidden}/{self.level}/{self.index}"
+        return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=4).digest(), "little")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON data."""
+        return asdict(self) | {"key": self.key, "seed": self.seed}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many of what.
+
+    Attributes:
+        effects: to hide alone and to leave out.
+        levels: strengths of single effects.
+        seeds: repetitions of each single effect at each level, from ``first`` on.
+        first: number of the first repetition; another one makes a fresh study.
+        nulls: stacks with nothing hidden.
+        pairs: stacks with two effects at level 4.
+        triples: stacks with three.
+        leave_out: repetitions of each effect, at level 4, that is not among the candidates.
+        others: repetitions of each untestable effect and of each outside the library.
+        shape: rows, columns and frames.
+    """
+
+    effects: Sequence[str]
+    levels: Sequence[float]
+    seeds: int
+    first: int
+    nulls: int
+    pairs: int
+    triples: int
+    leave_out: int
+    others: int
+    shape: tuple[int, int, int]
+
+    def cases(self) -> list[Case]:
+        """Return all cases; of each kind and level, every beginning holds its fair part."""
+        again = range(self.first, self.first + self.seeds)
+        groups = [
+            [Case("single", (e,), level, i, self.shape) for i in again for e in self._shuffled(i, level)]
+            for level in self.levels
+        ]
+        groups.append([Case("null", (), 0.0, self.first + i, self.shape) for i in range(self.nulls)])
+        groups.append(
+            [Case("pair", pair, 4.0, self.first, self.shape) for pair in self._several(2, self.pairs)]
+        )
+        groups.append([Case("pair", s, 4.0, self.first, self.shape) for s in self._several(3, self.triples)])
+        left = range(self.first, self.first + self.leave_out)
+        groups.append(
+            [Case("left_out", (e,), 4.0, i, self.shape, (e,)) for i in left for e in self._shuffled(i, -1.0)]
+        )
+        for kind, tags in (("untestable", UNTESTABLE), ("outside", OUTSIDE)):
+            other = range(self.first, self.first + self.others)
+            groups.append([Case(kind, (tag,), 4.0, i, self.shape) for i in other for tag in tags])
+        placed = [
+            ((i + 0.5) / len(group), n, case)
+            for n, group in enumerate(groups)
+            for i, case in enumerate(group)
+        ]
+        return [case for _, _, case in sorted(placed, key=lambda item: item[:2])]
+
+    def _shuffled(self, index: int, level: float) -> list[str]:
+        return sorted(self.effects, key=lambda tag: _digest(f"{tag}/{index}/{level}"))
+
+    def _several(self, size: int, count: int) -> list[tuple[str, ...]]:
+        chosen = [] if size > 2 else [p for p in _PAIRS if set(p) <= set(self.effects)]
+        number = self.first
+        while len(chosen) < count and len(self.effects) >= size:
+            ranked = sorted(self.effects, key=lambda tag: _digest(f"{tag}/{size}/{number}"))
+            # twins together are not two effects that anyone could tell from one
+            if (
+                not any(set(twins) <= set(ranked[:size]) for twins in TWINS)
+                and tuple(ranked[:size]) not in chosen
+            ):
+                chosen.append(tuple(ranked[:size]))
+            number += 1
+            if number > self.first + 100 * (count + 1):
+                break
+        return chosen[:count]
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.blake2b(text.encode(), digest_size=8).digest()
+
+
+def twins_of(tag: str) -> set[str]:
+    """Return the near twins of an effect."""
+    return {other for pair in TWINS if tag in pair for other in pair} - {tag}
+
+
+def remaining(cases: Iterable[Case], done: Iterable[str]) -> list[Case]:
+    """Return the cases without a result."""
+    finished = set(done)
+    return [case for case in cases if case.key not in finished]

@@ -1,0 +1,69 @@
+"""A few cases of the study through the installed command, with what they cost."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from discrepancy_cases import EFFECTS, Case
+from discrepancy_figures import Answer
+from discrepancy_worker import make
+
+PCHEM = Path(sys.executable).with_name("pchem")
+RUN = """run: {{store: run.zarr, workers: {workers}}}
+input: {{files: [frames.npy], integration_time: 1.0}}
+"""
+
+
+def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Path, workers: int) -> None:
+    """Print verdict, wall and CPU time of ``pchem run`` and ``pchem discrepancy`` on hidden stacks."""
+    print(
+        f"{'hidden':26s}{'said':40s}{'run, s':>9s}{'discrepancy, s':>16s}"
+        f"{'wall':>8s}{'CPU':>8s}{'memory, MB':>12s}"
+    )
+    ratios = []
+    for i in range(count):
+        case = Case("command", (EFFECTS[(7 * (first + i) + 4) % len(EFFECTS)],), 4.0, first + i, shape)
+        place = folder / f"command-{case.hidden[0]}-{case.index}"
+        shutil.rmtree(place, ignore_errors=True)
+        make(case.hidden, case.level, case.seed, shape, place, folder / "sealed" / f"{place.name}.json")
+        (place / "run.yaml").write_text(RUN.format(workers=workers))
+        run = _timed("run", place)
+        search = _timed("discrepancy", place)
+        verdict = json.loads((place / "run.zarr" / "discrepancy.json").read_text())
+        answer = Answer({"case": case.to_json(), "verdict": verdict})
+        ratios.append(search[0] / run[0])
+        print(
+            f"{case.hidden[0]:26s}{answer.names[:39]:40s}{run[0]:9.1f}{search[0]:16.1f}{ratios[-1]:7.1f}x"
+            f"{search[1] / run[1]:7.1f}x{search[2]:12.0f}",
+            flush=True,
+        )
+    print(
+        f"cost: median {np.median(ratios):.1f} times the plain pipeline, most {max(ratios):.1f}"
+        " (target: at most 20)"
+    )
+
+
+def _timed(stage: str, place: Path) -> tuple[float, float, float]:
+    """Return wall seconds, CPU seconds and peak memory (MB, of all such commands so far) of a command."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(
+        [str(PCHEM), stage, "run.yaml"],
+        cwd=place,
+        env=os.environ,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise SystemExit(f"pchem {stage} in {place}: {done.stderr.strip().splitlines()[-1:]}")
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return time.perf_counter() - start, cpu, after.ru_maxrss / 1024

@@ -1,0 +1,253 @@
+"""The figures of the study, from its records."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from discrepancy_cases import EFFECTS, twins_of
+
+Record = dict[str, Any]
+_LARGEST_SET = 3
+
+
+class Answer:
+    """What the verdict of one record says, beside what was hidden."""
+
+    def __init__(self, record: Record):
+        """Read a record."""
+        case, verdict = record["case"], record.get("verdict") or {}
+        self.kind: str = case["kind"]
+        self.level: float = case["level"]
+        self.hidden = set(case["hidden"])
+        self.failed = record.get("error")
+        self.verdict: str = verdict.get("verdict", "error") if not self.failed else "error"
+        self.named = set(verdict.get("effects", []))
+        steps = verdict.get("steps", [])
+        #: sets that could not be told apart; a demoted step of an unexplained stack names nobody
+        self.sets = [
+            {c["effect"] for c in step["candidates"]}
+            for step in steps
+            if step["effect"] is None and self.verdict == "ambiguous"
+        ]
+        self.wrong = self.named - self.hidden
+
+    @property
+    def alone(self) -> bool:
+        """All that is hidden is named, and nothing else."""
+        return self.named == self.hidden and not self.sets
+
+    @property
+    def within(self) -> bool:
+        """Each hidden effect is named or in a small set, and none is invented."""
+        small = [s for s in self.sets if len(s) <= _LARGEST_SET]
+        return not self.wrong and all(
+            tag in self.named or any(tag in names for names in small) for tag in self.hidden
+        )
+
+    @property
+    def answered(self) -> bool:
+        """Some name was given, alone or in a set."""
+        return bool(self.named or self.sets)
+
+    @property
+    def word(self) -> str:
+        """The column of the confusion matrix."""
+        if self.failed:
+            return "error"
+        if self.hidden and self.alone:
+            return "alone"
+        if self.wrong:
+            return "wrong"
+        if self.hidden and self.within:
+            return "in set"
+        return {"named": "part", "ambiguous": "other set"}.get(self.verdict, self.verdict)
+
+    @property
+    def names(self) -> str:
+        """What was said, in short."""
+        parts = sorted(self.named) + ["|".join(sorted(s)) for s in self.sets]
+        return " + ".join(parts) or self.verdict
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a fraction."""
+    if n == 0:
+        return 0.0, 1.0
+    z, p = 1.96, hits / n
+    middle, spread = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return (middle - spread) / (1 + z * z / n), (middle + spread) / (1 + z * z / n)
+
+
+def _line(title: str, hits: int, n: int, target: str, reached: bool | None) -> None:
+    if n == 0:
+        print(f"  {title:62s}{'-':>9s}{'':>16s}   target {target}")
+        return
+    low, high = wilson(hits, n)
+    mark = "" if reached is None else ("  reached" if reached else "  MISSED")
+    print(
+        f"  {title:62s}{hits:4d}/{n:<4d}{100 * hits / n:6.1f} % [{100 * low:.0f}, {100 * high:.0f}]"
+        f"   target {target}{mark}"
+    )
+
+
+def _share(
+    title: str, which: Sequence[Any], true: Callable[[Any], bool], *, least: float = 0, most: float = 1
+) -> None:
+    hits, n = sum(bool(true(one)) for one in which), len(which)
+    target = f">= {100 * least:g} %" if least else f"<= {100 * most:g} %"
+    _line(title, hits, n, target, None if n == 0 else least <= hits / n <= most)
+
+
+def print_figures(records: Iterable[Record]) -> None:
+    """Print the confusion matrix and every figure beside its target."""
+    records = list(records)
+    answers = [Answer(record) for record in records]
+    _confusion(answers)
+    _naming(answers)
+    _gaps([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
+    _biases([r for r in records if r.get("bias")])
+    _times(records)
+
+
+def _confusion(answers: Sequence[Answer]) -> None:
+    columns = ("alone", "in set", "other set", "part", "wrong", "unexplained", "consistent", "error")
+    print("\nHidden (rows) and what the workflow said (columns, stacks); 'said': answers other than it alone")
+    print(f"{'':14s}{'hidden':26s}{'level':>6s}" + "".join(f"{c:>12s}" for c in columns) + "  said")
+    rows: dict[tuple[str, str, float], list[Answer]] = defaultdict(list)
+    for answer in answers:
+        name = "+".join(sorted(answer.hidden)) if answer.kind != "pair" else f"{len(answer.hidden)} effects"
+        rows[answer.kind, name or "nothing", answer.level].append(answer)
+    order = {tag: i for i, tag in enumerate(EFFECTS)}
+    for (kind, name, level), group in sorted(
+        rows.items(), key=lambda row: (row[0][0], row[0][2], order.get(row[0][1], 99), row[0][1])
+    ):
+        words = Counter(answer.word for answer in group)
+        others = Counter(a.names for a in group if a.word in ("wrong", "other set", "part", "in set"))
+        said = "; ".join(f"{text} x{n}" if n > 1 else text for text, n in others.most_common(4))
+        print(
+            f"{kind:14s}{name:26s}{level:6g}"
+            + "".join(f"{words[c] or '':>12}" for c in columns)
+            + f"  {said}"
+        )
+
+
+def _naming(answers: Sequence[Answer]) -> None:
+    print("\nNaming")
+    for level, alone, inside, wrong in ((4.0, 0.92, 0.98, 0.02), (1.5, 0.0, 0.85, 0.05)):
+        group = [a for a in answers if a.kind == "single" and a.level == level]
+        if alone:
+            _share(f"single effects, {level:g} s95: named alone", group, lambda a: a.alone, least=alone)
+        _share(
+            f"single effects, {level:g} s95: named or in a set of <= 3",
+            group,
+            lambda a: a.within,
+            least=inside,
+        )
+        _share(f"single effects, {level:g} s95: a wrong name", group, lambda a: a.wrong, most=wrong)
+    group = [a for a in answers if a.kind == "null"]
+    _share("nothing hidden: any name", group, lambda a: a.named, most=0.02)
+    _share("nothing hidden: any name, or a set", group, lambda a: a.answered, most=0.02)
+    _share("nothing hidden: anything but consistent", group, lambda a: a.verdict != "consistent", most=0.05)
+    group = [a for a in answers if a.kind == "untestable"]
+    _share("untestable effects: any name", group, lambda a: a.answered, most=0.0)
+    group = [a for a in answers if a.kind == "pair"]
+    _share("two or three at once: all named or in their set", group, lambda a: a.within, least=0.9)
+    _share("two or three at once: one invented", group, lambda a: a.wrong, most=0.0)
+    for kind, title in (("left_out", "left out of the candidates"), ("outside", "outside the library")):
+        group = [a for a in answers if a.kind == kind]
+        _share(f"{title}: a wrong name", group, lambda a: a.wrong, most=0.05)
+        if kind == "left_out":
+            _share(
+                f"{title}: a wrong name that is no near twin",
+                group,
+                lambda a: any(a.wrong - twins_of(tag) for tag in a.hidden),
+                most=0.05,
+            )
+        _share(f"{title}: unexplained", group, lambda a: a.verdict == "unexplained", least=0.5)
+
+
+def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
+    print("\nGap on frames never used (single effects)")
+    for level in (4.0, 1.5):
+        named = [r["verdict"] for r, a in pairs if a.level == level and a.alone]
+        every = [r["verdict"] for r, a in pairs if a.level == level and not a.failed]
+        for title, group in (("all", every), ("named alone", named)):
+            _share(f"{level:g} s95, {title}: at its floor after", group, _at_floor, least=0.9)
+        if named:
+            closed = sorted(v["gap"]["closed_fraction"] for v in named)
+            print(f"    closed fraction where named: median {_median(closed):.3f}, lowest {closed[0]:.3f}")
+    strong = [(r["verdict"]["steps"][0], a) for r, a in pairs if a.level == 4.0 and a.alone]
+    with_placebo = [(s, a) for s, a in strong if s.get("placebo") and s["gap_before"] > 0]
+    apart = [s for s, a in with_placebo if s["placebo"]["effect"] not in twins_of(next(iter(a.hidden)))]
+    _share(
+        "4 s95: a placebo closes a quarter at most", apart, lambda s: _closed(s, "placebo") <= 0.25, least=0.9
+    )
+    if apart:
+        shares = sorted(_closed(s, "placebo") for s in apart)
+        print(f"    closed by the placebo: median {_median(shares):.3f}, largest {shares[-1]:.3f}")
+        worst = Counter(s["placebo"]["effect"] for s in apart if _closed(s, "placebo") > 0.25)
+        if worst:
+            print("    placebos that close more: " + ", ".join(f"{t} x{n}" for t, n in worst.most_common()))
+    rivals = [s for s, _ in strong if s.get("runner_up") and s["gap_before"] > 0]
+    _share("4 s95: the right name closes more than the runner-up", rivals, _better_than_runner_up, least=1.0)
+
+
+def _at_floor(verdict: dict[str, Any]) -> bool:
+    return bool(verdict["gap"]["after"] <= verdict["gap"]["floor"])
+
+
+def _closed(step: dict[str, Any], who: str) -> float:
+    return float(1 - max(step[who]["gap_after"], 0.0) / step["gap_before"])
+
+
+def _better_than_runner_up(step: dict[str, Any]) -> bool:
+    return bool(step["gap_after"] < step["runner_up"]["gap_after"] or step["gap_after"] <= step["gap_floor"])
+
+
+def _biases(records: Sequence[Record]) -> None:
+    print("\nBias of the maps by the effect, in standard errors of a pixel, mean over the pixels it touches,")
+    print(
+        "against the plain fit of the same stack without the effect; before and after the named effects are in the model"
+    )
+    for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e"):
+        rows = [(r["case"], r["bias"][name]) for r in records]
+        for limit, title in (
+            (1.0, "one standard error of a pixel"),
+            (None, "5 standard errors of the mean of all"),
+        ):
+            large = [
+                (case, b)
+                for case, b in rows
+                if abs(b["before"]) > (limit or 5 / math.sqrt(max(b["pixels"], 1)))
+            ]
+            _share(
+                f"{name}: beyond {title}: cut 5 times",
+                [b for _, b in large],
+                lambda b: abs(b["after"]) <= max(abs(b["before"]) / 5, 2 * b["chance"]),
+                least=0.9,
+            )
+            for case, b in sorted(large, key=lambda row: -abs(row[1]["before"]))[:6]:
+                tag = "+".join(case["hidden"])
+                print(
+                    f"      {tag:26s}{case['level']:4g} s95{b['before']:9.2f} -> {b['after']:7.2f}"
+                    f" +- {b['chance']:.2f}"
+                )
+
+
+def _times(records: Sequence[Record]) -> None:
+    seconds = sorted(r["cpu_seconds"] for r in records if "cpu_seconds" in r)
+    if seconds:
+        stacks = sorted(r["verdict"]["replicates"] for r in records if r.get("verdict"))
+        print(f"\nCPU seconds a stack: median {_median(seconds):.0f}, longest {seconds[-1]:.0f}", end="")
+        print(f"; simulated stacks: median {_median(stacks):g}, most {stacks[-1]}")
+    failed = Counter(r["error"][:110] for r in records if r.get("error"))
+    for error, n in failed.most_common(8):
+        print(f"failed x{n}: {error}")
+
+
+def _median(values: Sequence[float]) -> float:
+    n = len(values)
+    return (values[n // 2] + values[(n - 1) // 2]) / 2

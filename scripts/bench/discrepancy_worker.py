@@ -1,0 +1,142 @@
+"""One case of the study: hide in a process of its own, look blind, then open the key and compare."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from discrepancy_cases import Case
+from numpy.typing import NDArray
+
+MAKE = Path(__file__).resolve().parents[2] / "tests" / "hidden" / "make.py"
+PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+
+
+def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, Any]:
+    """Return the record of a case; whatever goes wrong is part of it."""
+    record: dict[str, Any] = {"case": case.to_json(), "error": None}
+    with tempfile.TemporaryDirectory(prefix="hidden-") as folder:
+        try:
+            stack, key = Path(folder) / "stack", Path(folder) / "sealed" / "key.json"
+            make(case.hidden, case.level, case.seed, case.shape, stack, key)
+            frames = np.load(stack / "frames.npy")
+            record |= _look(case, frames, options)
+            # only now is the key opened
+            record["hidden"] = json.loads(key.read_text())["effects"]
+            if with_bias and record.get("effects"):
+                affected = np.load(key.with_suffix(".npz"))[f"affected_{case.hidden[0]}"]
+                make((), case.level, case.seed, case.shape, Path(folder) / "twin", Path(folder) / "twin.json")
+                twin = np.load(Path(folder) / "twin" / "frames.npy")
+                record["bias"] = _bias(frames, twin, record.pop("effects"), affected)
+            record.pop("effects", None)
+        # a study of hundreds of cases goes on, and counts this one as failed
+        except Exception as error:
+            record.pop("effects", None)
+            record["error"] = f"{type(error).__name__}: {error}"
+            record["trace"] = traceback.format_exc()[-2000:]
+    return record
+
+
+def make(
+    hidden: tuple[str, ...], level: float, seed: int, shape: tuple[int, int, int], out: Path, key: Path
+) -> None:
+    """Write a stack and its sealed key with the independent chain."""
+    command = [sys.executable, str(MAKE), "--effect", ",".join(hidden) or "none", "--level", str(level)]
+    command += ["--seed", str(seed), "--out", str(out), "--key", str(key), "--frames", str(shape[2])]
+    command += ["--shape", str(shape[0]), str(shape[1])]
+    subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ)
+
+
+def _look(case: Case, frames: NDArray[np.uint16], options: dict[str, Any]) -> dict[str, Any]:
+    from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+    from pchem_pipeline.discrepancy.workflow import find_discrepancies
+
+    settings = DiscrepancySettings(exclude=case.exclude, **options)
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = find_discrepancies(frames, settings=settings)
+    return {
+        "seconds": time.perf_counter() - wall,
+        "cpu_seconds": time.process_time() - cpu,
+        "verdict": found.to_json(),
+        "effects": found.model,
+    }
+
+
+def fit_maps(frames: NDArray[np.uint16], effects: tuple[Any, ...] = ()) -> dict[str, NDArray[np.float64]]:
+    """Fit the whole stack with the PCD, or with the model that effects make of it.
+
+    Returns:
+        Maps of H, g, mu and s_e, their standard errors (``*_stderr``), and ``good``.
+    """
+    from pchem_pipeline.model.fit_status import FAILED
+    from pchem_pipeline.model.histogram import histogram_frames
+    from pchem_pipeline.model.pchem import fit_histograms
+
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(-1, histograms.counts.shape[-1])
+    flat = [a.ravel() for a in (histograms.origin, histograms.under, histograms.over)]
+    result = fit_histograms(counts, *flat)
+    if effects:
+        result = _grown(result, counts, flat, effects, frames.shape[1:])
+    shape = frames.shape[1:]
+    g, sigma = result.conversion_gain, result.read_noise_dn
+    variance = np.diagonal(result.covariance, axis1=1, axis2=2)
+    noise_variance = (
+        sigma**2 * variance[:, 1] + g**2 * variance[:, 3] + 2 * g * sigma * result.covariance[:, 1, 3]
+    )
+    maps = {
+        "quanta_exposure": result.quanta_exposure,
+        "conversion_gain": g,
+        "bias": result.bias,
+        "read_noise_e": g * sigma,
+        "quanta_exposure_stderr": np.sqrt(variance[:, 0]),
+        "conversion_gain_stderr": np.sqrt(variance[:, 1]),
+        "bias_stderr": np.sqrt(variance[:, 2]),
+        "read_noise_e_stderr": np.sqrt(np.maximum(noise_variance, 0)),
+        "good": (result.fit_status & FAILED) == 0,
+    }
+    return {name: np.asarray(values).reshape(shape) for name, values in maps.items()}
+
+
+def _grown(
+    plain: Any,
+    counts: NDArray[Any],
+    flat: list[NDArray[Any]],
+    effects: tuple[Any, ...],
+    shape: tuple[int, ...],
+) -> Any:
+    raise NotImplementedError
+
+
+def _bias(
+    frames: NDArray[np.uint16],
+    twin: NDArray[np.uint16],
+    effects: tuple[Any, ...],
+    affected: NDArray[np.bool_],
+) -> dict[str, Any]:
+    """Compare fits without and with the named effects to the plain fit of the twin without the effect."""
+    reference, before, after = fit_maps(twin), fit_maps(frames), fit_maps(frames, effects)
+    good = affected & reference["good"] & before["good"] & after["good"]
+    found: dict[str, Any] = {"pixels": int(good.sum()), "affected": int(affected.sum())}
+    for name in PARAMETERS:
+        error = reference[f"{name}_stderr"][good]
+        moved = [(maps[name] - reference[name])[good] for maps in (before, after)]
+        use = np.isfinite(error) & np.isfinite(moved[0]) & np.isfinite(moved[1])
+        n = max(int(use.sum()), 1)
+        # a few lost pixels must not decide over the mean of all
+        low, high = (np.clip((m / error)[use], -50, 50) for m in moved)
+        found[name] = {
+            "before": float(low.mean()) if use.any() else 0.0,
+            "after": float(high.mean()) if use.any() else 0.0,
+            "chance": float(high.std() / np.sqrt(n)) if use.any() else 0.0,
+            "pixels": n,
+        }
+    return found
