@@ -2,12 +2,12 @@
 
 Each stack is made by a process of its own (``tests/hidden/make.py``, which shares no code with the package)
 with a random sensor and random details of the effect; its key is opened when the verdict stands. Results go,
-one line a stack, into ``results.jsonl`` of the folder: an interrupted study goes on where it was, and a longer
-one takes over what is there. Every beginning of the study is balanced.
+one line a stack, into ``results.jsonl`` of the folder: an interrupted study goes on where it was, and a
+longer one takes over what is there. Every beginning of the study is balanced.
 
-    python scripts/bench/bench_discrepancy.py FOLDER --minutes 30    # as far as it gets, then the figures
+    python scripts/bench/bench_discrepancy.py FOLDER --minutes 30    # as far as it gets, and the figures
     python scripts/bench/bench_discrepancy.py FOLDER --report        # the figures of what is there
-    python scripts/bench/bench_discrepancy.py FOLDER --command 3     # through the installed command, with cost
+    python scripts/bench/bench_discrepancy.py FOLDER --command 3     # the installed command, with its cost
 """
 
 from __future__ import annotations

@@ -209,9 +209,7 @@ def _better_than_runner_up(step: dict[str, Any]) -> bool:
 
 def _biases(records: Sequence[Record]) -> None:
     print("\nBias of the maps by the effect, in standard errors of a pixel, mean over the pixels it touches,")
-    print(
-        "against the plain fit of the same stack without the effect; before and after the named effects are in the model"
-    )
+    print("against the plain fit of the same stack without the effect; without -> with the named effects")
     for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e"):
         rows = [(r["case"], r["bias"][name]) for r in records]
         for limit, title in (
