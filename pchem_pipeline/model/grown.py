@@ -1,0 +1,242 @@
+"""Maximum likelihood of (H, g, mu, sigma) under a grown model, cells integrated exactly.
+
+Where effects change the law of a pixel's samples (:class:`~pchem_pipeline.model.marginal.MarginalModel`), the
+plain estimates of PCH-EM are biased. Here the likelihood of the grown law is climbed from them by damped
+Newton steps with analytic derivatives. The mass of every code is an integral over its cell, not a density at
+its middle: rounding, code edges and clipping are exact, and the likelihood is bounded at any read noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc, chdtri
+
+from pchem_pipeline.model import grown_numba, grown_tile_numba
+from pchem_pipeline.model.fit_status import FAILED, FitStatus
+from pchem_pipeline.model.grown_inputs import HasParameters, Parameters, columns_of, lobes_of, pack
+from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.model.pchem import FitResult
+from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.start import kernel_counts
+
+__all__ = ["GrownFit", "HasParameters", "fit_grown", "lobe_threshold", "log_likelihood", "marginal_mass"]
+
+FloatArray = NDArray[np.float64]
+
+_CLEAR_GAP = 30.0  # nats: a neighbour this far below is not tried again
+
+
+@dataclass(frozen=True)
+class GrownFit(FitResult):
+    """Estimates of a batch of ``n`` pixels under a grown model.
+
+    As :class:`~pchem_pipeline.model.pchem.FitResult`, but the read noise is that of the pixel alone, without
+    the variance and the lobes of the named effects; ``log_likelihood`` is that of the exact masses, and
+    ``likelihood_gap`` is renewed only where the plain one was below 30 nats.
+
+    Attributes:
+        lobe_amplitude_e: amplitude of the free lobes found in the pixel, e-, shape (n,); NaN without any.
+        lobe_weight: weight q of these lobes, shape (n,); 0 without any.
+    """
+
+    lobe_amplitude_e: NDArray[np.float64]
+    lobe_weight: NDArray[np.float64]
+
+
+def fit_grown(
+    counts: NDArray[np.integer],
+    origin: NDArray[np.integer],
+    start: Parameters,
+    model: MarginalModel,
+    settings: FitSettings | None = None,
+    *,
+    plain: FitResult | None = None,
+    warm: bool = False,
+) -> GrownFit:
+    """Estimate (H, g, mu, sigma) of every pixel under a grown model by maximum likelihood.
+
+    Damped Newton steps on the exact masses of the codes from ``start``; the neighbours (H -+ 1, mu +- 1/g)
+    are tried where the plain fit does not exclude them.
+    Where the model has free lobes, each amplitude is tried in each pixel with a weight of its own, see
+    :func:`lobe_threshold`. No pixel raises: what cannot be fitted holds NaN and a reason. The answer for a
+    pixel does not depend on the others in the batch.
+
+    Args:
+        counts: histograms, shape (n, B), any unsigned type.
+        origin: DN of bin 0, shape (n,).
+        start: (H, g, mu, sigma) of the pixels, each (n,): usually the plain estimates; NaN: not fitted.
+        model: the law.
+        settings: how to fit; the defaults if None.
+        plain: plain fit of the same pixels, from which status bits and gaps are carried over; by default the
+            neighbours of every pixel are tried, unless ``warm``.
+        warm: ``start`` comes from a fit with (nearly) this model, not from a plain one.
+
+    Returns:
+        Estimates, covariances (inverse of the observed information) and a status word per pixel.
+    """
+    settings = settings or FitSettings()
+    counts = kernel_counts(counts)
+    n = counts.shape[0]
+    parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
+    out = np.full((n, grown_numba.N_OUT), np.nan)
+    words = np.zeros((n, grown_numba.N_WORDS), np.int64)
+    gaps = np.full(n, np.inf if warm else 0.0) if plain is None else plain.likelihood_gap
+    grown_tile_numba.fit_tile(
+        counts,
+        np.ascontiguousarray(origin, np.int64),
+        columns_of(start),
+        np.ascontiguousarray(gaps, np.float64),
+        pack(model, n),
+        np.array(model.free_lobes, np.float64),
+        _limits(settings, model, warm),
+        parameters,
+        covariance,
+        out,
+        words,
+    )
+    chi2, dof = out[:, grown_numba.CHI2], words[:, grown_numba.FREEDOM]
+    probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
+    status = _status(parameters, out, words, probability, settings, plain)
+    failed = (status & int(FAILED)) != 0
+    parameters[failed] = np.nan
+    covariance[failed] = np.nan
+    exposure, gain, bias, sigma = np.ascontiguousarray(parameters.T)
+    weight = np.where(failed, np.nan, out[:, grown_numba.LOBE_WEIGHT])
+    return GrownFit(
+        quanta_exposure=exposure,
+        conversion_gain=gain,
+        bias=bias,
+        read_noise_dn=sigma,
+        covariance=covariance,
+        log_likelihood=out[:, grown_numba.LOG_LIKELIHOOD].copy(),
+        likelihood_gap=out[:, grown_numba.GAP].copy(),
+        fit_status=status.astype(np.uint16),
+        n_iterations=words[:, grown_numba.EVALUATIONS].astype(np.int32),
+        goodness_chi2=chi2.copy(),
+        goodness_dof=dof.astype(np.int32),
+        goodness_p=probability,
+        lobe_amplitude_e=np.where(weight > 0, out[:, grown_numba.AMPLITUDE], np.nan),
+        lobe_weight=weight,
+    )
+
+
+def lobe_threshold(model: MarginalModel) -> float:
+    """Return the rise of the log-likelihood, nats, that free lobes must bring to be kept.
+
+    At a weight of 0, the border of what is allowed, twice the rise is 0 or, half of the time, chi-square
+    with one degree of freedom. The amplitude means nothing there, so the largest of the rises at all
+    amplitudes counts (Davies 1987); by Bonferroni's bound over them a pixel without lobes is given some with
+    at most the probability ``free_lobe_alarm``.
+    """
+    trials = max(len(model.free_lobes), 1)
+    return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * model.free_lobe_alarm / trials)))
+
+
+def log_likelihood(
+    counts: NDArray[np.integer],
+    origin: NDArray[np.integer],
+    parameters: Parameters,
+    model: MarginalModel,
+    *,
+    lobes: tuple[ArrayLike, ArrayLike] | None = None,
+) -> FloatArray:
+    """Return ``sum_i c_i log P(x_i)`` of every pixel, nats, shape (n,); NaN without parameters.
+
+    Comparable between models, the neutral one included, and between frames that were and were not fitted.
+
+    Args:
+        counts: histograms, shape (n, B), any unsigned type.
+        origin: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma) of the pixels, each (n,).
+        model: the law.
+        lobes: ``lobe_amplitude_e`` and ``lobe_weight`` of the pixels; by default those of ``parameters``
+            where it is a :class:`GrownFit`, else none.
+    """
+    counts = kernel_counts(counts)
+    out = np.full(counts.shape[0], np.nan)
+    grown_tile_numba.score_tile(
+        counts,
+        np.ascontiguousarray(origin, np.int64),
+        columns_of(parameters),
+        lobes_of(parameters, lobes, out.size),
+        pack(model, out.size),
+        out,
+    )
+    return out
+
+
+def marginal_mass(
+    model: MarginalModel,
+    maps: Parameters,
+    codes: ArrayLike,
+    *,
+    lobes: tuple[ArrayLike, ArrayLike] | None = None,
+) -> FloatArray:
+    """Return the probability of each code in each pixel, exact to the ends of the tails.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
+        codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
+        lobes: as in :func:`log_likelihood`.
+
+    Returns:
+        P(x), shape (n, n_codes); NaN where a parameter is.
+
+    Raises:
+        ValueError: if the codes do not increase by 1.
+    """
+    wanted = np.atleast_2d(np.asarray(codes, np.int64))
+    if (np.diff(wanted, axis=1) != 1).any():
+        raise ValueError("codes must increase by 1")
+    columns = columns_of(maps)
+    n = columns.shape[0]
+    out = np.full((n, wanted.shape[1]), np.nan)
+    if out.size:
+        first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
+        grown_tile_numba.mass_tile(first, columns, lobes_of(maps, lobes, n), pack(model, n), out)
+    return out
+
+
+def _limits(settings: FitSettings, model: MarginalModel, warm: bool) -> FloatArray:
+    limits = np.zeros(grown_numba.N_LIMITS)
+    limits[grown_numba.MIN_LOG_EXPOSURE] = np.log(settings.minimum_quanta_exposure)
+    limits[grown_numba.TOLERANCE] = settings.tolerance
+    limits[grown_numba.MAX_EVALUATIONS] = settings.max_iterations
+    limits[grown_numba.CLEAR_GAP] = _CLEAR_GAP
+    limits[grown_numba.LOBE_RISE] = lobe_threshold(model)
+    limits[grown_numba.WARM] = warm
+    return limits
+
+
+def _status(
+    parameters: FloatArray,
+    out: FloatArray,
+    words: NDArray[np.int64],
+    probability: FloatArray,
+    settings: FitSettings,
+    plain: FitResult | None,
+) -> NDArray[np.int64]:
+    """Return the status words: what the plain fit said of the data, and what this fit says of itself.
+
+    Rounding is exact here, so coarse steps bias nothing and their bit falls.
+    """
+    carried = int(FAILED | FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW)
+    n = parameters.shape[0]
+    status = np.zeros(n, np.int64) if plain is None else plain.fit_status.astype(np.int64) & carried
+    fitted = (status & int(FAILED)) == 0
+    status[fitted & (words[:, grown_numba.CONVERGED] == 0)] |= FitStatus.NOT_CONVERGED
+    with np.errstate(invalid="ignore"):
+        exposure, gain, _, sigma = parameters.T
+        flags = {
+            FitStatus.EXPOSURE_AT_BOUND: exposure <= settings.minimum_quanta_exposure * (1 + 1e-9),
+            FitStatus.BIAS_AMBIGUOUS: out[:, grown_numba.GAP] < settings.gap_threshold,
+            FitStatus.NOT_INFORMATIVE: gain * sigma > settings.read_noise_limit,
+            FitStatus.POOR_FIT: probability < settings.goodness_limit,
+        }
+    for bit, where in flags.items():
+        status[fitted & where] |= bit
+    return status
