@@ -1,0 +1,171 @@
+"""Flicker noise: part of a pixel's read noise stays for many frames.
+
+The low-frequency noise of a source follower that correlated double sampling does not remove (1/f noise; van
+Vliet 1976; Kansy 1980 for its passage through double sampling) correlates successive frames of a pixel,
+each pixel by itself. Here it is one Lorentzian: a stationary Ornstein-Uhlenbeck process of correlation time
+tau, ``R_t = (1 - share)^(1/2) sigma Z_t + share^(1/2) sigma U_t`` with ``cov(U_t, U_{t+l}) = exp(-l /
+tau)``. Several of them, with tau spaced by powers, add up to 1/f (McWhorter 1957).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.long_memory import between_grid_points, frame_key
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext, RandomSource
+    from pchem_pipeline.effects.evidence import Evidence, TimeSeries
+
+__all__ = ["FlickerNoise"]
+
+# correlation times, frames, among which the estimator looks
+_TIMES = np.array([0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0, 400.0, 1000.0])
+
+
+@register_effect
+class FlickerNoise(Effect):
+    """Part of the power of the read noise that is correlated in time; the power of all stays as it is.
+
+    Signature: residuals of successive frames are alike and block means wander, each pixel by itself: neither
+    frame means nor neighbours show anything, and a pixel's own histogram does not either.
+    """
+
+    tag: Literal["flicker_noise"] = Field(default="flicker_noise", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Flicker (1/f) noise of the pixels"
+    source: ClassVar[str] = "van Vliet 1976; Kansy 1980 (double sampling of 1/f noise); McWhorter 1957"
+    signature: ClassVar[tuple[str, ...]] = (
+        "time.block.readout.chi", "time.lag1.readout.mean", "time.lag2.readout.mean",
+        "time.lag3.readout.mean",
+    )  # fmt: skip
+    strength: ClassVar[str] = "share"
+    power: ClassVar[float] = 1.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "analog_memory": "frames without any exposure: flicker remains there, memory does not",
+        "dark_current_rts": "a sweep of the exposure time: blinking charge grows with it, flicker does not",
+        "bias_drift": "pairs of distant pixels: a drift of the bias is common to them",
+        "bias_jumps": "pairs of pixels of a quadrant: a jump is common to them",
+        "gain_drift": "dark and bright pixels: a drift of the gain grows with the signal",
+        "rts_noise": "longer runs: slow telegraph noise has two levels and stays in the same few pixels",
+    }
+    share: float = Field(ge=0, le=1, description="part of the power of the read noise, no unit")
+    correlation_frames: float = Field(
+        default=30.0, gt=0, le=1e6, description="correlation time of that part, frames"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with a part of the noise exchanged for a correlated one."""
+        noise = _ornstein_uhlenbeck(context.random, context.frames, self.correlation_frames)
+        noise *= np.sqrt(self.share) * context.truth["analog_read_noise_e"]
+        if context.read_noise is not None:
+            noise -= (1.0 - np.sqrt(1.0 - self.share)) * context.read_noise
+        noise += values
+        return noise
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it from some frames to hundreds of frames long."""
+        return tuple(cls(share=0.0036, correlation_frames=tau) for tau in (3.0, 30.0, 300.0))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the least-squares fit of lag correlations and variance of block means, over a grid of tau.
+
+        A shift by d changes ``E[R | x]`` by ``d Var(r) / sigma^2`` on average (a), so that residuals l frames
+        apart are correlated by ``a share exp(-l / tau)``.
+        """
+        if evidence.time is None:
+            return ()
+        seen, error, response = _correlations(evidence, evidence.time)
+        best: list[tuple[float, float, float]] = []
+        for tau in _TIMES:
+            shape = response * _shape(evidence.time, tau)
+            information = float(((shape / error) ** 2).sum())
+            if information > 0:
+                share = float((shape * seen / error**2).sum()) / information
+                best.append((share * np.sqrt(information), share, float(tau)))
+        best.sort(reverse=True)
+        if not best or best[0][0] < 3.0:
+            return ()
+        return tuple(
+            cls(share=min(share, 1.0), correlation_frames=tau) for _, share, tau in _spread_out(best)
+        )
+
+
+def _spread_out(ranked: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    """Return the best of (sigmas, share, tau) and up to two others, nearly as good and far off in tau."""
+    kept = [ranked[0]]
+    for candidate in ranked[1:]:
+        far = all(abs(np.log(candidate[2] / other[2])) > 1.2 for other in kept)
+        if far and candidate[0] > 0.6 * ranked[0][0] and len(kept) < 3:
+            kept.append(candidate)
+    return kept
+
+
+def _correlations(
+    evidence: Evidence, time: TimeSeries
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return lags 1 to 3 and the relative excess of block means, their standard errors, and the response."""
+    maps = evidence.maps
+    response = (evidence.readout_std / maps.read_noise_dn) ** 2
+    good = maps.usable & np.isfinite(response) & (evidence.readout_std > 0)
+    lags = np.asarray(time.lag_readout, np.float64)[:, good]
+    n = max(good.sum(), 1)
+    pairs = np.maximum(time.n_pairs * (1.0 - np.arange(3) / max(time.block_frames - 1, 1)), 1.0)
+    seen, error = [np.nanmean(lags, axis=1)], [1.0 / np.sqrt(n * pairs)]
+    means = np.asarray(time.block_readout, np.float64)[:, good] / evidence.readout_std[good]
+    if means.shape[0] >= 2:
+        # what all pixels share is another effect's
+        means = means - np.nanmean(means, axis=1, keepdims=True)
+        degrees = means.shape[0] - 1
+        variance = float(np.nanmean(np.nanvar(means, axis=0, ddof=1))) * _frames_of_block(time)
+        seen.append(np.array([variance * n / max(n - 1, 1) - 1.0]))
+        error.append(np.array([np.sqrt(2.0 / (degrees * n))]))
+    return np.concatenate(seen), np.concatenate(error), float(response[good].mean())
+
+
+def _frames_of_block(time: TimeSeries) -> float:
+    return float(time.frames.size / max(time.block_start.size, 1))
+
+
+def _shape(time: TimeSeries, tau: float) -> NDArray[np.float64]:
+    """Return what a share of 1 gives: correlations at lags 1 to 3, excess of the block means' variance."""
+    lags = np.exp(-np.arange(1, 4) / tau)
+    if time.block_readout.shape[0] < 2:
+        return lags
+    frames = _frames_of_block(time)
+    inside = np.arange(1, max(int(frames), 2))
+    excess = 2.0 * np.sum((1.0 - inside / frames) * np.exp(-inside / tau))
+    # blocks are compared with one another: what is common to all of them does not show
+    starts = time.block_start / tau
+    between = np.exp(-np.abs(starts[:, None] - starts[None, :]))
+    np.fill_diagonal(between, 0.0)
+    common = (excess + 1.0) * between.sum() / max(starts.size * (starts.size - 1), 1)
+    return np.append(lags, max(excess - common, 0.0))
+
+
+def _ornstein_uhlenbeck(
+    random: RandomSource, frames: NDArray[np.int64], correlation_frames: float
+) -> NDArray[np.float64]:
+    """Return a stationary Gaussian process with covariance exp(-lag / tau), (frame, y, x), by pixel."""
+
+    def normal(frame: int) -> NDArray[np.float64]:
+        return random.normal(("y", "x"), frame_key(frame))
+
+    def midpoint(
+        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], rho: float
+    ) -> NDArray[np.float64]:
+        state = normal(frame)
+        state *= np.sqrt((1.0 - rho**2) / (1.0 + rho**2))
+        state += rho / (1.0 + rho**2) * (before + after)
+        return state
+
+    return np.concatenate(between_grid_points(frames, correlation_frames, normal, midpoint))

@@ -1,0 +1,108 @@
+"""Skewed read noise: an exponential part besides the Gaussian one (exGaussian).
+
+What has not settled when it is sampled (a slow source follower, dielectric absorption, a rectifying clamp)
+leans to one side. The exponentially modified Gaussian is the usual law of such a sum (Grushka 1972): ``R =
+(1 - share^2)^(1/2) sigma Z + share sigma (E - 1)`` with ``Z`` standard normal and ``E`` exponential, both of
+variance 1, so that ``R`` has mean 0, variance ``sigma^2`` and skewness ``2 share^3``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.response import strength_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["NoiseSkew"]
+
+_LOBES = 6
+
+
+@register_effect
+class NoiseSkew(Effect):
+    """Exponential part of the read noise; mean and variance of the noise stay as they are.
+
+    Signature: the third Hermite score has one sign in all pixels, then the fourth is positive; nothing in
+    time or space. Peaks lean to high DN (``share`` positive) or low DN (negative).
+    """
+
+    tag: Literal["noise_skew"] = Field(default="noise_skew", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Skewed read noise (exponentially modified Gaussian)"
+    source: ClassVar[str] = "Grushka 1972 (exponentially modified Gaussian)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "shape.He3.mean", "shape.He4.mean", "shape.goodness.mean", "shape.He3C1.mean", "tail.low.count",
+    )  # fmt: skip
+    strength: ClassVar[str] = "share"
+    power: ClassVar[float] = 3.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "signal_dependent_noise": "frames without any exposure: the skew remains there",
+        "nonlinearity": "a sweep of the exposure: the skew does not grow with the signal",
+        "adc_inl": "a sweep of the bias: the skew moves along with the peaks, wrong codes do not",
+        "rts_noise": "longer runs: telegraph noise stays in the same few pixels",
+    }
+    share: float = Field(
+        ge=-1,
+        le=1,
+        description="standard deviation of the exponential part relative to that of all read noise, no unit; "
+        "negative: tail to low DN",
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with a part of the noise exchanged for an exponential one."""
+        exponential = np.log(context.random.uniform(("frame", "y", "x")))
+        exponential += 1.0
+        exponential *= -self.share * context.truth["analog_read_noise_e"]
+        if context.read_noise is not None:
+            exponential -= (1.0 - self._gaussian) * context.read_noise
+        exponential += values
+        return exponential
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return a tail to high DN and one to low DN."""
+        return cls(share=0.64), cls(share=-0.64)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the share whose third Hermite score is that seen."""
+        return strength_of(evidence, cls(share=0.3), "He3", signed=True)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with the exponential part as a few equally likely shifts (quantile means).
+
+        The width of the Gaussian takes up the variance that the shifts lack, so the sum has variance
+        sigma^2 exactly, and its skewness is made exact too.
+        """
+        shifts, weights = _exponential_lobes(_LOBES)
+        lacking = self.share**2 * (1.0 - float(weights @ shifts**2))
+        width = np.sqrt(max(1.0 - self.share**2 + lacking, 1e-6))
+        return model.with_noise(weights, shift_sigma=self.share * shifts, width=width)
+
+    @property
+    def _gaussian(self) -> float:
+        return float(np.sqrt(1.0 - self.share**2))
+
+
+def _exponential_lobes(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shifts (mean 0) and weights of n parts of an exponential of mean 1, finer towards its tail.
+
+    Each shift is the mean of its part, so the mean is exact; the variance lacks what is inside the parts.
+    """
+    # parts of equal width in the cube root of the survival: the tail, which makes the skew, is resolved
+    edges = np.append(-3.0 * np.log(1.0 - np.arange(n) / n), np.inf)
+    survival = np.append(np.exp(-edges[:-1]), 0.0)
+    weights = -np.diff(survival)
+    first = np.append((edges[:-1] + 1.0) * survival[:-1], 0.0)
+    return -np.diff(first) / weights - 1.0, weights

@@ -1,0 +1,80 @@
+"""Nonlinear response: the step from one electron to the next changes with their number.
+
+The capacitance of the sense node and the gain of the source follower depend on the voltage, so the response
+of a pixel bends (Janesick 2007, chapter on V/V and V/e- nonlinearity): ``k`` electrons give ``k (1 + b (k -
+1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.response import strength_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["Nonlinearity"]
+
+
+@register_effect
+class Nonlinearity(Effect):
+    """Relative change of the step per electron, the same in every pixel.
+
+    Signature: the score of position against the square of the electron number (He1C2) has one sign in all
+    pixels; then He3C1 and He3. Nothing in time or space. The gain that the PCD finds is that of the steps
+    which the pixel's exposure reaches.
+    """
+
+    tag: Literal["nonlinearity"] = Field(default="nonlinearity", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Nonlinearity of the pixel's response"
+    source: ClassVar[str] = "Janesick 2007 (V/V and V/e- nonlinearity)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "shape.He1C2.mean", "shape.He3C1.mean", "shape.He2C1.mean", "shape.goodness.mean",
+    )  # fmt: skip
+    strength: ClassVar[str] = "step_change"
+    power: ClassVar[float] = 1.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "adc_inl": "a sweep of the bias: the ADC's error stays where it is in DN, the pixel's in electrons",
+        "signal_dependent_noise": "a ladder of exposures: nonlinearity bends the means, noise the variances",
+        "noise_skew": "a ladder of exposures: the bend grows with the signal, the skew does not",
+        "branching_counts": "a sweep of the bias voltage or exposure: a bent comb stays bent at any exposure",
+    }
+    step_change: float = Field(
+        ge=-0.2,
+        le=0.2,
+        description="relative change of the step per electron (five electrons up, steps differ by five times "
+        "this), 1/e-",
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, on a bent comb; draws nothing."""
+        bend = np.zeros(values.shape) if context.charge is None else context.charge.astype(np.float64)
+        bend *= bend - 1.0
+        bend *= 0.5 * self.step_change
+        bend += values
+        return bend
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return steps that grow and steps that shrink."""
+        return cls(step_change=2e-3), cls(step_change=-2e-3)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the change whose bend of the comb (He1C2) is that seen."""
+        return strength_of(evidence, cls(step_change=1e-3), "He1C2", signed=True)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with the comb bent."""
+        return model.with_levels(curvature=self.step_change)

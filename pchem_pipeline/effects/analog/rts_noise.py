@@ -1,0 +1,281 @@
+"""Random telegraph noise: a trap in the source follower of some pixels shifts the signal by a step.
+
+One oxide trap is full or empty; while it is full the source follower reads ``amplitude_e`` more (Kandiah
+and Whiting 1978; Wang, Rao, Mierop and Theuwissen 2006). Correlated double sampling subtracts the state at
+reset from that at the signal: three levels, -A, 0 and +A (Leyris et al. 2006), with q/2, 1 - q and q/2. The
+means of N samples each before and after (correlated multiple sampling) move in steps of A/N, for a jump at
+a random place among the 2 N samples. Without double sampling the two levels of the slow trap itself are
+seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.long_memory import between_grid_points, frame_key
+from pchem_pipeline.effects.response import PixelLaw, typical_pixels
+from pchem_pipeline.model.marginal import MarginalModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext, RandomSource
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+
+__all__ = ["RtsNoise"]
+
+# draws that are no frame's
+_WHERE, _SIZE = 0x7FFFFFFE, 0x7FFFFFFF
+_AMPLITUDES = (1.0, 0.7, 1.5, 2.5, 4.0)
+_PROBABILITIES = np.geomspace(0.01, 0.6, 25)
+# a pixel stands out beyond that many standard deviations
+_OUTLYING = 5.0
+_EQUAL, _EXPONENTIAL = (0.6, 0.8, 1.0, 1.25, 1.6), (0.3, 0.55, 1.0, 1.6, 2.5)
+
+
+@register_effect
+class RtsNoise(Effect):
+    """Telegraph noise of a share of the pixels, each with one trap; zero on average.
+
+    Signature: in few pixels the noise is heavy-tailed (He4), the fit is poor and samples lie below the bias
+    by more than the noise, where no electrons hide them. Sampled twice, successive frames are independent
+    and neighbours are too; without double sampling the residuals of these few pixels are alike for many
+    frames.
+    """
+
+    tag: Literal["rts_noise"] = Field(default="rts_noise", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Random telegraph noise (RTS noise, burst noise) of the source follower"
+    source: ClassVar[str] = (
+        "Kandiah and Whiting 1978; Wang, Rao, Mierop and Theuwissen 2006; Leyris et al. 2006 (three levels "
+        "behind correlated double sampling)"
+    )
+    signature: ClassVar[tuple[str, ...]] = (
+        "shape.He4.cnt", "shape.goodness.cnt", "shape.He4.chi", "tail.low.pixels", "shape.He2C1.chi",
+    )  # fmt: skip
+    strength: ClassVar[str] = "fraction"
+    power: ClassVar[float] = 1.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "heavy_tailed_noise": "longer runs: telegraph noise stays in the same few pixels; or another "
+        "number of correlated samples, which moves its levels",
+        "dark_current_rts": "a sweep of the exposure time: blinking charge grows with it, telegraph noise of "
+        "the source follower does not",
+        "overdispersed_counts": "frames without any exposure: telegraph noise remains there",
+        "flicker_noise": "longer runs: slow telegraph noise has two levels and stays in the same few pixels",
+    }
+    fraction: float = Field(ge=0, le=1, description="share of the pixels that have a trap, no unit")
+    amplitude_e: float = Field(
+        ge=0, le=1e4, description="step of the trap, e-; exponential: its mean over these pixels"
+    )
+    spread: Literal["equal", "exponential"] = Field(
+        default="equal", description="equal: the same step in all these pixels; exponential: distributed so"
+    )
+    probability: float = Field(
+        default=0.2,
+        ge=0,
+        le=1,
+        description="correlated: that the trap changes its state within a sample; single: that it is full",
+    )
+    sampling: Literal["correlated", "single"] = Field(
+        default="correlated",
+        description="correlated: signal less reset, drawn anew in every frame; single: the trap as it is",
+    )
+    samples: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="correlated: samples averaged before and after (1: double sampling)",
+    )
+    correlation_frames: float = Field(
+        default=30.0, gt=0, le=1e6, description="single: correlation time of the trap's state, frames"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the steps of the pixels that have a trap."""
+        result: NDArray[Any] = values.copy()
+        _, y, x = np.nonzero(context.random.uniform(("y", "x"), _WHERE) < self.fraction)
+        if not y.size:
+            return result
+        step = np.full(y.size, self.amplitude_e)
+        if self.spread == "exponential":
+            step *= -np.log(context.random.uniform(("y", "x"), _SIZE)[0, y, x])
+        if self.sampling == "single":
+            result[:, y, x] += step * (self._states(context.random, context.frames, y, x) - self.probability)
+        else:
+            result[:, y, x] += step * self._differences(context.random.uniform(("frame", "y", "x"))[:, y, x])
+        return result
+
+    def _differences(self, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return signal less reset, in steps of the trap, from uniform numbers of any shape."""
+        # position within the half that a number falls in: the half is the sign
+        inside = np.abs(2.0 * uniform - 1.0)
+        rank = np.floor((inside - (1.0 - self.probability)) / max(self.probability, 1e-300) * self._places())
+        rank = rank.clip(-1, self._places() - 1)
+        height = np.minimum(rank + 1.0, self._places() - rank) / self.samples
+        found: NDArray[np.float64] = np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height)
+        return found
+
+    def _places(self) -> int:
+        """Return between how many successive samples a jump can fall."""
+        return 2 * self.samples - 1
+
+    def _states(
+        self, random: RandomSource, frames: NDArray[np.int64], y: NDArray[np.intp], x: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
+        """Return 1 where the trap is full and 0 where it is empty, (frame, pixel)."""
+        full = self.probability
+
+        def after(state: NDArray[np.float64], rho: float) -> NDArray[np.float64]:
+            return full + (state - full) * rho
+
+        def uniform(frame: int) -> NDArray[np.float64]:
+            found: NDArray[np.float64] = random.uniform(("y", "x"), frame_key(frame))[0, y, x]
+            return found
+
+        def independent(frame: int) -> NDArray[np.float64]:
+            return (uniform(frame) < full).astype(np.float64)
+
+        def midpoint(
+            frame: int, before: NDArray[np.float64], behind: NDArray[np.float64], rho: float
+        ) -> NDArray[np.float64]:
+            # Bayes: the way there by way of "full" and by way of "empty"
+            up, down = after(before, rho), 1.0 - after(before, rho)
+            to_full, to_empty = after(np.ones(1), rho), after(np.zeros(1), rho)
+            by_full = up * np.where(behind > 0, to_full, 1.0 - to_full)
+            by_empty = down * np.where(behind > 0, to_empty, 1.0 - to_empty)
+            return (uniform(frame) * (by_full + by_empty) < by_full).astype(np.float64)
+
+        return np.stack(between_grid_points(frames, self.correlation_frames, independent, midpoint))
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return double sampling at two steps, multiple sampling, and a slow trap."""
+        return (
+            cls(fraction=0.014, amplitude_e=1.0),
+            cls(fraction=0.014, amplitude_e=2.5, probability=0.1),
+            cls(fraction=0.014, amplitude_e=1.0, spread="exponential"),
+            cls(fraction=0.014, amplitude_e=1.5, samples=4),
+            cls(fraction=0.014, amplitude_e=0.5, probability=0.5, sampling="single"),
+        )
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return steps of several sizes, each with the probability and share that outlying pixels ask for.
+
+        How far a pixel stands out (the larger of He4 and goodness of fit) gives the probability; how many do
+        gives the share, corrected for those too weak to stand out.
+        """
+        found = cls._correlated(evidence)
+        slow = cls._single(evidence)
+        return [*found[: 5 - len(slow)], *slow]
+
+    @classmethod
+    def _correlated(cls, evidence: Evidence) -> list[Self]:
+        usable = evidence.maps.usable
+        outlying = np.fmax(evidence.scores["He4"], evidence.goodness)[usable]
+        outlying = outlying[outlying > _OUTLYING]
+        n = int(usable.sum())
+        # fewer are chance; where most pixels stand out something else is wrong
+        if outlying.size < 3 or outlying.size > 0.3 * n:
+            return []
+        mean = float(outlying.mean())
+        laws = [PixelLaw(evidence.maps, int(pixel)) for pixel in typical_pixels(evidence.maps, 6)[0]]
+        kinds: tuple[tuple[float, int], ...] = (*((a, 1) for a in _AMPLITUDES),)
+        found = []
+        for amplitude, samples in kinds:
+            effect = cls(fraction=1.0, amplitude_e=amplitude, probability=1.0, samples=samples)
+            shifts = effect._standing_out(laws, evidence.n_frames)
+            power = _survival(_OUTLYING - shifts).mean(axis=1)
+            seen = _mean_above(_OUTLYING, shifts).mean(axis=1)
+            at = int(np.argmin(np.abs(np.log(seen / mean)) + np.where(power < 0.02, 10.0, 0.0)))
+            fraction = outlying.size / (n * max(float(power[at]), 0.02))
+            misfit = abs(float(np.log(seen[at] / mean)))
+            values = {"fraction": min(fraction, 1.0), "probability": float(_PROBABILITIES[at])}
+            found.append((misfit > 0.3, effect.model_copy(update=values)))
+        # a size that cannot make pixels stand out as they do comes last
+        return [effect for _, effect in sorted(found, key=lambda item: item[0])]
+
+    def _standing_out(self, laws: Sequence[PixelLaw], n_frames: int) -> NDArray[np.float64]:
+        """Return by how many standard deviations a pixel with a trap stands out, (probability, pixel)."""
+        rows = []
+        for law in laws:
+            change = law.change(self._as_noise())
+            score = law.score_shift("He4", change) * np.sqrt(n_frames) * _PROBABILITIES
+            chi = law.noncentrality(change) * n_frames * _PROBABILITIES**2
+            rows.append(np.fmax(score, chi / np.sqrt(2.0 * (law.mass * n_frames > 5).sum() + 4.0 * chi)))
+        return np.array(rows).T
+
+    @classmethod
+    def _single(cls, evidence: Evidence) -> list[Self]:
+        """Return a slow trap where the residuals of few pixels are strongly correlated in time."""
+        time, maps = evidence.time, evidence.maps
+        if time is None or time.n_pairs < 10:
+            return []
+        lags = np.asarray(time.lag_readout, np.float64)[:, maps.usable]
+        outlying = lags[0] * np.sqrt(time.n_pairs) > _OUTLYING
+        if outlying.sum() < 3 or outlying.sum() > 0.3 * outlying.size:
+            return []
+        near, far = float(lags[0, outlying].mean()), float(lags[2, outlying].mean())
+        rho = float(np.clip((far / near) ** 0.5, 0.05, 0.995)) if far > 0 else 0.05
+        # lag 1 of a pixel is Var(r) / sigma^2 times A^2 p (1 - p) rho / sigma^2
+        sigma = (maps.read_noise_dn * maps.conversion_gain)[maps.usable][outlying]
+        response = (evidence.readout_std / maps.read_noise_dn)[maps.usable][outlying] ** 2
+        amplitude = 2.0 * float(np.sqrt(np.mean(near / rho * sigma**2 / response)))
+        return [
+            cls(
+                fraction=float(outlying.mean()),
+                amplitude_e=min(amplitude, 1e4),
+                probability=0.5,
+                sampling="single",
+                correlation_frames=-1.0 / float(np.log(rho)),
+            )
+        ]
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law that looks for such levels in every pixel, with a weight of its own.
+
+        The fit decides pixel by pixel, since the effect is in few of them; steps around the stated one are
+        tried, more of them where they are spread.
+        """
+        factors = _EQUAL if self.spread == "equal" else _EXPONENTIAL
+        steps = [f * self.amplitude_e for f in factors if self.amplitude_e > 0]
+        return model.with_free_lobes(steps, pattern=self._pattern())
+
+    def _pattern(self) -> list[tuple[float, float]]:
+        """Return (shift in steps, weight) of the levels beside the quiet one."""
+        if self.sampling == "single":
+            return [(1.0, 1.0)]
+        heights = np.arange(1, self.samples + 1) / self.samples
+        weights = np.where(heights < 1.0, 1.0, 0.5) / self._places()
+        return [(float(s * h), float(w)) for h, w in zip(heights, weights, strict=True) for s in (-1, 1)]
+
+    def _as_noise(self) -> MarginalModel:
+        """Return the law of a pixel with a trap."""
+        shifts, weights = np.array(self._pattern()).T
+        return MarginalModel().with_noise(
+            np.append(1.0 - self.probability, self.probability * weights),
+            shift_e=np.append(0.0, self.amplitude_e * shifts),
+        )
+
+
+def _survival(z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability that a standard normal number is above z."""
+    from scipy.special import ndtr
+
+    found: NDArray[np.float64] = ndtr(-z)
+    return found
+
+
+def _mean_above(limit: float, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean of a normal number of unit variance, given that it is above a limit."""
+    from scipy.special import log_ndtr
+
+    z = limit - mean
+    # the inverse Mills ratio, far tails included
+    found: NDArray[np.float64] = mean + np.exp(-0.5 * z**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
+    return found

@@ -1,0 +1,91 @@
+"""Noise that grows with the number of electrons: the peaks widen from one to the next.
+
+Each electron that is multiplied or collected with a gain of its own adds its own variance: ``Var(x | k) =
+sigma^2 + s^2 k`` (excess noise, McIntyre 1966; cell-to-cell gain spread of silicon photomultipliers, Eckert
+et al. 2010). A gain that differs from sample to sample is common to the sample's electrons: ``s^2 k^2``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.response import strength_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["SignalDependentNoise"]
+
+
+@register_effect
+class SignalDependentNoise(Effect):
+    """Gaussian noise whose variance grows with the electron number or with its square.
+
+    Signature: the score of width against electron number (He2C1) is positive in all pixels, and with it the
+    third Hermite score; He2C2 tells the square from the number. Nothing in time or space.
+    """
+
+    tag: Literal["signal_dependent_noise"] = Field(
+        default="signal_dependent_noise", description="name of the effect"
+    )
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Signal-dependent noise (gain or excess noise)"
+    source: ClassVar[str] = "McIntyre 1966 (multiplication noise); Eckert et al. 2010 (peaks of SiPM spectra)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "shape.He2C1.mean", "shape.He3.mean", "shape.He2C2.mean", "shape.goodness.mean", "shape.He4.mean",
+    )  # fmt: skip
+    strength: ClassVar[str] = "noise_e"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "nonlinearity": "a ladder of exposures: nonlinearity bends the means, this the variances",
+        "noise_skew": "frames without any exposure: a skew remains there, this does not",
+        "heavy_tailed_noise": "frames without any exposure: heavy tails remain there, this does not",
+        "overdispersed_counts": "higher exposure: peaks of few electrons that are still narrow exclude this",
+        "gain_drift": "repeating the run: a drift has a course in time, noise has none",
+    }
+    noise_e: float = Field(ge=0, description="standard deviation that one electron adds, e-")
+    growth: Literal["root", "linear"] = Field(
+        default="root",
+        description="root: each electron adds variance of its own (noise_e k^(1/2)); linear: the electrons "
+        "of a sample share it (noise_e k)",
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the noise of its electrons."""
+        noise = context.random.normal(("frame", "y", "x"))
+        if context.charge is not None:
+            noise *= np.sqrt(context.charge) if self.growth == "root" else context.charge
+        noise *= self.noise_e
+        noise += values
+        return noise
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return both growths."""
+        return cls(noise_e=0.06), cls(noise_e=0.03, growth="linear")
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the noise of either growth whose widening of the peaks is that seen."""
+        found: list[Self] = []
+        for effect in cls.typical():
+            found += strength_of(evidence, effect, "He2C1")
+        return found
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with variance growing along the peaks."""
+        more = self.noise_e**2
+        return (
+            model.with_variance(per_electron=more)
+            if self.growth == "root"
+            else model.with_variance(per_electron2=more)
+        )
