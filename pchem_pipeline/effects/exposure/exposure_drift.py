@@ -1,29 +1,45 @@
-"""Linear drift of the quanta exposure during a capture (the sensor warms up, the lamp ages).
+"""Drift of the quanta exposure during a capture (the sensor warms up, the lamp ages).
 
 PCH-EM assumes independent, identically distributed frames (Hendrickson et al. 2023, Sec. II-B). Here frame
-``n`` of ``N`` sees ``H_n = H (1 + drift (n / (N - 1) - 1/2))``, so they are not. Dark current doubles every
-6 to 8 K, about 10 % per kelvin, so a tenth of a kelvin over the run already drifts by 1 %.
+``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a course s of mean 0 and range 1, so they are not. Dark
+current doubles every 6 to 8 K, about 10 % per kelvin, so a tenth of a kelvin over the run already drifts by 1
+%.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.charge_sums import ExposureCourse, exposure_course, exposure_nodes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["ExposureDrift"]
+
+_T = TypeVar("_T", bound="ExposureDrift")
+
+_NODES = 9
+_SETTLING = (0.05, 0.1, 0.2, 0.4)
+# chi-square that chance explains, seldom more, with the freedom of a line, a settling curve, a path
+_FREEDOM = (0.0, 3.0, 20.0)
 
 
 @register_effect
 class ExposureDrift(Effect):
     """Relative change of H from the first frame to the last, the same in every pixel.
+
+    The course is a straight line, an exponential approach to the end (``settling_fraction``), or any course
+    given by its values at equal distances (``path``).
 
     Signature: block means of the electron number follow the drift with a slope proportional to H,
     those of the readout residual do not. The mean over the run stays; for large N the variance grows
@@ -32,12 +48,135 @@ class ExposureDrift(Effect):
 
     tag: Literal["exposure_drift"] = Field(default="exposure_drift", description="name of the effect")
     plane: ClassVar[Plane] = Plane.EXPOSURE
-    drift: float = Field(ge=-2, le=2, description="(H_last - H_first) / H_mean, no unit")
+    title: ClassVar[str] = "drift of the illumination or of the dark current"
+    source: ClassVar[str] = "Widenhorn et al. 2002, Proc. SPIE 4669, 193 (dark current and temperature)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.charge.trend",
+        "frame.charge.slow",
+        "time.block.charge.chi",
+        "frame.charge.lag1",
+    )
+    strength: ClassVar[str] = "drift"
+    separate: ClassVar[Mapping[str, str]] = {
+        "gain_drift": "the readout residual of bright pixels against that of dim ones: constant here",
+        "bias_drift": "covered pixels, or frames without exposure: constant here",
+        "persistence": "the map of the change: proportional to H here",
+        "exposure_flicker": "a reference photodiode or the logged temperature",
+    }
+    drift: float = Field(
+        ge=-2, le=2, description="(H_last - H_first) / H_mean (range of the course for a path), no unit"
+    )
+    settling_fraction: float | None = Field(
+        default=None,
+        gt=0,
+        le=10,
+        description="time constant of an exponential course in lengths of the run; null: a straight line",
+    )
+    path: tuple[float, ...] = Field(
+        default=(),
+        max_length=1000,
+        description="course at equally spaced times from the first frame to the last, linear in between, any "
+        "unit (its mean and range are taken out); empty: a straight line",
+    )
+
+    @model_validator(mode="after")
+    def _one_course(self) -> Self:
+        if self.path and self.settling_fraction is not None:
+            raise ValueError("exposure_drift: path and settling_fraction are two courses; give one of them")
+        if self.path and max(self.path) == min(self.path):
+            raise ValueError("exposure_drift: path needs at least two different values; leave it empty")
+        return self
+
+    def course(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the course s of mean 0 and range 1 over the run at times in 0..1 (first to last frame)."""
+        if self.path:
+            nodes = np.asarray(self.path)
+            # the mean of a broken line counts its ends by half
+            mean = np.mean(0.5 * (nodes[1:] + nodes[:-1]))
+            values = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
+            course: NDArray[np.float64] = (values - mean) / np.ptp(nodes)
+            return course
+        if self.settling_fraction is not None:
+            return _settling(position, self.settling_fraction)
+        return position - 0.5
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the drifting exposure (frame, y, x), e-; draws nothing."""
         last = context.n_frames - 1
         # frames before the run are simulated only as memory of the first: as exposed as that one
-        position = context.frames.clip(0, last) / last - 0.5 if last > 0 else context.frames * 0.0
-        result: NDArray[Any] = values * (1.0 + self.drift * position)[:, None, None]
+        position = context.frames.clip(0, last) / last if last > 0 else np.full(context.frames.shape, 0.5)
+        factor = np.maximum(1.0 + self.drift * self.course(position), 0.0)
+        result: NDArray[Any] = values * factor[:, None, None]
         return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 1.6 % end to end, rising and falling, straight and settling."""
+        return (
+            cls(drift=0.016),
+            cls(drift=-0.016),
+            cls(drift=0.016, settling_fraction=0.2),
+            cls(drift=-0.016, settling_fraction=0.2),
+        )
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the courses that least squares on the frames' exposures cannot tell from the best one.
+
+        A course is taken seriously where it explains more than chance by three standard deviations; one with
+        more freedom only where it beats the simpler ones by as much.
+        """
+        course = exposure_course(evidence)
+        if course is None or evidence.time is None:
+            return ()
+        position = course.frames / max(evidence.time.n_run - 1, 1)
+        # what flickers from frame to frame is noise to a drift
+        noise = max(course.variance, 0.5 * float(np.mean(np.diff(course.deviation) ** 2)))
+        settling = [_fit(cls(drift=1.0, settling_fraction=s), course, position, noise) for s in _SETTLING]
+        found = [
+            _fit(cls(drift=1.0), course, position, noise),
+            max(settling, key=lambda pair: pair[0]),
+            _fit_path(cls, course, position, noise),
+        ]
+        net = [(chi2 - free, effect) for (chi2, effect), free in zip(found, _FREEDOM, strict=True)]
+        best = max(chi2 for chi2, _ in net)
+        likely = [pair for pair in net if pair[0] > max(9.0, best - 25.0)]
+        return [effect for _, effect in sorted(likely, key=lambda pair: -pair[0])]
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law mixed over the exposures of the run."""
+        factors = 1.0 + self.drift * self.course(np.linspace(0.0, 1.0, 401))
+        return model.with_exposures(*exposure_nodes(factors))
+
+
+def _settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+    whole = -np.expm1(-1.0 / fraction)
+    mean = (1.0 - fraction * whole) / whole
+    course: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
+    return course
+
+
+def _fit(unit: _T, course: ExposureCourse, position: NDArray[np.float64], noise: float) -> tuple[float, _T]:
+    """Return the chi-square that a course explains, and it at its fitted strength."""
+    shape = unit.course(position)
+    shape = shape - shape.mean()
+    slope = float(shape @ course.deviation) / float(shape @ shape)
+    return slope**2 * float(shape @ shape) / noise, unit.scaled(slope)
+
+
+def _fit_path(
+    cls: type[_T], course: ExposureCourse, position: NDArray[np.float64], noise: float
+) -> tuple[float, _T]:
+    """Return the same for a broken line with free nodes."""
+    at = np.linspace(0.0, 1.0, _NODES)
+    hats = np.stack([np.interp(position, at, row) for row in np.eye(_NODES)], axis=1)
+    # a little stiffness, so that nodes without frames follow their neighbours
+    stiff = 1e-3 * position.size / _NODES * np.diff(np.eye(_NODES), 2, axis=0)
+    deviation = course.deviation - course.deviation.mean()
+    nodes = np.linalg.solve(hats.T @ hats + stiff.T @ stiff, hats.T @ deviation)
+    fitted = hats @ nodes
+    chi2 = float(deviation @ deviation - np.sum((deviation - fitted) ** 2)) / noise
+    spread = float(np.ptp(nodes))
+    if not spread > 0:
+        return 0.0, cls(drift=0.0)
+    return chi2, cls(drift=min(spread, 2.0), path=tuple(float(round(v / spread, 4)) for v in nodes))

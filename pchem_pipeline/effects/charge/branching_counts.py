@@ -1,0 +1,102 @@
+"""Branching counts: an electron may release further ones in its own pixel, and these again.
+
+Avalanches, hot carriers and luminescence that is absorbed in the pixel itself multiply electrons: every one,
+the secondary ones too, makes Poisson many (mean l) more. A primary one then becomes a cluster of Borel size,
+and Poisson many of them a generalised Poisson number (Consul and Jain 1973), in use for silicon
+photomultipliers (Vinogradov 2012): ``P(k) = q (q + l k)^(k - 1) exp(-q - l k) / k!`` of mean ``q / (1 - l)``
+and variance ``q / (1 - l)^3``.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.count_scores import count_excess
+from pchem_pipeline.effects.electrons import regrouped
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["BranchingCounts"]
+
+
+@register_effect
+class BranchingCounts(Effect):
+    """Mean number of further electrons that each electron makes: generalised Poisson electron numbers.
+
+    H stays the mean number of electrons, ``q = H (1 - l)`` the primary ones: the two cannot be told apart at
+    one exposure.
+
+    Signature: the score of the second Charlier polynomial is positive in all pixels, and per sample the same
+    at every H; then that of the third; nothing in time, nothing between neighbours.
+    """
+
+    tag: Literal["branching_counts"] = Field(default="branching_counts", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.CHARGE
+    title: ClassVar[str] = "branching (generalised Poisson) counts"
+    source: ClassVar[str] = (
+        "Consul and Jain 1973, Technometrics 15, 791; Vinogradov 2012, Nucl. Instrum. Methods A 695, 247"
+    )
+    signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C3.mean", "code.smooth")
+    strength: ClassVar[str] = "branching"
+    separate: ClassVar[Mapping[str, str]] = {
+        "overdispersed_counts": "several light levels: the excess variance grows like H here, like H^2 there",
+        "optical_crosstalk": "correlation of the electron numbers of neighbours: none here",
+        "exposure_flicker": "correlation between pixels of one frame: none here",
+    }
+    branching: float = Field(
+        ge=0, le=0.5, description="mean number of further electrons made by each electron (l), no unit"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return electron numbers (frame, y, x), e-; thinned by 1 - l first, so that the mean stays."""
+        if self.branching == 0:
+            return values.copy()
+        u = context.random.uniform(("frame", "y", "x"))
+        grow = -np.expm1(-self.branching)
+        below = _borel_beyond_one(self.branching)
+
+        def extra(v: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.int64]:
+            return 1 + np.searchsorted(below, v)
+
+        return regrouped(values, u, self.branching, lambda index: (self.branching, grow), extra)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at half a percent, and at the tenth of a silicon photomultiplier."""
+        return (cls(branching=0.0052),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return l from the scores of the second Charlier polynomial, where they are positive by 3 sigma."""
+        c, stderr = count_excess(evidence, power=-1.0)
+        # Var K = H + 2 l H + ... against H + c H
+        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > 3.0 * stderr else ()
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with generalised Poisson electron numbers."""
+        return model.with_counts("borel", self.branching)
+
+
+@functools.lru_cache(maxsize=64)
+def _borel_beyond_one(branching: float) -> NDArray[np.float64]:
+    """Return P(n <= 2 | n >= 2), P(n <= 3 | n >= 2), ... of a Borel number n, but for the last, 1."""
+    mass, masses = branching * np.exp(-2.0 * branching), []
+    n = 2
+    while mass > 1e-17 * branching and n < 2000:
+        masses.append(mass)
+        # P(n) = exp(-l n) (l n)^(n - 1) / n!
+        mass *= branching * np.exp(-branching + (n - 1) * np.log1p(1.0 / n))
+        n += 1
+    below: NDArray[np.float64] = (np.cumsum(masses) / np.sum(masses))[:-1]
+    return below

@@ -1,0 +1,76 @@
+"""Charge diffusion: an electron is collected by a neighbour of the pixel that it was made in.
+
+Carriers released below the depleted region wander sideways before they are collected (Janesick 2001,
+Scientific Charge-Coupled Devices, ch. 4). Each electron moves to one of the four neighbours with probability
+f, independently of the others. Poisson electrons that are moved independently stay independent Poisson
+(Kingman 1993, Poisson Processes, displacement theorem): in frames of one constant exposure this is invisible,
+and part of H.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.electrons import sent_to_neighbours
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence
+
+__all__ = ["ChargeDiffusion"]
+
+
+@register_effect
+class ChargeDiffusion(Effect):
+    """Probability that an electron is collected by one of the four neighbours (each a quarter of it).
+
+    An electron that would leave the sensor at its edge stays.
+
+    Signature: none: the map of H is blurred, and nothing tells a blurred map from a smooth one.
+    """
+
+    tag: Literal["charge_diffusion"] = Field(default="charge_diffusion", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.CHARGE
+    title: ClassVar[str] = "charge diffusion"
+    source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices, ch. 4"
+    strength: ClassVar[str] = "fraction"
+    untestable: ClassVar[str] = (
+        "Poisson electrons that each move by chance stay independent Poisson electrons, so only the map of H "
+        "changes; an edge, a spot or single X-rays would show it"
+    )
+    fraction: float = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
+
+    def halo(self) -> int:
+        """Return 1 row: the neighbours above and below."""
+        return 1
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return electron numbers (frame, y, x), e-, as collected."""
+        result = values.copy()
+        if self.fraction == 0:
+            return result
+        u = context.random.uniform(("frame", "y", "x"))
+        (frame, y, x), (_, to_y, to_x) = sent_to_neighbours(values, u, self.fraction)
+        row = context.rows[0] + to_y
+        leaves = (row >= 0) & (row < context.shape[0]) & (to_x >= 0) & (to_x < context.shape[1])
+        np.subtract.at(result, (frame[leaves], y[leaves], x[leaves]), 1)
+        arrives = leaves & (to_y >= 0) & (to_y < values.shape[1])
+        np.add.at(result, (frame[arrives], to_y[arrives], to_x[arrives]), 1)
+        return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at a fifth."""
+        return (cls(fraction=0.2),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return nothing: no statistic of such frames depends on it."""
+        return ()

@@ -1,0 +1,71 @@
+"""Charge lag: an electron is read one frame late.
+
+An incomplete transfer out of the photodiode leaves each electron behind with probability f (Fossum and
+Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump-gate pixels of Ma et al.
+2015). Poisson electrons that are delayed independently stay independent Poisson from frame to frame (Mirasol
+1963, for the output of the queue M/G/infinity): at constant exposure this is invisible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.electrons import binomial_upper
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence
+
+__all__ = ["ChargeLag"]
+
+
+@register_effect
+class ChargeLag(Effect):
+    """Probability that an electron is read with the next frame instead of its own.
+
+    Signature: none at constant exposure: what is late in one frame is replaced, on average and in law, by
+    what was late in the frame before.
+    """
+
+    tag: Literal["charge_lag"] = Field(default="charge_lag", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.CHARGE
+    title: ClassVar[str] = "charge transfer lag"
+    source: ClassVar[str] = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
+    strength: ClassVar[str] = "fraction"
+    untestable: ClassVar[str] = (
+        "Poisson electrons that are each delayed by chance stay independent Poisson electrons; a bright "
+        "frame followed by dark ones would show it"
+    )
+    fraction: float = Field(
+        ge=0, le=0.9, description="probability that an electron is one frame late, no unit"
+    )
+
+    def history(self) -> int:
+        """Return 1 frame: the one whose electrons are late."""
+        return 1
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return electron numbers (frame, y, x), e-, as read; the first frame gets nothing from before."""
+        if self.fraction == 0:
+            return values.copy()
+        u = context.random.uniform(("frame", "y", "x"))
+        late = binomial_upper(u.reshape(-1), values.reshape(-1), self.fraction).reshape(values.shape)
+        result: NDArray[Any] = values - late
+        result[1:] += late[:-1]
+        return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at a fifth."""
+        return (cls(fraction=0.2),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return nothing: no statistic of such frames depends on it."""
+        return ()

@@ -1,0 +1,109 @@
+"""Over-dispersed counts: each pixel's exposure differs from frame to frame, independently of its neighbours.
+
+Thermal light and speckle (Mandel 1959; Goodman 1985), dark-current blinking that is too fast to be resolved,
+and a jitter of each pixel's integration time mix Poisson laws. A Gamma-distributed exposure of relative
+variance a gives the negative binomial law, ``Var K = H + a H^2`` (Greenwood and Yule 1920). It is drawn as
+what it also is: Poisson many clusters of logarithmic size (Quenouille 1949).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.count_scores import count_excess
+from pchem_pipeline.effects.electrons import regrouped
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["OverdispersedCounts"]
+
+
+@register_effect
+class OverdispersedCounts(Effect):
+    """Relative variance of the exposure of a pixel from frame to frame: negative binomial electron numbers.
+
+    Signature: the score of the second Charlier polynomial is positive in all pixels, and per sample grows
+    like H; nothing in time, nothing between neighbours, nothing in the readout channel.
+    """
+
+    tag: Literal["overdispersed_counts"] = Field(
+        default="overdispersed_counts", description="name of the effect"
+    )
+    plane: ClassVar[Plane] = Plane.CHARGE
+    title: ClassVar[str] = "over-dispersed (negative binomial) counts"
+    source: ClassVar[str] = "Mandel 1959, Proc. Phys. Soc. 74, 233; Goodman 1985, Statistical Optics, ch. 9"
+    signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C2.slope", "code.smooth", "shape.C3.mean")
+    strength: ClassVar[str] = "relative_variance"
+    separate: ClassVar[Mapping[str, str]] = {
+        "branching_counts": "several light levels: the excess variance grows like H^2 here, like H there",
+        "exposure_flicker": "correlation between pixels of one frame: none here",
+        "dark_current_rts": "slower frames and longer runs: blinking pixels become correlated in time",
+    }
+    relative_variance: float = Field(
+        ge=0, le=1, description="variance of the exposure divided by its squared mean (a), no unit"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return electron numbers (frame, y, x), e-, made of Poisson ones of mean ``context.exposure``."""
+        assert context.exposure is not None  # the chain gives it from this plane on
+        a, exposure = self.relative_variance, context.exposure
+        if a == 0:
+            return values.copy()
+        u = context.random.uniform(("frame", "y", "x"))
+        flat = exposure.reshape(-1)
+
+        def law(index: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            x = np.maximum(a * flat[index], 1e-300)
+            log = np.log1p(x)
+            return np.maximum(1.0 - log / x, 0.0), np.maximum(1.0 - x / ((1.0 + x) * log), 0.0)
+
+        def extra(v: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.int64]:
+            return _logarithmic_beyond_one(v, a * flat[index])
+
+        # both probabilities are below a H / 2
+        return regrouped(values, u, (0.5 * a) * exposure, law, extra)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at a = 0.0064, an exposure that jitters by 8 %."""
+        return (cls(relative_variance=0.0064),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return a from the scores of the second Charlier polynomial, where they are positive by 3 sigma."""
+        a, stderr = count_excess(evidence, power=0.0)
+        return (cls(relative_variance=min(a, 1.0)),) if a > 3.0 * stderr else ()
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with negative binomial electron numbers."""
+        return model.with_counts("negative_binomial", self.relative_variance)
+
+
+def _logarithmic_beyond_one(v: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return n - 1 for logarithmic n >= 2, P(n) ~ theta^n / n with theta = x / (1 + x)."""
+    theta = x / (1.0 + x)
+    extra = np.ones(v.size, np.int64)
+    mass = 0.5 * theta / (np.log1p(x) / theta - 1.0) if v.size else v
+    active, below, n = np.arange(v.size), mass, 2
+    while active.size and n < 100_000:
+        more = v[active] > below
+        active, below, mass, theta = active[more], below[more], mass[more], theta[more]
+        extra[active] += 1
+        mass = mass * theta * (n / (n + 1))
+        below = below + mass
+        # rounding must not keep the last few alive for ever
+        active = np.where(mass > 1e-17, active, -1)
+        keep = active >= 0
+        active, below, mass, theta = active[keep], below[keep], mass[keep], theta[keep]
+        n += 1
+    return extra

@@ -1,0 +1,63 @@
+"""Spurious charge: electrons that no light and no dark current made.
+
+Clock-induced charge, glow of the amplifiers and leaking light add Poisson electrons to every frame (Janesick
+2001, Scientific Charge-Coupled Devices, ch. 7; 1.5e-4 e-/px in Barak et al. 2022, SENSEI). The sum of
+Poisson electrons is Poisson: at one exposure time they are part of H.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence
+
+__all__ = ["SpuriousCharge"]
+
+
+@register_effect
+class SpuriousCharge(Effect):
+    """Mean number of electrons added to every pixel of every frame.
+
+    Signature: none: H is larger by as much.
+    """
+
+    tag: Literal["spurious_charge"] = Field(default="spurious_charge", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.CHARGE
+    title: ClassVar[str] = "spurious (clock-induced) charge"
+    source: ClassVar[str] = (
+        "Janesick 2001, Scientific Charge-Coupled Devices, ch. 7; "
+        "Barak et al. 2022, Phys. Rev. Applied 17, 014022"
+    )
+    strength: ClassVar[str] = "mean_e"
+    untestable: ClassVar[str] = (
+        "sums of Poisson electrons are Poisson, so it is part of H; a series of integration times would show "
+        "it (the part of H that does not grow with time)"
+    )
+    mean_e: float = Field(ge=0, description="mean number of spurious electrons per pixel and frame, e-")
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return electron numbers (frame, y, x), e-, spurious ones included."""
+        if self.mean_e == 0:
+            return values.copy()
+        result: NDArray[Any] = values + context.random.poisson(np.full(values.shape, self.mean_e))
+        return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.3 e-."""
+        return (cls(mean_e=0.3),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return nothing: no statistic of such frames depends on it."""
+        return ()

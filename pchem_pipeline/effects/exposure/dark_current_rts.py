@@ -1,0 +1,197 @@
+"""Dark current that blinks: metastable defects switch a pixel's dark current between two levels.
+
+Random telegraph signals of the dark current are found in few pixels of new sensors and in many irradiated
+ones, with jumps that are exponentially distributed over the pixels (Hopkins and Hopkinson 1993; Goiffon et
+al. 2009; Virmontois et al. 2013). The state is a Markov chain with exponential dwell times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.charge_sums import BlockCharge, block_charge
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence
+
+__all__ = ["DarkCurrentRts"]
+
+# a pixel stands out beyond this standard normal number: one in 150,000 by chance
+_STANDS_OUT = 4.35
+_MOST_OF_A_SENSOR = 0.3
+# share of the time in the upper level, and law of the steps
+_KINDS: tuple[tuple[float, Literal["equal", "exponential"]], ...] = (
+    (0.5, "equal"),
+    (0.2, "equal"),
+    (0.5, "exponential"),
+)
+
+
+@register_effect
+class DarkCurrentRts(Effect):
+    """Two levels of the exposure, H and H + step, in a fraction of the pixels.
+
+    Signature: block means of the electron number wander in few pixels, strongly, and successive electron
+    numbers are alike there; nothing in the readout residual, nothing in the other pixels.
+    """
+
+    tag: Literal["dark_current_rts"] = Field(default="dark_current_rts", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.EXPOSURE
+    title: ClassVar[str] = "random telegraph signal of the dark current"
+    source: ClassVar[str] = (
+        "Hopkins and Hopkinson 1993, IEEE Trans. Nucl. Sci. 40, 1567; Goiffon et al. 2009, ibid. 56, 2132"
+    )
+    signature: ClassVar[tuple[str, ...]] = (
+        "time.block.charge.cnt",
+        "time.lag1.charge.cnt",
+        "time.block.charge.chi",
+        "shape.C2.cnt",
+    )
+    strength: ClassVar[str] = "fraction"
+    separate: ClassVar[Mapping[str, str]] = {
+        "rts_noise": "the exposure time: the jumps grow with it here, and not there",
+        "flicker_noise": "the jumps are in the electron numbers here, in the readout residual there",
+        "persistence": "a longer run: regions fade once there, single pixels jump up and down here",
+        "overdispersed_counts": "slower and longer runs: the blinking becomes correlated in time",
+    }
+    fraction: float = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
+    step_e: float = Field(
+        default=1.0, ge=0, description="additional exposure of the upper level, mean over these pixels, e-"
+    )
+    steps: Literal["equal", "exponential"] = Field(
+        default="equal", description="equal: step_e in each of these pixels; exponential: distributed so"
+    )
+    dwell_low_frames: float = Field(default=200.0, ge=0.5, description="mean time in the lower level, frames")
+    dwell_high_frames: float = Field(
+        default=200.0, ge=0.5, description="mean time in the upper level, frames"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the blinking exposure (frame, y, x), e-; touches the pixels that blink only."""
+        result = values.copy()
+        u = context.random.uniform(("y", "x"))[0]
+        blinks = u < self.fraction
+        for row in np.flatnonzero(blinks.any(axis=1)):
+            # pixels that blink at a small fraction come first, so that they keep their numbers at a larger
+            # one
+            columns = np.flatnonzero(blinks[row])
+            columns = columns[np.argsort(u[row, columns])]
+            random = context.random.generator(y=int(context.rows[row]))
+            for column in columns:
+                result[:, row, column] += self._added(context, random)
+        return result
+
+    def _added(self, context: EffectContext, random: np.random.Generator) -> NDArray[np.float64]:
+        """Return the additional exposure of one pixel in each frame of the block, e-."""
+        low, high = self.dwell_low_frames, self.dwell_high_frames
+        step = self.step_e * (random.exponential() if self.steps == "exponential" else 1.0)
+        starts_high = random.random() < high / (low + high)
+        # an even number of dwell times, well above what the run holds; the same whatever the block
+        pairs = int(
+            2.0 + context.n_frames / (low + high) * 1.5 + 6.0 * (context.n_frames / (low + high)) ** 0.5
+        )
+        dwell = random.exponential(size=(pairs, 2)) * ((high, low) if starts_high else (low, high))
+        changes = np.cumsum(dwell.reshape(-1))
+        # frames before the run are as the first one
+        passed = np.searchsorted(changes, np.maximum(context.frames, 0), side="right")
+        added: NDArray[np.float64] = step * ((passed % 2 == 0) == starts_high)
+        return added
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it in 1.1 % of the pixels, slow and fast."""
+        return (cls(fraction=0.011), cls(fraction=0.011, dwell_low_frames=20.0, dwell_high_frames=20.0))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return it from the pixels that stand out by block means or by lagged correlations.
+
+        Their excess variance of block means and their autocovariances give the variance of the exposure and
+        the time constant; a share of the time in the upper level of one half and of a fifth, and exponential
+        steps, are tried, since the second moments do not tell them apart.
+        """
+        blocks = block_charge(evidence)
+        if blocks is None or evidence.time is None:
+            return ()
+        found = _outliers(evidence, blocks)
+        n = int(found.sum())
+        if n < 3 or n > _MOST_OF_A_SENSOR * found.size:
+            return ()
+        variance, tau = _telegraph(evidence, blocks, found)
+        if not variance > 0:
+            return ()
+        return [cls(**_guess(n / found.size, variance, tau, *kind)) for kind in _KINDS]
+
+
+def _guess(
+    fraction: float, variance: float, tau: float, share: float, steps: Literal["equal", "exponential"]
+) -> dict[str, Any]:
+    """Return the fields for a share of the time in the upper level and a law of the steps."""
+    spread = 2.0 if steps == "exponential" else 1.0
+    return {
+        # small ones of exponential steps stay hidden: some 1.5 times as many as stand out
+        "fraction": min(fraction * (1.5 if steps == "exponential" else 1.0), 1.0),
+        "step_e": float(np.sqrt(variance / (share * (1.0 - share)) / spread)),
+        "steps": steps,
+        "dwell_low_frames": max(float(tau / share), 0.5),
+        "dwell_high_frames": max(float(tau / (1.0 - share)), 0.5),
+    }
+
+
+def _outliers(evidence: Evidence, blocks: BlockCharge) -> NDArray[np.bool_]:
+    """Return which of the blocks' pixels wander by themselves, shape (n,)."""
+    assert evidence.time is not None
+    freedom = blocks.length.size - 1
+    chi2 = np.sum(blocks.length[:, None] * blocks.deviation**2, axis=0) / blocks.variance
+    # Wilson and Hilferty 1931: the cube root of a chi-square is nearly normal
+    mean = 1.0 - 2.0 / (9.0 * freedom)
+    wander = ((chi2 / freedom) ** (1.0 / 3.0) - mean) / np.sqrt(2.0 / (9.0 * freedom))
+    lags = np.asarray(evidence.time.lag_charge, np.float64)[:, blocks.y, blocks.x]
+    alike = lags.sum(axis=0) * np.sqrt(evidence.time.n_pairs / lags.shape[0])
+    outliers: NDArray[np.bool_] = np.fmax(wander, alike) > _STANDS_OUT
+    return outliers
+
+
+class _Telegraph(NamedTuple):
+    """Mean variance of the exposure of the pixels that blink, e-^2, and its time constant, frames."""
+
+    variance: float
+    tau: float
+
+
+def _telegraph(evidence: Evidence, blocks: BlockCharge, found: NDArray[np.bool_]) -> _Telegraph:
+    """Fit ``S exp(-lag / tau)`` to the autocovariances, and its average to the blocks' excess variance."""
+    assert evidence.time is not None
+    single = blocks.variance[found]
+    lags = np.asarray(evidence.time.lag_charge, np.float64)[:, blocks.y[found], blocks.x[found]]
+    length, n_blocks = float(np.median(blocks.length)), blocks.length.size
+    whole = np.sum(blocks.length[:, None] * blocks.deviation[:, found] ** 2, axis=0) / (n_blocks - 1)
+    seen = np.append((lags * single).mean(axis=1), ((whole - single) / length).mean())
+    errors = np.append(
+        np.full(lags.shape[0], evidence.time.n_pairs**-0.5), np.sqrt(2.0 / (n_blocks - 1)) / length
+    ) * np.sqrt(np.mean(single**2))
+    # what blinks is not Poisson: leave room for the spread of the walk itself
+    errors = np.hypot(errors, 0.1 * np.abs(seen))
+    tau = np.geomspace(0.5, 20.0 * float(blocks.start[-1] + length), 120)[:, None]
+    shape = np.hstack([np.exp(-np.arange(1.0, lags.shape[0] + 1) / tau), _averaged(length / tau)])
+    run = float(blocks.start[-1] + length - blocks.start[0])
+    # the mean over the run is taken out
+    shape = np.maximum(shape - _averaged(run / tau), 1e-12)
+    weight = errors**-2.0
+    variance = (shape * weight) @ seen / ((shape**2) @ weight)
+    misfit = ((seen - variance[:, None] * shape) ** 2) @ weight
+    best = int(np.argmin(np.where(variance > 0, misfit, np.inf)))
+    return _Telegraph(float(variance[best]), float(tau[best, 0]))
+
+
+def _averaged(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the variance of the mean over x time constants of an exponential memory of variance 1."""
+    return np.where(x > 1e-4, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-4) ** 2, 1.0)

@@ -1,0 +1,197 @@
+"""Flicker of the exposure: every frame is a little brighter or darker as a whole.
+
+The intensity noise of a lamp or laser, a shutter that jitters, or a temperature that jumps multiplies the
+exposure of all pixels of frame t by ``a_t`` of mean 1 and standard deviation s (EMVA Standard 1288, release
+4.0, requires the source to be stable for this reason). Successive frames may be alike
+(``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.charge_sums import ExposureCourse, exposure_course, exposure_nodes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
+
+__all__ = ["ExposureFlicker"]
+
+_T = TypeVar("_T", bound="ExposureFlicker")
+
+
+@register_effect
+class ExposureFlicker(Effect):
+    """Relative fluctuation of H from frame to frame, the same in all pixels.
+
+    Signature: the frame means of the electron number scatter more than their shot noise, those of the readout
+    residual do not, and the two do not vary together.
+    """
+
+    tag: Literal["exposure_flicker"] = Field(default="exposure_flicker", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.EXPOSURE
+    title: ClassVar[str] = "flicker of the illumination (intensity noise)"
+    source: ClassVar[str] = (
+        "EMVA Standard 1288, release 4.0 (2021), sec. 6; Petermann 1988, Laser Diode Modulation"
+    )
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.charge.variance",
+        "frame.charge.line",
+        "frame.charge.largest",
+        "frame.charge.lag1",
+    )
+    strength: ClassVar[str] = "rms"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "exposure_drift": "a longer run: a flicker does not go on in one direction",
+        "frame_noise": "covered pixels, or frames without exposure: constant here",
+        "overdispersed_counts": "correlation between pixels of one frame: all of them here",
+    }
+    rms: float = Field(ge=0, le=1, description="standard deviation of the exposure over its mean, no unit")
+    correlation_frames: float = Field(
+        default=0.0,
+        ge=0,
+        description="number of frames in which the memory of a fluctuation falls to 1/e; 0: every frame anew",
+    )
+    period_frames: float | None = Field(
+        default=None, gt=1, description="period of a sine, frames; null: random fluctuations"
+    )
+    phase_cycles: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="phase of the sine at frame 0, cycles (0: rising through the mean)",
+    )
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if self.period_frames is not None and self.correlation_frames > 0:
+            raise ValueError("exposure_flicker: a sine has no correlation_frames; leave one of them out")
+        if self.period_frames is not None and self.rms > 0.7:
+            raise ValueError(
+                "exposure_flicker: a sine of rms above 0.7 makes the exposure negative; lower it"
+            )
+        return self
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the flickering exposure (frame, y, x), e-."""
+        if self.rms == 0:
+            return values.copy()
+        if self.period_frames is not None:
+            phase = context.frames / self.period_frames + self.phase_cycles
+            factor = 1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * phase)
+        else:
+            # log-normal: never negative, mean exactly 1
+            width = np.sqrt(np.log1p(self.rms**2))
+            factor = np.exp(width * self._fluctuation(context) - 0.5 * width**2)
+        result: NDArray[Any] = values * factor[:, None, None]
+        return result
+
+    def _fluctuation(self, context: EffectContext) -> NDArray[np.float64]:
+        if self.correlation_frames == 0:
+            return context.random.normal(("frame",))[:, 0, 0]
+        from scipy.signal import lfilter
+
+        # the whole run each time: a few hundred numbers cost less than keeping them
+        kept = np.exp(-1.0 / self.correlation_frames)
+        steps = context.random.generator().standard_normal(context.n_frames)
+        steps[1:] *= np.sqrt(1.0 - kept**2)
+        path = np.asarray(lfilter([1.0], [1.0, -kept], steps))
+        fluctuation: NDArray[np.float64] = path[context.frames.clip(0, context.n_frames - 1)]
+        return fluctuation
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 2 %: from frame to frame, slower, and on the mains (100 Hz at 30 frames/s)."""
+        return (cls(rms=0.02), cls(rms=0.02, correlation_frames=5.0), cls(rms=0.02, period_frames=3.0))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return rms, and memory or period, from the variance, lags and spectrum of the frames' exposures."""
+        course = exposure_course(evidence)
+        if course is None or evidence.time is None:
+            return ()
+        found = [*_sine(cls, course), *_random(cls, course)]
+        return found[:3]
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law mixed over the exposures of the frames."""
+        if self.period_frames is not None:
+            factors = 1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * (np.arange(400) + 0.5) / 400)
+            return model.with_exposures(*exposure_nodes(factors))
+        # Gauss-Hermite in the logarithm
+        nodes, weights = np.polynomial.hermite_e.hermegauss(3)
+        width = np.sqrt(np.log1p(self.rms**2))
+        factors = np.exp(width * nodes - 0.5 * width**2)
+        weights = weights / weights.sum()
+        return model.with_exposures(weights, factors / (weights @ factors))
+
+
+def _random(cls: type[_T], course: ExposureCourse) -> list[_T]:
+    """Return a flicker anew in every frame, and one with a memory, where there is more than shot noise."""
+    n = course.deviation.size
+    step = np.diff(course.deviation)[np.diff(course.frames) == 1]
+    if step.size < 8:
+        return []
+    # differences do not see a drift; their variance has the kurtosis of a moving average
+    fast = 0.5 * float(np.mean(step**2)) - course.variance
+    fast_error = course.variance * np.sqrt(3.0 / step.size)
+    smooth = course.deviation - course.deviation.mean()
+    whole = float(smooth @ smooth) / (n - 1) - course.variance
+    whole_error = course.variance * np.sqrt(2.0 / n)
+    if max(fast / fast_error, whole / whole_error) < 3.0:
+        return []
+    found: list[_T] = []
+    if fast > 2.5 * fast_error:
+        found.append(cls(rms=min(float(np.sqrt(fast)), 1.0)))
+    # fast = s^2 (1 - rho): the lag-1 correlation of an exponential memory
+    rho = 1.0 - fast / whole if whole > 3.0 * whole_error else 0.0
+    if 0.0 < rho < 0.98 and whole - fast > 3.0 * np.hypot(fast_error, whole_error):
+        memory = float(-1.0 / np.log(rho))
+        found.insert(0, cls(rms=min(float(np.sqrt(whole)), 1.0), correlation_frames=memory))
+    return found
+
+
+def _sine(cls: type[_T], course: ExposureCourse) -> list[_T]:
+    """Return a sine at the highest line of the spectrum that stands out of shot noise and of the rest."""
+    first, n = int(course.frames[0]), int(course.frames[-1] - course.frames[0]) + 1
+    series = np.zeros(n)
+    series[course.frames.astype(np.int64) - first] = course.deviation - course.deviation.mean()
+    # padded to twice the length, so that a line between two frequencies keeps most of its height
+    spectrum = np.fft.rfft(series, 2 * n)
+    power = np.abs(spectrum) ** 2 / course.deviation.size
+    # slow changes are a drift
+    power[: 2 * 20] = 0.0
+    peak = int(np.argmax(power))
+    floor = max(course.variance, float(np.median(power)) / np.log(2.0))
+    if power[peak] < 16.0 * floor or peak == 0:
+        return []
+    frequency = _refined(series, peak / (2 * n))
+    phase = np.exp(-2j * np.pi * frequency * np.arange(n))
+    line = complex(np.sum(series * phase)) * 2.0 / course.deviation.size
+    rms = abs(line) / np.sqrt(2.0)
+    # a sine that rises through the mean at frame 0 has the phase of -i
+    cycles = (np.angle(line * 1j) / (2.0 * np.pi) - frequency * first) % 1.0
+    if not 0 < frequency < 0.999 or rms > 0.7:
+        return []
+    return [cls(rms=float(rms), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
+
+
+def _refined(series: NDArray[np.float64], frequency: float) -> float:
+    """Return the frequency (cycles per frame) of the highest power next to a peak of the spectrum."""
+    t = np.arange(series.size)
+    width = 0.5 / series.size
+    for _ in range(4):
+        tried = np.clip(frequency + width * np.linspace(-1.0, 1.0, 9), 1e-6, 0.5)
+        power = [abs(np.sum(series * np.exp(-2j * np.pi * f * t))) for f in tried]
+        frequency, width = float(tried[int(np.argmax(power))]), width / 3.0
+    return frequency

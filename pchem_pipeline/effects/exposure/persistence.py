@@ -1,0 +1,221 @@
+"""Persistence: the ghost of an earlier bright image, released slowly into the frames of the run.
+
+Traps that a bright exposure has filled empty with their own time constants, and the exposure of frame t
+becomes ``H + A_p exp(-t / tau)`` with the image A of before (Smith et al. 2008, "A theory for image
+persistence in HgCdTe photodiodes"). Its map is that of the earlier image and not of H: a spot here, or any image on a
+coarse grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.charge_sums import BlockCharge, block_charge
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.context import EffectContext
+    from pchem_pipeline.effects.evidence import Evidence
+
+__all__ = ["Persistence"]
+
+_T = TypeVar("_T", bound="Persistence")
+
+_GRID = 8
+# time constants tried, in lengths of the run
+_DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
+
+
+@register_effect
+class Persistence(Effect):
+    """Exposure left over from an earlier image, fading away from the first frame on.
+
+    Signature: block means of the electron number fall along the run in a connected part of the sensor, not in
+    proportion to H; nothing in the readout residual.
+    """
+
+    tag: Literal["persistence"] = Field(default="persistence", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.EXPOSURE
+    title: ClassVar[str] = "image persistence"
+    source: ClassVar[str] = "Smith et al. 2008, Proc. SPIE 7021, 70210J"
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.charge.quadrants",
+        "frame.charge.trend",
+        "time.block.charge.chi",
+        "frame.charge.slow",
+    )
+    strength: ClassVar[str] = "peak_e"
+    separate: ClassVar[Mapping[str, str]] = {
+        "exposure_drift": "a run after a longer time in the dark: the change, not proportional to H, is gone",
+        "dark_current_rts": "a longer run: single pixels jump up and down there, regions fade once here",
+        "bias_drift": "frames without exposure: the residual stays here",
+    }
+    peak_e: float = Field(ge=0, description="largest additional exposure in the first frame, e- per frame")
+    decay_frames: float = Field(gt=0, description="time constant of the fading, frames")
+    centre_y: float = Field(
+        default=0.5, ge=0, le=1, description="row of the spot's centre over the number of rows, no unit"
+    )
+    centre_x: float = Field(
+        default=0.5, ge=0, le=1, description="column of the spot's centre over the number of columns, no unit"
+    )
+    radius: float = Field(
+        default=0.2,
+        gt=0,
+        description="standard deviation of the Gaussian spot over the longer side of the sensor, no unit",
+    )
+    image: tuple[tuple[float, ...], ...] = Field(
+        default=(),
+        description="instead of the spot: relative brightness of the earlier image on a coarse grid over the "
+        "whole sensor (rows of numbers >= 0, the largest counts as 1, linear in between); empty: the spot",
+    )
+
+    @model_validator(mode="after")
+    def _image_is_a_grid(self) -> Self:
+        if not self.image:
+            return self
+        if len({len(row) for row in self.image}) != 1 or not self.image[0]:
+            raise ValueError("persistence: the rows of image have different lengths or none; give a grid")
+        values = [value for row in self.image for value in row]
+        if min(values) < 0 or max(values) == 0:
+            raise ValueError("persistence: image needs numbers >= 0 and one above 0; correct it")
+        return self
+
+    def pattern(self, rows: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.float64]:
+        """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""
+        y, x = (rows + 0.5) / shape[0], (np.arange(shape[1]) + 0.5) / shape[1]
+        if self.image:
+            grid = np.asarray(self.image)
+            result: NDArray[np.float64] = (
+                _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
+            )
+            return result
+        side = max(shape)
+        dy, dx = (y - self.centre_y) * shape[0] / side, (x - self.centre_x) * shape[1] / side
+        spot: NDArray[np.float64] = np.exp(-0.5 * (dy[:, None] ** 2 + dx**2) / self.radius**2)
+        return spot
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
+        if self.peak_e == 0:
+            return values.copy()
+        left = self.peak_e * np.exp(-np.maximum(context.frames, 0) / self.decay_frames)
+        result: NDArray[Any] = values + left[:, None, None] * self.pattern(context.rows, context.shape)
+        return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return a spot of 0.15 e- that fades within a quarter of a run of 4000 frames."""
+        return (cls(peak_e=0.15, decay_frames=1000.0),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return a spot and an image from the pixels' block means, fitted with a falling exponential each.
+
+        What all pixels do in proportion to H is taken out first. The amplitudes are averaged over the cells
+        of a coarse grid; the time constant is the one that explains most.
+        """
+        blocks = block_charge(evidence)
+        if blocks is None or evidence.time is None:
+            return ()
+        exposure = evidence.maps.quanta_exposure
+        tried = [_Cells.of(blocks, exposure, decay * evidence.time.n_run) for decay in _DECAYS]
+        best = max(tried, key=lambda cells: cells.score)
+        if best.score < 4.0:
+            return ()
+        amplitude = best.above_background()
+        found: list[Self] = [] if amplitude.max() <= 0 else [_spot(cls, best, exposure.shape)]
+        bright = np.where(amplitude > 2.0 * best.noise, amplitude, 0.0)
+        if bright.any():
+            peak = float(bright.max())
+            image = tuple(tuple(float(round(v / peak, 3)) for v in row) for row in bright)
+            found.append(cls(peak_e=peak, decay_frames=best.decay, image=image))
+        return found
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Amplitudes of a falling exponential in the cells of a grid over the sensor.
+
+    Attributes:
+        decay: time constant, frames.
+        amplitude: e-, less what goes with H, shape (rows, columns); 0 in cells without pixels.
+        noise: standard errors, e-; infinite in cells without pixels.
+        exposure: mean H, e-.
+        score: chi-square of all cells against 0, as a standard normal number.
+    """
+
+    decay: float
+    amplitude: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    exposure: NDArray[np.float64]
+    score: float
+
+    @classmethod
+    def of(cls, blocks: BlockCharge, exposure: NDArray[np.float64], decay: float) -> _Cells:
+        """Return the least squares amplitudes at a time constant."""
+        mean = decay / blocks.length * np.exp(-blocks.start / decay) * -np.expm1(-blocks.length / decay)
+        shape = mean - np.average(mean, weights=blocks.length)
+        weight = blocks.length * shape
+        found = weight @ blocks.deviation / (weight @ shape)
+        stderr = np.sqrt(blocks.variance / (weight @ shape))
+        # single pixels that jump are another effect
+        found = np.clip(found, -4.0 * stderr, 4.0 * stderr)
+        rows, columns = (min(_GRID, n) for n in exposure.shape)
+        cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
+        n = rows * columns
+
+        def mean_of(values: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
+
+        inverse = stderr**-2
+        amplitude, held = mean_of(found, inverse), np.bincount(cell, inverse, n)
+        noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
+        freedom = max(int((held > 0).sum()) - 1, 1)
+        score = (float(np.sum((amplitude / noise) ** 2)) - freedom) / np.sqrt(2.0 * freedom)
+        bright = mean_of(exposure[blocks.y, blocks.x], inverse)
+        grid = (rows, columns)
+        return cls(decay, amplitude.reshape(grid), noise.reshape(grid), bright.reshape(grid), score)
+
+    def above_background(self) -> NDArray[np.float64]:
+        """Return the amplitudes with that part of H added which makes the darkest quarter 0."""
+        held = np.isfinite(self.noise) & (self.exposure > 0)
+        background = float(np.quantile(self.amplitude[held] / self.exposure[held], 0.25))
+        return np.where(held, self.amplitude - background * self.exposure, 0.0)
+
+
+def _spot(cls: type[_T], cells: _Cells, shape: tuple[int, ...]) -> _T:
+    """Return the Gaussian spot that fits the cells best, with a part of H as background."""
+    rows, columns = cells.amplitude.shape
+    y, x = (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns
+    side = max(shape)
+    inverse = cells.noise**-2.0
+    background = cells.exposure
+    power = float(np.sum(inverse * background**2))
+    target = cells.amplitude - background * (float(np.sum(inverse * background * cells.amplitude)) / power)
+    best = (0.0, 0.0, 0.5, 0.5, 0.2)
+    for radius in (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6):
+        for cy in np.linspace(0.0, 1.0, 17):
+            dy = ((y - cy) * shape[0] / side)[:, None]
+            dx = ((x - np.linspace(0.0, 1.0, 17)[:, None]) * shape[1] / side)[:, None, :]
+            spots = np.exp(-0.5 * (dy**2 + dx**2) / radius**2)
+            spots = spots - background * (np.sum(inverse * background * spots, (1, 2)) / power)[:, None, None]
+            overlap, size = np.sum(inverse * spots * target, (1, 2)), np.sum(inverse * spots**2, (1, 2))
+            gain = np.where(overlap > 0, overlap**2 / np.maximum(size, 1e-300), 0.0)
+            i = int(np.argmax(gain))
+            if gain[i] > best[0]:
+                best = (float(gain[i]), float(overlap[i] / size[i]), float(cy), i / 16.0, radius)
+    _, peak, centre_y, centre_x, radius = best
+    return cls(peak_e=peak, decay_frames=cells.decay, centre_y=centre_y, centre_x=centre_x, radius=radius)
+
+
+def _hats(position: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Return weights (positions, n) of linear interpolation between the centres of n cells in 0..1."""
+    centres = (np.arange(n) + 0.5) / n
+    return np.stack([np.interp(position, centres, row) for row in np.eye(n)], axis=1)
