@@ -85,7 +85,7 @@ def fit_maps(frames: NDArray[np.uint16], effects: tuple[Any, ...] = ()) -> dict[
     flat = [a.ravel() for a in (histograms.origin, histograms.under, histograms.over)]
     result = fit_histograms(counts, *flat)
     if effects:
-        result = _grown(result, counts, flat, effects, frames.shape[1:])
+        result = _grown(result, counts, flat[0], effects)
     shape = frames.shape[1:]
     g, sigma = result.conversion_gain, result.read_noise_dn
     variance = np.diagonal(result.covariance, axis1=1, axis2=2)
@@ -106,14 +106,24 @@ def fit_maps(frames: NDArray[np.uint16], effects: tuple[Any, ...] = ()) -> dict[
     return {name: np.asarray(values).reshape(shape) for name, values in maps.items()}
 
 
-def _grown(
-    plain: Any,
-    counts: NDArray[Any],
-    flat: list[NDArray[Any]],
-    effects: tuple[Any, ...],
-    shape: tuple[int, ...],
-) -> Any:
-    raise NotImplementedError
+def _grown(plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tuple[Any, ...]) -> Any:
+    """Fit again with the law that the effects make of the PCD."""
+    from pchem_pipeline.effects.evidence import PixelMaps
+    from pchem_pipeline.model.fit_status import FAILED
+    from pchem_pipeline.model.grown import fit_grown
+    from pchem_pipeline.model.marginal import MarginalModel
+
+    maps = PixelMaps(
+        plain.quanta_exposure,
+        plain.conversion_gain,
+        plain.bias,
+        plain.read_noise_dn,
+        (plain.fit_status & FAILED) == 0,
+    )
+    model = MarginalModel()
+    for effect in effects:
+        model = effect.marginal(model, maps)
+    return fit_grown(counts, origin, plain, model, plain=plain)
 
 
 def _bias(

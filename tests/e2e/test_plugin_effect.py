@@ -1,0 +1,95 @@
+"""Somebody else's effect: installed beside the package, found, named, and added; broken ones are left out."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from commands import Shell
+
+TESTS = Path(__file__).resolve().parents[1]
+RUN = """
+run: {store: run.zarr}
+input: {files: [stack/frames.npy], integration_time: 1.0}
+discrepancy: {replicates: 30, grown_replicates: 12}
+"""
+BROKEN = {
+    "hasty_offset": "nobody divided the offsets",
+    "careless_offset": "offsets were left on the desk",
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder with the package as pip leaves it: its modules, and what its pyproject.toml announces."""
+    folder, source = tmp_path_factory.mktemp("site"), TESTS / "plugin_package"
+    project = tomllib.loads((source / "pyproject.toml").read_text())["project"]
+    shutil.copytree(
+        source / "chessboard_effects",
+        folder / "chessboard_effects",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
+    info = folder / f"chessboard_effects-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    (info / "entry_points.txt").write_text(
+        "".join(
+            f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
+            for group, points in project["entry-points"].items()
+        )
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stack(tmp_path_factory):
+    """A folder ``stack`` whose frames hide the effect, made by a process that knows neither package."""
+    folder = tmp_path_factory.mktemp("hidden")
+    command = [sys.executable, TESTS / "hidden" / "make.py", "--effect", "checkerboard_offset"]
+    command += ["--level", 4, "--seed", 11, "--shape", 16, 16, "--frames", 1500, "--out", folder / "stack"]
+    subprocess.run(list(map(str, command)), check=True)
+    return folder
+
+
+@pytest.fixture
+def with_plugin(shell, site, stack):
+    """Commands of an environment that has the plug-in, in a folder with the hidden stack and a YAML."""
+    shutil.copytree(stack / "stack", shell.folder / "stack")
+    (shell.folder / "run.yaml").write_text(RUN)
+    path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
+    return Shell(shell.folder, {**shell.environment, "PYTHONPATH": path})
+
+
+def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_plugin, stack):
+    with_plugin.ok("ingest", "run.yaml")
+    result = with_plugin.ok("discrepancy", "run.yaml")
+    found = json.loads((with_plugin.folder / "run.zarr" / "discrepancy.json").read_text())
+    assert found["verdict"] == "named"
+    assert found["effects"] == ["chessboard_offset"]
+    assert found["gap"]["after"] < 0.2 * found["gap"]["before"]
+    (key,) = json.loads((stack / "sealed" / "stack.json").read_text())["effects"]
+    offset = found["steps"][0]["parameters"]["offset_dn"]
+    assert abs(offset["value"] - key["strength"]) < 0.15 * key["strength"]
+    for tag, reason in BROKEN.items():
+        assert reason in found["left_out"][tag]
+        assert any(tag in line and reason in line for line in result.stderr.splitlines())
+    assert any("lost_offset" in line for line in result.stderr.splitlines())
+    assert "chessboard_offset" in (with_plugin.folder / "run.yaml").read_text()
+    # from now on the fit knows it, and nothing is added twice
+    with_plugin.ok("fit", "run.yaml")
+
+
+def test_without_the_plug_in_nobody_else_is_blamed(shell, stack):
+    shutil.copytree(stack / "stack", shell.folder / "stack")
+    (shell.folder / "run.yaml").write_text(RUN)
+    shell.ok("ingest", "run.yaml")
+    shell.ok("discrepancy", "run.yaml")
+    found = json.loads((shell.folder / "run.zarr" / "discrepancy.json").read_text())
+    assert found["effects"] == []
+    assert found["verdict"] == "unexplained"
