@@ -10,13 +10,14 @@ otherwise an effect that makes the statistics scatter would shrink the gap by wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
-from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.null import NullModel, moments
 
 __all__ = ["Gap", "GapMetric"]
 
@@ -59,6 +60,7 @@ class GapMetric:
 
     null: NullModel
     n_samples: int
+    _known: dict[int, dict[str, FloatArray]] = field(default_factory=dict, repr=False, compare=False)
 
     def gap(self, z: FloatArray, mean: FloatArray, replicates: FloatArray) -> Gap:
         """Return the gap of a model.
@@ -68,28 +70,54 @@ class GapMetric:
             mean: what the model gives, shape (m,).
             replicates: vectors drawn from a model with that mean or another, for the floor, shape (b, m).
         """
-        b = replicates.shape[0]
-        # a replicate's distance from the mean of the others is that of new data from the mean of all
-        apart = (replicates - replicates.mean(axis=0)) * b / (b - 1)
-        apart *= np.sqrt((1.0 + 1.0 / b) / (1.0 + 1.0 / (b - 1)))
-        total, own, families = 0.0, np.zeros(b), {}
-        for family in FAMILIES:
-            index = [i for i, name in enumerate(self.null.names) if STATISTICS[name].family == family]
-            if not index:
-                continue
-            inverse = np.linalg.inv(self.null.covariance[np.ix_(index, index)])
-            residual = (z - mean)[index]
-            distance = float(residual @ inverse @ residual)
-            chance = np.einsum("bi,ij,bj->b", apart[:, index], inverse, apart[:, index])
-            families[family] = (distance - float(chance.mean())) / (2.0 * self.n_samples)
-            total += distance
-            own += chance
+        total, families = 0.0, {}
+        own = self._own_distances(replicates)
+        for family, index in self._members().items():
+            distance = _distances((z - mean)[None, index], self.null.covariance[np.ix_(index, index)])[0]
+            families[family] = (float(distance) - float(own[family].mean())) / (2.0 * self.n_samples)
+            total += float(distance)
+        chance = np.sum(list(own.values()), axis=0)
         scale = 2.0 * self.n_samples
-        excess = total - float(own.mean())
-        spread = float(np.sqrt(own.var(ddof=1) + 4.0 * max(excess, 0.0)))
+        excess = total - float(chance.mean())
+        spread = float(np.sqrt(chance.var(ddof=1) + 4.0 * max(excess, 0.0)))
         return Gap(
             value=excess / scale,
-            floor=float(np.quantile(own, _FLOOR_QUANTILE) - own.mean()) / scale,
+            floor=float(np.quantile(chance, _FLOOR_QUANTILE) - chance.mean()) / scale,
             interval=((excess - _INTERVAL * spread) / scale, (excess + _INTERVAL * spread) / scale),
             families=families,
         )
+
+    def _members(self) -> dict[str, list[int]]:
+        """Return the places of the statistics of each family that has any."""
+        families = [STATISTICS[name].family for name in self.null.names]
+        found = {family: [i for i, f in enumerate(families) if f == family] for family in FAMILIES}
+        return {family: index for family, index in found.items() if index}
+
+    def _own_distances(self, replicates: FloatArray) -> dict[str, FloatArray]:
+        """Return for each family the distances that data of the model itself would have, shape (b,) each.
+
+        Each replicate is measured against the others, as the data are against all: in the covariance too,
+        where that was estimated from it.
+        """
+        if id(replicates) in self._known:
+            return self._known[id(replicates)]
+        b = replicates.shape[0]
+        known = replicates is self.null.replicates
+        own: dict[str, list[float]] = {family: [] for family in self._members()}
+        for i in range(b):
+            others = np.delete(replicates, i, axis=0)
+            mean, _, covariance = (
+                moments(others) if known else (others.mean(axis=0), None, self.null.covariance)
+            )
+            for family, index in self._members().items():
+                apart = (replicates[i] - mean)[None, index]
+                own[family].append(float(_distances(apart, covariance[np.ix_(index, index)])[0]))
+        found = {family: np.array(values) for family, values in own.items()}
+        self._known[id(replicates)] = found
+        return found
+
+
+def _distances(residuals: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the squared Mahalanobis distances of residuals, shape (n, m)."""
+    white = linalg.solve_triangular(linalg.cholesky(covariance, lower=True), residuals.T, lower=True)
+    return np.asarray(np.sum(white**2, axis=0))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-__all__ = ["NullModel", "as_matrix", "look_elsewhere", "two_sided"]
+__all__ = ["NullModel", "as_matrix", "look_elsewhere", "moments", "two_sided"]
 
 FloatArray = NDArray[np.float64]
 
@@ -48,13 +48,8 @@ class NullModel:
     @classmethod
     def from_replicates(cls, names: tuple[str, ...], vectors: FloatArray) -> NullModel:
         """Estimate from replicates, shape (b, m)."""
-        mean = vectors.mean(axis=0)
-        std = _std(vectors - mean)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            correlation = np.corrcoef(vectors, rowvar=False)
-        correlation = np.where(np.isfinite(correlation), correlation, 0.0) * (1.0 - _SHRINKAGE)
-        np.fill_diagonal(correlation, 1.0)
-        return cls(names, mean, std, correlation * np.outer(std, std), vectors, _effective_tests(vectors))
+        mean, std, covariance = moments(vectors)
+        return cls(names, mean, std, covariance, vectors, _effective_tests(vectors))
 
     @property
     def n_replicates(self) -> int:
@@ -72,6 +67,17 @@ class NullModel:
     def global_p(self, z: FloatArray, splits: int = 1) -> float:
         """Return the probability that any statistic deviates as much as the most deviating one."""
         return look_elsewhere(float(self.p_values(z, splits).min()), self.effective_tests)
+
+
+def moments(vectors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean, standard deviation and shrunk covariance of replicates, shape (b, m)."""
+    mean = vectors.mean(axis=0)
+    std = _std(vectors - mean)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.corrcoef(vectors, rowvar=False)
+    correlation = np.where(np.isfinite(correlation), correlation, 0.0) * (1.0 - _SHRINKAGE)
+    np.fill_diagonal(correlation, 1.0)
+    return mean, std, correlation * np.outer(std, std)
 
 
 def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:

@@ -1,0 +1,211 @@
+"""The pure parts of the workflow on made-up statistics: splits, null model, fingerprints, naming, gap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
+from pchem_pipeline.discrepancy.gap import GapMetric
+from pchem_pipeline.discrepancy.naming import choose, score_set
+from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.splits import block_length, split_frames
+from pchem_pipeline.effects.registry import effect_class
+from pchem_pipeline.errors import InputError
+
+NAMES = tuple(STATISTICS)[:40]
+
+
+def _null(rng: np.random.Generator, b: int = 60, m: int = 40) -> NullModel:
+    return NullModel.from_replicates(NAMES[:m], rng.normal(0.3, 1.0, (b, m)))
+
+
+def _hypothesis(tag: str, fingerprint: np.ndarray) -> Hypothesis:
+    parameters = {
+        "row_noise": {"row_noise_dn": 0.1},
+        "frame_noise": {"frame_noise_dn": 0.1},
+        "exposure_drift": {"drift": 0.1},
+    }[tag]
+    return Hypothesis(effect_class(tag).model_validate({"tag": tag, **parameters}), fingerprint)
+
+
+# -- splits -----------------------------------------------------------------------------------------
+
+
+def test_splits_share_no_frame_and_keep_blocks_whole() -> None:
+    splits = split_frames(np.arange(1000), 20)
+    parts = [splits.train, splits.test, splits.final]
+    together = np.concatenate(parts)
+    assert len({part.size for part in parts}) == 1
+    assert np.unique(together).size == together.size == 960  # 48 blocks; the rest is left out
+    for part in parts:
+        blocks = part.reshape(-1, 20)
+        assert np.all(np.diff(blocks, axis=1) == 1)
+        assert np.all(blocks[:, 0] % 20 == 0)
+
+
+def test_splits_see_the_same_stretch_of_the_run() -> None:
+    splits = split_frames(np.arange(6000), 100)
+    centres = [part.mean() for part in (splits.train, splits.test, splits.final)]
+    # a slow drift must look alike in all three: centres within a block of the middle
+    assert np.ptp(centres) < 100
+
+
+def test_no_block_spans_a_gap_in_the_numbering() -> None:
+    numbers = np.concatenate([np.arange(0, 330), np.arange(500, 830)])
+    splits = split_frames(numbers, 20)
+    for part in (splits.train, splits.test, splits.final):
+        assert np.all(np.diff(numbers[part].reshape(-1, 20), axis=1) == 1)
+
+
+@pytest.mark.parametrize(
+    ("frames", "wanted", "expected"), [(4000, None, 66), (17750, None, 100), (700, None, 20)]
+)
+def test_length_of_blocks(frames: int, wanted: int | None, expected: int) -> None:
+    assert block_length(frames, wanted) == expected
+
+
+@pytest.mark.parametrize(("frames", "wanted"), [(599, None), (800, 100)])
+def test_too_few_frames_are_refused_with_how_many(frames: int, wanted: int | None) -> None:
+    with pytest.raises(InputError, match=r"need (600|900)"):
+        block_length(frames, wanted)
+
+
+# -- null -------------------------------------------------------------------------------------------
+
+
+def test_global_p_is_uniform_under_the_null() -> None:
+    rng = np.random.default_rng(11)
+    p = np.array([_null(rng).global_p(rng.normal(0.3, 1.0, 40)) for _ in range(400)])
+    # binomial: 5 standard errors
+    for level in (0.05, 0.2, 0.5):
+        assert abs(np.mean(p < level) - level) < 5 * np.sqrt(level * (1 - level) / p.size)
+
+
+def test_global_p_would_catch_missing_look_elsewhere() -> None:
+    rng = np.random.default_rng(12)
+    naive = np.array([_null(rng).p_values(rng.normal(0.3, 1.0, 40)).min() for _ in range(200)])
+    assert np.mean(naive < 0.05) > 0.5
+
+
+def test_effective_tests_of_copies_are_those_of_one() -> None:
+    rng = np.random.default_rng(13)
+    one = rng.normal(size=(200, 1))
+    copies = NullModel.from_replicates(NAMES[:20], np.repeat(one, 20, axis=1))
+    assert copies.effective_tests == pytest.approx(1.0, abs=0.3)
+
+
+def test_sidak() -> None:
+    assert look_elsewhere(0.01, 10) == pytest.approx(1 - 0.99**10)
+
+
+# -- fingerprints and naming ------------------------------------------------------------------------
+
+
+def test_factors_and_their_errors_are_those_of_least_squares() -> None:
+    rng = np.random.default_rng(14)
+    first, second = rng.normal(size=40), rng.normal(size=40)
+    noise = Noise(np.eye(40), 0.0)
+    pulls = []
+    for _ in range(400):
+        shift = 8.0 * first + 5.0 * second + rng.normal(size=40)
+        fit = fit_set([_hypothesis("row_noise", first), _hypothesis("frame_noise", second)], shift, noise)
+        pulls.append((fit.factors - [8.0, 5.0]) / fit.stderr)
+    pulls_ = np.array(pulls)
+    assert np.all(np.abs(pulls_.mean(axis=0)) < 5 / np.sqrt(400))
+    assert np.all(np.abs(pulls_.std(axis=0) - 1) < 5 / np.sqrt(800))
+
+
+def test_the_right_one_of_three_is_named() -> None:
+    rng = np.random.default_rng(15)
+    prints = {tag: rng.normal(size=40) for tag in ("row_noise", "frame_noise", "exposure_drift")}
+    hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
+    noise = Noise(np.eye(40), 0.1)
+    shifts = tuple(3.0 * prints["frame_noise"] + rng.normal(size=40) for _ in range(2))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), noise)
+    assert choice is not None
+    assert choice.best.tags == {"frame_noise"}
+    assert choice.probability[0] > 0.99
+
+
+def test_two_at_once_are_both_named() -> None:
+    rng = np.random.default_rng(16)
+    prints = {tag: rng.normal(size=40) for tag in ("row_noise", "frame_noise", "exposure_drift")}
+    hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
+    mean = 3.0 * prints["row_noise"] + 2.0 * prints["exposure_drift"]
+    shifts = tuple(mean + rng.normal(size=40) for _ in range(2))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(np.eye(40), 0.05))
+    assert choice is not None
+    assert choice.best.tags == {"row_noise", "exposure_drift"}
+
+
+def test_twins_are_ambiguous() -> None:
+    rng = np.random.default_rng(17)
+    print_ = rng.normal(size=40)
+    twin = print_ + 0.02 * rng.normal(size=40)
+    hypotheses = [_hypothesis("row_noise", print_), _hypothesis("frame_noise", twin)]
+    shifts = tuple(3.0 * print_ + rng.normal(size=40) for _ in range(2))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(np.eye(40), 0.1))
+    assert choice is not None
+    assert {r.hypothesis.tag for r in choice.rivals[0]} == {"row_noise", "frame_noise"}
+    assert max(choice.probability) < 0.98
+
+
+def test_nothing_is_chosen_where_nothing_is() -> None:
+    rng = np.random.default_rng(18)
+    hypotheses = [
+        _hypothesis("row_noise", rng.normal(size=40)),
+        _hypothesis("frame_noise", rng.normal(size=40)),
+    ]
+    chosen = [
+        choose(hypotheses, (rng.normal(size=40), rng.normal(size=40)), Noise(np.eye(40), 0.1))
+        for _ in range(50)
+    ]
+    assert sum(choice is not None for choice in chosen) <= 2
+
+
+def test_a_wrong_effect_scores_below_the_right_one_on_frames_that_it_did_not_see() -> None:
+    rng = np.random.default_rng(19)
+    right, wrong = rng.normal(size=40), rng.normal(size=40)
+    noise = Noise(np.eye(40), 0.1)
+    shifts = (2.0 * right + rng.normal(size=40), 2.0 * right + rng.normal(size=40))
+    scores = [
+        score_set([_hypothesis(tag, f)], shifts, noise).score
+        for tag, f in (("row_noise", right), ("frame_noise", wrong))
+    ]
+    assert scores[0] > scores[1] + 10
+
+
+# -- gap --------------------------------------------------------------------------------------------
+
+
+def test_gap_is_the_divergence_and_does_not_grow_with_the_samples() -> None:
+    rng = np.random.default_rng(20)
+    values = []
+    for n in (10_000, 40_000):
+        null = _null(rng, b=200)
+        shift = np.zeros(40)
+        shift[:3] = 0.05 * np.sqrt(n)
+        metric = GapMetric(null, n)
+        gaps = [
+            metric.gap(0.3 + shift + rng.normal(size=40), null.mean, null.replicates).value for _ in range(60)
+        ]
+        values.append(np.mean(gaps))
+    # three statistics moved by 0.05 sigma per root sample: 3 * 0.05^2 / 2
+    assert values[0] == pytest.approx(3 * 0.05**2 / 2, rel=0.15)
+    assert values[1] == pytest.approx(values[0], rel=0.15)
+
+
+def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
+    rng = np.random.default_rng(21)
+    below = []
+    for _ in range(100):
+        null = _null(rng)
+        gap = GapMetric(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
+        below.append(gap.at_floor)
+    assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
+
+
+def test_every_statistic_belongs_to_a_family() -> None:
+    assert {s.family for s in STATISTICS.values()} == set(FAMILIES)
