@@ -270,3 +270,38 @@ def mass_tile(
         all_masses(theta, cells, law, room)
         for i in range(n_codes):
             out[pixel, i] = room.mass[i]
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def slope_tile(
+    first: NDArray[np.int64],
+    parameters: NDArray[np.float64],
+    lobes: NDArray[np.float64],
+    law: Law,
+    out: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+) -> None:
+    """Fill the mass of successive codes and its slopes in log H, 1/g, mu and log sigma_R^2.
+
+    Args:
+        first: first code of each pixel, DN, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4).
+        lobes: amplitude (e-) and weight of each pixel's free lobes, shape (n, 2).
+        law: grown model.
+        out: out, shape (n, n_codes); comes as NaN.
+        slopes: out, shape (n, 4, n_codes); comes as NaN.
+    """
+    n_codes = out.shape[1]
+    space = np.zeros(n_codes), np.empty(n_codes + 1), make_lobes(law)
+    room, theta = make_room(n_codes), np.empty(N_THETA)
+    for pixel in range(parameters.shape[0]):
+        if not math.isfinite(parameters[pixel].sum()):
+            continue
+        cells = make_cells(law, pixel, lobes[pixel, 0], first[pixel], first[pixel], n_codes, space)
+        to_theta(parameters[pixel], first[pixel], cells, law, True, theta)
+        theta[LOBE] = lobes[pixel, 1]
+        all_masses(theta, cells, law, room)
+        for i in range(n_codes):
+            out[pixel, i] = room.mass[i]
+            for j in range(4):
+                slopes[pixel, j, i] = room.slopes[j, i]
