@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Bend", "best_bend"]
 
-_PIXELS = 512
+_PIXELS = 256
 _PERIODS = 48
+_MOST_CODES = 1500
 _SHORTEST = 8.0
 # fall of chi2 by two coefficients at one of some 20 independent periods: p about 1e-3
 _LEAST_GAIN = 20.0
@@ -57,15 +58,18 @@ class _Pixels:
 
 def best_bend(evidence: Evidence) -> list[Bend]:
     """Return the bends that explain the residuals of the codes, the best first; none if none stands out."""
-    codes, residuals, expected = usable_codes(evidence.code)
+    codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
     chosen = _sample(evidence.maps)
     if codes.size < 16 or chosen is None:
         return []
     pixels = _tangents(*chosen)
     samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
-    in_use = _in_use(expected)
-    periods = np.geomspace(_SHORTEST, max(2.0 * in_use, 4.0 * _SHORTEST), _PERIODS)
-    fits = [_fit(p, pixels, samples, codes, residuals * np.sqrt(expected), expected) for p in periods]
+    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(expected), 4.0 * _SHORTEST), _PERIODS)
+    turned = np.outer(np.append(codes, codes[-1] + 1) - 0.5, 2.0 * np.pi / periods)
+    # per code and period what a sine and a cosine of 1 DN would leave, in standard errors
+    response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
+    designs = np.stack([response @ np.sin(turned), response @ np.cos(turned)], axis=2)
+    fits = [_fit(designs[:, i], residuals * np.sqrt(expected)) for i in range(_PERIODS)]
     gains = np.array([gain for gain, _ in fits])
     total = float((residuals**2 * expected).sum())
     found = []
@@ -73,7 +77,8 @@ def best_bend(evidence: Evidence) -> list[Bend]:
         left = max(1.0, (total - gains[place]) / max(codes.size - 6, 1))
         peak = gains[place] >= gains[max(place - 2, 0) : place + 3].max()
         if gains[place] > _LEAST_GAIN * left and peak:
-            found.append(fits[place][1])
+            a, b = fits[place][1]
+            found.append(Bend(float(np.hypot(a, b)), float(periods[place]), float(np.arctan2(b, a))))
     return found[:2]
 
 
@@ -127,36 +132,29 @@ def _tangents(
     return _Pixels(first, density, mass, tangents.transpose(0, 2, 1))
 
 
-def _fit(
-    period: float,
-    pixels: _Pixels,
-    samples: float,
-    codes: NDArray[np.int64],
-    scaled: NDArray[np.float64],
-    expected: NDArray[np.float64],
-) -> tuple[float, Bend]:
-    """Return by how much a sine of this period lowers chi2 of the codes, and the sine.
+def _response(pixels: _Pixels, codes: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
 
-    Args:
-        period: DN.
-        pixels: the sample.
-        samples: number of samples of the sensor per pixel of the sample.
-        codes: where the residuals are, DN, (c,).
-        scaled: residuals in standard errors, (c,).
-        expected: expected counts, (c,).
+    Summed over the sample of pixels, with what their fits take up projected out.
     """
     n_cells = pixels.mass.shape[1]
-    edges = pixels.first - 0.5 + np.arange(n_cells + 1)
-    place = (pixels.first + np.arange(n_cells) - codes[0]).ravel()
-    inside = (place >= 0) & (place < codes.size)
-    columns = []
-    for wave in (np.sin, np.cos):
-        change = np.diff(-pixels.density * wave(2.0 * np.pi * edges / period), axis=1)
-        taken = np.einsum("pjc,pc->pj", pixels.tangents, change / pixels.mass)
-        change = change - np.einsum("pjc,pj->pc", pixels.tangents, taken)
-        columns.append(np.bincount(place[inside], change.ravel()[inside], codes.size) * samples)
-    design = np.stack(columns, axis=1) / np.sqrt(expected)[:, None]
-    a, b = (float(value) for value in np.linalg.lstsq(design, scaled, rcond=None)[0])
-    left = scaled - design @ np.array([a, b])
-    gain = float((scaled**2).sum() - (left**2).sum())
-    return gain, Bend(float(np.hypot(a, b)), period, float(np.arctan2(b, a)))
+    total = np.zeros((codes.size + 2 * n_cells, codes.size + 2 * n_cells + 1))
+    cells = np.arange(n_cells)
+    for first, density, mass, tangents in zip(
+        pixels.first[:, 0] - codes[0] + n_cells, pixels.density, pixels.mass, pixels.tangents, strict=True
+    ):
+        if not 0 <= first <= total.shape[0] - n_cells:
+            continue
+        # a deviation at an edge moves the samples there into the upper cell
+        change = np.zeros((n_cells, n_cells + 1))
+        change[cells, cells] = density[:-1]
+        change[cells, cells + 1] = -density[1:]
+        change -= tangents.T @ (tangents / mass @ change)
+        total[first : first + n_cells, first : first + n_cells + 1] += change
+    return total[n_cells:-n_cells, n_cells:-n_cells]
+
+
+def _fit(design: NDArray[np.float64], scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return by how much a sine and a cosine lower chi2 of the codes, and their factors."""
+    factors: NDArray[np.float64] = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
+    return float((scaled**2).sum() - ((scaled - design @ factors) ** 2).sum()), factors

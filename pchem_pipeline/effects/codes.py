@@ -16,26 +16,65 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.evidence import CodeResiduals, PixelMaps
 
-__all__ = ["Residuals", "code_range", "edge_shifts", "roughness", "usable_codes"]
+__all__ = ["Residuals", "code_range", "edge_shifts", "few_shifts", "roughness", "usable_codes"]
 
 Residuals = tuple["NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
 
 # fewest expected counts at which a relative residual is about normal
 _FEWEST = 100.0
+# fall of chi2 that one edge must bring, and most edges
+_LEAST_GAIN = 20.0
+_MOST_SHIFTS = 4
 
 
-def usable_codes(code: CodeResiduals) -> Residuals:
-    """Return the longest run of codes with counts enough: codes, relative residuals, expected counts."""
-    good = np.concatenate([[False], (code.expected >= _FEWEST) & np.isfinite(code.expected), [False]])
+def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> Residuals:
+    """Return the longest run of codes with counts enough: codes, relative residuals, expected counts.
+
+    Of a run longer than ``most`` the part with the most counts.
+    """
+    every = code.first + np.arange(code.expected.size)
+    # the extreme codes are where a limit piles counts up
+    inside = (every > code.minimum) & (every < code.maximum)
+    good = np.concatenate([[False], inside & (code.expected >= _FEWEST), [False]])
     edges = np.flatnonzero(np.diff(good.astype(np.int8)))
     starts, ends = edges[::2], edges[1::2]
     if not starts.size:
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     longest = int((ends - starts).argmax())
     part = slice(int(starts[longest]), int(ends[longest]))
+    if part.stop - part.start > most:
+        sums = np.cumsum(np.concatenate([[0.0], code.expected[part]]))
+        begin = part.start + int((sums[most:] - sums[:-most]).argmax())
+        part = slice(begin, begin + most)
     expected = np.asarray(code.expected[part], np.float64)
     codes = code.first + np.arange(part.start, part.stop)
     return codes, (code.observed[part] - expected) / expected, expected
+
+
+def few_shifts(residuals: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return shifts of the edges, DN, shape (codes + 1,), if a few of them explain all that is rough.
+
+    One edge after the other, the one that lowers chi2 the most (matching pursuit); None if the residuals ask
+    for more than a few, or for none.
+    """
+    shifts = np.zeros(residuals.size + 1)
+    left = residuals.copy()
+    # an edge moved up makes the code below it wider by as much as that above it narrower
+    weight = np.concatenate([expected, [0.0]]) + np.concatenate([[0.0], expected])
+    inner = slice(1, -1)
+    for _ in range(_MOST_SHIFTS):
+        pull = np.diff(np.concatenate([[0.0], left * expected, [0.0]]))
+        gains = pull**2 / weight
+        place = 1 + int(gains[inner].argmax())
+        if gains[place] < _LEAST_GAIN:
+            break
+        shift = -pull[place] / weight[place]
+        shifts[place] += shift
+        left[place - 1] -= shift
+        left[place] += shift
+    if not shifts.any() or roughness(left, expected)[1] > 3.0:
+        return None
+    return shifts
 
 
 def roughness(residuals: NDArray[np.float64], expected: NDArray[np.float64]) -> tuple[float, float]:

@@ -21,8 +21,10 @@ __all__ = ["Line", "coherent_line", "incoherent_line"]
 _FALSE_ALARM = 1e-3
 # frames of a spectrum over frames and lines: enough to tell a line, and bounded memory
 _MOST_CELLS = 1 << 24
-# below so many cycles per run a line along frames is a drift
-_SLOWEST = 3.0
+# slow changes that are no lines: cosines of up to so many half periods per run
+_SLOW_WAVES = 6
+# frequencies along frames over which the noise is taken as one
+_STRETCH = 128
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class Line:
 def coherent_line(means: NDArray[Any], frames: NDArray[np.int64], n_run: int) -> Line | None:
     """Return the highest line over frames and lines, or None where none stands out.
 
-    Left out are what is constant in time (part of the bias map), drifts (slower than three cycles per run)
-    and alternation (half the frame rate) of the whole frame.
+    What is constant in time (part of the bias map), drifts (slower than three cycles per run) and alternation
+    (half the frame rate) are taken away first.
 
     Args:
         means: (n, lines), DN; lines with NaN do not count.
@@ -57,25 +59,22 @@ def coherent_line(means: NDArray[Any], frames: NDArray[np.int64], n_run: int) ->
         n_run: number of frames of the run.
     """
     field, lines = _prepared(means)
-    if field.shape[0] < 16 or field.shape[1] < 1:
+    if field.shape[0] < 64 or field.shape[1] < 1:
         return None
     n_lines = 2 * means.shape[1] if means.shape[1] > 1 else 1
-    length = min(n_run, max(16, _MOST_CELLS // n_lines))
+    length = min(n_run, max(64, _MOST_CELLS // n_lines))
     inside = frames - frames[0] < length
-    field, numbers = field[inside], frames[inside]
-    first = int(numbers[0])
+    numbers = frames[inside]
+    field = _without_slow(field[inside], numbers)
     grid = np.zeros((length, n_lines), np.float32)
-    grid[np.ix_(numbers - first, lines)] = field
+    grid[np.ix_(numbers - numbers[0], lines)] = field
     power = _half_plane(grid)
-    _blank(power)
-    level = np.array([np.median(p[p > 0]) for p in power.T]) / np.log(2.0)
-    ratio = power / level
+    ratio = power / _level(power)
     place = np.unravel_index(int(ratio.argmax()), ratio.shape)
-    # twice as fine a grid along the lines has some twice the chances of the plain one
     excess = float(ratio[place]) - np.log(ratio.size)
     if excess < -np.log(_FALSE_ALARM):
         return None
-    start = (float(np.fft.fftfreq(length)[place[0]]), place[1] / n_lines)
+    start = (float(np.fft.fftfreq(length)[place[0]]), float(place[1] / n_lines))
     return _refined(field, numbers, lines, start, (1.0 / length, 1.0 / n_lines), float(excess))
 
 
@@ -119,14 +118,30 @@ def _half_plane(grid: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.abs(spectrum) ** 2, np.float32)
 
 
-def _blank(power: NDArray[np.float32]) -> None:
-    """Set to zero what is no line of a pickup (see :func:`coherent_line`)."""
-    length = power.shape[0]
-    slow = int(_SLOWEST) + 1
-    power[0] = 0.0
-    # the spectrum of whole frames is symmetric: one half says all
-    power[:slow, 0] = 0.0
-    power[length // 2 - 1 :, 0] = 0.0
+def _without_slow(field: NDArray[np.float64], frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the field without what no pickup does: the mean, slow changes and alternation of each line.
+
+    They are fitted and not only left out of the spectrum, where gaps between the frames spread them widely.
+    """
+    position = (frames - frames[0]) / max(int(frames[-1] - frames[0]), 1)
+    waves = [np.cos(np.pi * j * position) for j in range(_SLOW_WAVES + 1)]
+    basis = np.linalg.qr(np.stack([*waves, 1.0 - 2.0 * (frames % 2)], axis=1))[0]
+    return np.asarray(field - basis @ (basis.T @ field), np.float64)
+
+
+def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the noise power around each place, so that broad humps of the spectrum are no lines.
+
+    Stretches of frequencies along frames, each at one frequency along lines: the median of exponentially
+    distributed powers is log 2 of their mean.
+    """
+    level = np.empty_like(power)
+    pieces = np.array_split(np.arange(power.shape[0]), max(power.shape[0] // _STRETCH, 1))
+    for piece in pieces:
+        level[piece] = np.median(power[piece], axis=0) / np.log(2.0)
+    # what was fitted and taken away leaves holes: never less than the typical level
+    typical = np.median(level)
+    return np.asarray(np.maximum(level, np.float32(0.5 * typical)), np.float32)
 
 
 def _mean_power(
@@ -160,6 +175,9 @@ def _refined(
     doubled = 1.0 if (f_line % 0.5 == 0.0 and f_frame % 0.5 == 0.0) else 2.0
     amplitude = doubled * abs(best) / field.size
     phase = float(np.angle(best) + np.pi / 2.0)
+    if f_line == 0.0 and f_frame < 0.0:
+        # along frames alone the negative frequency is the same line
+        f_frame, phase = -f_frame, np.pi - phase
     return Line(amplitude, _wrapped(f_line), _wrapped(f_frame), phase, excess)
 
 

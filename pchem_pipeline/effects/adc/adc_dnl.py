@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.codes import code_range, edge_shifts, roughness, usable_codes
+from pchem_pipeline.effects.codes import code_range, edge_shifts, few_shifts, roughness, usable_codes
 from pchem_pipeline.effects.edges import merged_edges
 
 if TYPE_CHECKING:
@@ -145,19 +145,29 @@ class AdcDnl(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return one wrong bit where that explains the residuals, and the shifts of all edges as they are."""
+        """Return a wrong bit or a few wrong edges where such explain the residuals, and all edges."""
         codes, residuals, expected = usable_codes(evidence.code)
         variance, significance = roughness(residuals, expected)
-        if significance < 3.0:
-            return ()
-        shifts = edge_shifts(residuals, expected, variance)
+        few = few_shifts(residuals, expected)
+        bit = _best_bit(codes, residuals, expected) if codes.size else None
+        found = [] if bit is None else [cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0])]
+        if few is not None:
+            found += cls._from_shifts(codes, few)
+        if significance > 3.0:
+            found += cls._from_shifts(codes, edge_shifts(residuals, expected, variance))
+        return found
+
+    @classmethod
+    def _from_shifts(cls, codes: NDArray[np.int64], shifts: NDArray[np.float64]) -> list[Self]:
+        """Return the effect with these edges, its strength the rms deviation of the widths."""
+        used = np.flatnonzero(shifts)
         size = float(np.sqrt(np.mean(np.diff(shifts) ** 2)))
-        if size <= 0:
-            return ()
-        listed = tuple(np.round(shifts / size, 4).tolist())
-        found = cls(dnl_lsb=min(size, 1.0), pattern="edges", first_code=int(codes[0]), edges=listed)
-        bit = _best_bit(codes, residuals, expected)
-        return (found,) if bit is None else (cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0]), found)
+        if not used.size or size <= 0:
+            return []
+        part = slice(int(used[0]), int(used[-1]) + 1)
+        listed = tuple(np.round(shifts[part] / size, 4).tolist())
+        first = int(codes[0]) + part.start
+        return [cls(dnl_lsb=min(size, 1.0), pattern="edges", first_code=first, edges=listed)]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with the edges moved.

@@ -32,6 +32,7 @@ Path = tuple[tuple[int, float], ...]
 _QUADRANTS = 4
 _LOBES = 7
 _SWEEPS = 4
+_LAGS = 40
 
 
 @register_effect
@@ -123,17 +124,19 @@ class BiasJumps(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the change points of the quadrants' means, and random jumps of that size and rate.
+        """Return the change points of the quadrants' means, and random jumps of like size and rate.
 
         What is common to the quadrants is taken out first, so that neither a drift nor frame noise is
-        taken for jumps.
+        taken for jumps. Jumps too many or too small to be told apart still leave a correlation in time.
         """
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
         series, cuts = _contrasts(evidence.time)
         number = sum(c.size for c in cuts)
+        drawn = _correlated(evidence.time)
+        random = [cls(amplitude_dn=drawn[0] / responsivity(evidence), rate=drawn[1])] if drawn else []
         if not number:
-            return ()
+            return random
         means = [segment_means(one, c) for one, c in zip(series.T, cuts, strict=True)]
         steps = np.concatenate([np.diff(m) for m in means])
         size = float(np.sqrt((steps**2).mean())) / responsivity(evidence)
@@ -142,7 +145,7 @@ class BiasJumps(Effect):
             _as_path(evidence.time.frames, c, m / responsivity(evidence) / size)
             for c, m in zip(cuts, means, strict=True)
         )
-        return cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate)
+        return [cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate), *random]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law of copies at the levels (a variance where they are close against the noise).
@@ -203,6 +206,35 @@ def _contrasts(time: TimeSeries) -> tuple[NDArray[np.float64], list[NDArray[np.i
     if not _is_white((means - steps).mean(axis=1)):
         return means - common, cuts
     return means, [find_changes(one, noise_variance(one)) for one in means.T]
+
+
+def _correlated(time: TimeSeries) -> tuple[float, float] | None:
+    """Return amplitude, DN, and rate of two-level jumps of the autocovariance seen, None if there is none.
+
+    Of a level that jumps at rate q between ``-a/2`` and ``a/2`` it is ``a^2 / 4 (1 - 2 q)^l`` at lag l; the
+    deviation from the mean of four such quadrants has three quarters of that.
+    """
+    contrast = time.quadrant_readout - time.quadrant_readout.mean(axis=1, keepdims=True)
+    contrast = contrast - contrast.mean(axis=0)
+    terms: list[tuple[float, float, float]] = []
+    for lag in range(1, min(_LAGS, time.frames.size // 4) + 1):
+        together = time.frames[lag:] - time.frames[:-lag] == lag
+        if together.sum() >= 8:
+            products = (contrast[lag:] * contrast[:-lag])[together]
+            terms.append((lag, float(products.mean()), float(products.shape[0])))
+    if not terms:
+        return None
+    lags, covariance, weight = np.array(terms).T
+    error = np.array([noise_variance(one) for one in contrast.T]).mean() / np.sqrt(3.0)
+    best: tuple[float, float, float] | None = None
+    for rate in np.geomspace(1e-3, 0.25, 12):
+        shape = (1.0 - 2.0 * rate) ** lags
+        square = float((weight * shape**2).sum())
+        size = float((weight * shape * covariance).sum()) / square
+        significance = size * np.sqrt(square) / error
+        if size > 0 and significance > 4.0 and (best is None or significance > best[0]):
+            best = (significance, 2.0 * np.sqrt(size / 0.75), float(rate))
+    return None if best is None else best[1:]
 
 
 def _is_white(series: NDArray[np.float64]) -> bool:

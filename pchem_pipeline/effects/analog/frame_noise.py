@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.common_modes import add_offset, mean_variance, responsivity
+from pchem_pipeline.effects.common_modes import add_offset, line_excess, mean_variance, responsivity
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,11 +68,12 @@ class FrameNoise(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the excess variance of successive frames, so that a slow drift does not count.
 
-        Half the mean squared difference of successive frame means, even and odd frames centred apart.
+        Half the mean squared difference of successive frame means, even and odd frames centred apart, less
+        what the noise of pixels, rows and columns gives.
         """
         if evidence.time is None:
             return ()
-        expected = float(mean_variance(evidence))
+        expected = _expected(evidence, evidence.time)
         steps = _steps(evidence.time)
         if steps.size < 8 or not expected > 0:
             return ()
@@ -86,6 +87,16 @@ class FrameNoise(Effect):
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
         return model.with_variance(dn2=self.frame_noise_dn**2)
+
+
+def _expected(evidence: Evidence, time: TimeSeries) -> float:
+    """Return the variance, DN^2, that pixels, rows and columns by themselves give to frame means."""
+    expected = float(mean_variance(evidence))
+    for means, axis in ((time.row_readout, 1), (time.column_readout, 0)):
+        excess, error = line_excess(means, mean_variance(evidence, axis))
+        if excess > 2.0 * error:
+            expected += excess / means.shape[1]
+    return expected
 
 
 def _steps(time: TimeSeries) -> NDArray[np.float64]:

@@ -33,6 +33,8 @@ _RARE = 1e-12
 class RepeatedFrames(Effect):
     """Frame t is, sample by sample, frame t - 1 as it was delivered (which may itself be a repeat).
 
+    Or a part of its rows is, where frames are transferred in parts.
+
     Signature: pairs of successive frames that are equal everywhere; then also correlations at lag 1, in
     charge and readout alike. A pixel's own histogram does not change, only fewer of its samples count.
     """
@@ -45,6 +47,7 @@ class RepeatedFrames(Effect):
     )
     signature: ClassVar[tuple[str, ...]] = (
         "frame.repeated",
+        "frame.repeated_rows",
         "time.lag1.charge.mean",
         "time.lag1.readout.mean",
     )
@@ -59,6 +62,17 @@ class RepeatedFrames(Effect):
     frames: tuple[int, ...] = Field(
         default=(), max_length=1 << 20, description="numbers of frames that repeat the one before, besides"
     )
+
+    rows: tuple[int, int] | None = Field(
+        default=None, description="first row and the row after the last that are repeated; null: all rows"
+    )
+
+    @field_validator("rows")
+    @classmethod
+    def _some_rows(cls, rows: tuple[int, int] | None) -> tuple[int, int] | None:
+        if rows is not None and not 0 <= rows[0] < rows[1]:
+            raise ValueError(f"repeated_frames: rows {list(rows)} hold none; give [first, after the last]")
+        return rows
 
     @field_validator("frames")
     @classmethod
@@ -92,7 +106,11 @@ class RepeatedFrames(Effect):
         # an original is looked for no further back than history reaches, so that it is the same one
         # whatever block is simulated; in a longer run of repeats the later ones are left as they are
         source = np.where((source < 0) | (index - source > self.history()), index, source)
-        result: NDArray[Any] = values[source]
+        if self.rows is None:
+            return np.asarray(values[source])
+        chosen = np.flatnonzero((context.rows >= self.rows[0]) & (context.rows < self.rows[1]))
+        result: NDArray[Any] = values.copy()
+        result[:, chosen] = values[source][:, chosen]
         return result
 
     @classmethod
@@ -102,13 +120,22 @@ class RepeatedFrames(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the fraction of frames that equal the one before, and the list of them."""
-        if evidence.time is None or not evidence.time.repeated.size:
+        """Return the fraction of frames that equal the one before, and the list of them.
+
+        Where only rows are equal, a quarter of the rows stands for those that are: evidence has their number
+        and not their place.
+        """
+        if evidence.time is None:
             return ()
-        pairs = int((np.diff(evidence.time.frames) == 1).sum())
-        listed = tuple(evidence.time.repeated.tolist())
-        probability = min(len(listed) / max(pairs, 1), 0.5)
-        return cls(probability=probability), cls(frames=listed)
+        time, found = evidence.time, []
+        pairs = max(int((np.diff(time.frames) == 1).sum()), 1)
+        if time.repeated.size:
+            listed = tuple(time.repeated.tolist())
+            found = [cls(probability=min(len(listed) / pairs, 0.5)), cls(frames=listed)]
+        if time.repeated_rows:
+            part = max(time.row_readout.shape[1] // 4, 1)
+            found.append(cls(probability=min(time.repeated_rows / part / pairs, 0.5), rows=(0, part)))
+        return found
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the same law: a repeat is one more sample of it, though not a new one."""
