@@ -1,0 +1,138 @@
+"""From sums with a known law to standard normal quantiles.
+
+Every function takes what was seen and what is expected without any effect, and answers with a number that is
+about N(0, 1) then; a large positive one says "too much". Far in the tails logarithms of the probabilities are
+used, so that the answer stays finite and keeps growing with the effect.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+
+__all__ = [
+    "best",
+    "chi_square",
+    "counted",
+    "extreme",
+    "largest_normal",
+    "largest_power",
+    "poisson",
+    "repeats",
+]
+
+FloatArray = NDArray[np.float64]
+
+_SMALL = 1e-12
+# an event that is next to impossible counts as much as this many standard deviations
+_CERTAIN = 10.0
+_RARE = 1e-3
+
+
+def counted(count: ArrayLike, expected: ArrayLike) -> FloatArray:
+    """Return ``2 sqrt(c + 3/8) - 2 sqrt(e + 3/8)``: variance 1 for a Poisson count (Anscombe 1948)."""
+    seen, mean = np.asarray(count, np.float64), np.maximum(np.asarray(expected, np.float64), 0.0)
+    return np.asarray(2.0 * (np.sqrt(seen + 0.375) - np.sqrt(mean + 0.375)))
+
+
+def chi_square(value: ArrayLike, mean: ArrayLike, variance: ArrayLike | None = None) -> FloatArray:
+    """Return the normal quantile of a sum of squares (Wilson and Hilferty 1931).
+
+    Args:
+        value: the sum.
+        mean: its expectation (the degrees of freedom where the squares have variance 1).
+        variance: its variance; twice the mean if None.
+    """
+    mu = np.asarray(mean, np.float64)
+    spread = 2.0 * mu if variance is None else np.asarray(variance, np.float64)
+    # a multiple of a chi-square with the same mean and variance has this many degrees of freedom
+    width = spread / (9.0 * mu**2)
+    ratio = np.maximum(np.asarray(value, np.float64), 0.0) / mu
+    return np.asarray((np.cbrt(ratio) - (1.0 - width)) / np.sqrt(width))
+
+
+def poisson(count: int, expected: float) -> float:
+    """Return the normal quantile of a Poisson count, ties split; near 0 for none where none is expected."""
+    expected = max(expected, _SMALL)
+    if count == 0:
+        return _quantile(np.log1p(-0.5 * np.exp(-expected)))
+    above = _log_poisson_tail(count, expected)
+    at = count * np.log(expected) - expected - special.gammaln(count + 1.0)
+    log_p = above + np.log1p(-0.5 * np.exp(min(at - above, 0.0)))
+    return _quantile(log_p)
+
+
+def repeats(count: int, expected: float) -> float:
+    """Return 10 for each coincidence that cannot happen; where they do happen, what :func:`counted` says."""
+    return float(_CERTAIN * count) if expected < _RARE else float(counted(count, expected))
+
+
+def largest_normal(values: FloatArray) -> float:
+    """Return the normal quantile of the largest magnitude among independent N(0, 1) numbers."""
+    log_tail = np.log(2.0) + special.log_ndtr(-float(np.max(np.abs(values))))
+    return _of_many(log_tail, values.size)
+
+
+def largest_power(power: FloatArray, averaged: int) -> float:
+    """Return the normal quantile of the largest of many powers.
+
+    Args:
+        power: each the mean of ``averaged`` independent exponential numbers of mean 1 (the periodogram of
+            white noise; the largest of them is Fisher's g-test), any shape.
+        averaged: how many.
+    """
+    return _of_many(_log_gamma_tail(averaged, averaged * float(np.max(power))), power.size)
+
+
+def _of_many(log_tail: float, n: int) -> float:
+    """Return the quantile of the smallest of n p-values given its logarithm."""
+    log_none = n * np.log1p(-np.exp(min(log_tail, -1e-9)))
+    if log_none < -1e-6:
+        return float(special.ndtri_exp(log_none))
+    return _quantile(np.log(n) + log_tail)
+
+
+def _quantile(log_p: float) -> float:
+    """Return the normal deviate exceeded with probability exp(log_p)."""
+    return float(-special.ndtri_exp(min(log_p, -1e-9)))
+
+
+def _log_poisson_tail(count: int, expected: float) -> float:
+    """Return log P(N >= count), count at least 1."""
+    tail = float(special.gammainc(count, expected))
+    if tail > 1e-250:
+        return float(np.log(tail))
+    ratio = expected / (count + 1.0)
+    return float(
+        count * np.log(expected) - expected - special.gammaln(count + 1.0) - np.log1p(-min(ratio, 0.5))
+    )
+
+
+def _log_gamma_tail(shape: float, value: float) -> float:
+    tail = float(special.gammaincc(shape, value))
+    if tail > 1e-250:
+        return float(np.log(tail))
+    return float((shape - 1.0) * np.log(value) - value - special.gammaln(shape))
+
+
+def extreme(count: int, on: float, beyond: float) -> float:
+    """Return the normal quantile of ``count`` samples at the extreme value and none beyond it.
+
+    Args:
+        count: samples at the extreme, at least 1.
+        on: samples expected there.
+        beyond: samples expected beyond.
+    """
+    on = max(on, _SMALL)
+    # P(no sample beyond) is uniform; half of the chance of the extreme itself splits the ties
+    nothing = _quantile(-beyond + np.log(0.5 + 0.5 * np.exp(-on)))
+    above = _log_poisson_tail(count, on)
+    at = count * np.log(on) - on - special.gammaln(count + 1.0)
+    piled = _quantile(above + np.log1p(-0.5 * np.exp(min(at - above, 0.0))) - np.log(-np.expm1(-on)))
+    return float((nothing + piled) / np.sqrt(2.0))
+
+
+def best(*z: float) -> float:
+    """Return the normal quantile of the largest of a few normal quantiles."""
+    return _of_many(float(special.log_ndtr(-max(z))), len(z))
