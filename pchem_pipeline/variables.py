@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["PARAMETERS", "VARIABLES", "Variable", "variables_of"]
+__all__ = ["FREE_LOBES", "PARAMETERS", "VARIABLES", "Variable", "variables_of"]
 
 #: The four parameters of the PCD, in the order of every (…, parameter) axis.
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+
+#: Arrays of the group ``fit`` that exist only where the model holds effects.
+FREE_LOBES = ("lobe_amplitude_e", "lobe_weight")
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,11 @@ _ALL: list[Variable] = [
     Variable("fit/goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of the histogram, bins merged"),
     Variable("fit/goodness_dof", _MAP, "int32", "1", "degrees of freedom of goodness_chi2"),
     Variable("fit/goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds"),
+    # where the model's effects look for levels in each pixel (random telegraph noise)
+    Variable(
+        "fit/lobe_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN without any"
+    ),
+    Variable("fit/lobe_weight", _MAP, "float64", "1", "probability to be off the quiet level; 0 without any"),
     *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")),
     Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
     # raw ensemble (paper, Sec. II-C): axis `dn`

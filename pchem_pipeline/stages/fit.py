@@ -1,20 +1,23 @@
-"""Stage ``fit``: PCH-EM on the histogram of every pixel."""
+"""Stage ``fit``: PCH-EM on the histogram of every pixel, and again with the effects of the run's model."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit_status import FAILED, MEANINGS
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.compose import marginal_model, pixel_maps
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.grown import fit_grown
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.base import StageContext, open_store
-from pchem_pipeline.variables import PARAMETERS, variables_of
+from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
@@ -24,9 +27,12 @@ __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "fit_ti
 NAME = "fit"
 VERSION = 1
 UPSTREAM: tuple[str, ...] = ("histogram",)
-SETTINGS: tuple[str, ...] = ("fit", "run.tile")
+SETTINGS: tuple[str, ...] = ("fit", "model", "run.tile")
 READS: tuple[str, ...] = ("histogram/counts", "histogram/origin", "histogram/under", "histogram/over")
 WRITES: tuple[str, ...] = ("fit",)
+
+#: Pixels of which effects are told nothing: no value, or one electron off.
+_UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
 
 
 def identity(context: StageContext) -> dict[str, Any]:
@@ -36,25 +42,49 @@ def identity(context: StageContext) -> dict[str, Any]:
 
 
 def fit_tile(
-    histogram: Mapping[str, NDArray[Any]], settings: FitSettings, adc_limits: tuple[int, int] | None
+    histogram: Mapping[str, NDArray[Any]],
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+    effects: Sequence[Effect] = (),
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the group ``fit`` of a tile, by name.
+
+    With effects the plain fit is where the one under the grown law starts.
 
     Args:
         histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of the tile.
         settings: of the fit.
         adc_limits: first and last code of the ADC, DN, or None where they are not known.
+        effects: of the run's model.
     """
     counts = histogram["counts"]
     shape = counts.shape[:2]
     flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
-    result: FitResult = fit_histograms(
-        counts.reshape(-1, counts.shape[2]), **flat, settings=settings, adc_limits=adc_limits
-    )
+    rows = counts.reshape(-1, counts.shape[2])
+    result: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits)
+    if effects:
+        result = _grown(rows, flat["origin"], result, settings, effects)
     variances = np.diagonal(result.covariance, axis1=1, axis2=2)
     arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
-    arrays |= {v.name: getattr(result, v.name) for v in variables_of("fit") if v.name not in arrays}
+    arrays |= {
+        v.name: getattr(result, v.name)
+        for v in variables_of("fit")
+        if v.name not in arrays and hasattr(result, v.name)
+    }
     return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
+
+
+def _grown(
+    counts: NDArray[Any],
+    origin: NDArray[Any],
+    plain: FitResult,
+    settings: FitSettings,
+    effects: Sequence[Effect],
+) -> FitResult:
+    """Fit again with the law that the effects compose, as they see the pixels after the plain fit."""
+    usable = (plain.fit_status & int(_UNUSABLE)) == 0
+    maps = pixel_maps([getattr(plain, name) for name in PARAMETERS], usable)
+    return fit_grown(counts, origin, plain, marginal_model(effects, maps), settings, plain=plain)
 
 
 def run(context: StageContext) -> None:
@@ -63,7 +93,9 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: the histograms are missing, or the store refuses.
     """
-    context.create_maps([v.path for v in variables_of("fit") if v.name != "fit_status"])
+    effects = context.config.model.effects
+    left_out = ("fit_status",) if effects else ("fit_status", *FREE_LOBES)
+    context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])
     context.create_maps(
         ["fit/fit_status"],
         flag_masks=[int(bit) for bit in MEANINGS],
@@ -71,25 +103,35 @@ def run(context: StageContext) -> None:
         flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
     )
     if not context.executor.shares_memory:
-        _compile(context.store.array("histogram/counts").dtype)
+        _compile(context.store.array("histogram/counts").dtype, effects)
     task = functools.partial(
-        _do_tile, store=context.store.path, settings=context.config.fit, adc_limits=context.adc_limits
+        _do_tile,
+        store=context.store.path,
+        settings=context.config.fit,
+        adc_limits=context.adc_limits,
+        effects=effects,
     )
     context.run_units(context.tiles(), task, needs="histogram")
 
 
-def _compile(dtype: np.dtype[Any]) -> None:
+def _compile(dtype: np.dtype[Any], effects: Sequence[Effect]) -> None:
     """Compile the kernels once, into the cache, before other processes do it all at the same time."""
-    fit_histograms(np.ones((1, 8), dtype), np.zeros(1, np.int32))
+    histogram = {name: np.zeros((1, 1), np.int32) for name in ("origin", "under", "over")}
+    fit_tile({"counts": np.ones((1, 1, 8), dtype), **histogram}, FitSettings(), None, effects)
 
 
 def _do_tile(
-    tile: Tile, *, store: Path, settings: FitSettings, adc_limits: tuple[int, int] | None
+    tile: Tile,
+    *,
+    store: Path,
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+    effects: Sequence[Effect],
 ) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels."""
     run_store = open_store(store)
     histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
-    arrays = fit_tile(histogram, settings, adc_limits)
+    arrays = fit_tile(histogram, settings, adc_limits, effects)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]
