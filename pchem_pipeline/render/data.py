@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS
+from pchem_pipeline.render.discrepancy_data import DiscrepancyData
 
 __all__ = ["FEW_CHANNELS", "MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
 
@@ -93,6 +94,7 @@ class ReportData:
         stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
             ``peak_memory_bytes``, ``units``, ``notes``.
         missing: part (see ``PARTS``) to the reason why it is absent.
+        discrepancy: what the model is missing, or None where nobody looked.
     """
 
     title: str
@@ -118,6 +120,7 @@ class ReportData:
     inputs: Sequence[Mapping[str, Any]] = ()
     stages: Sequence[Mapping[str, Any]] = ()
     missing: Mapping[str, str] = field(default_factory=dict)
+    discrepancy: DiscrepancyData | None = None
 
     @property
     def noun(self) -> str:

@@ -11,6 +11,7 @@ import jinja2
 
 from pchem_pipeline.render.captions import MAP_READING, SECTIONS
 from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
 from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.report_json import report_json
 from pchem_pipeline.render.settings import ReportSettings
@@ -43,11 +44,13 @@ class RenderedReport:
         html: the page.
         json: the numbers.
         figures: file name to content, for the folder ``figures``.
+        pages: further pages, by file name.
     """
 
     html: str
     json: str
     figures: dict[str, bytes] = field(default_factory=dict)
+    pages: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,10 @@ def render_report(data: ReportData, settings: ReportSettings | None = None) -> R
     figures: dict[str, bytes] = {}
     pictures = [_picture(exhibit, settings, figures) for exhibit in exhibits(data, settings)]
     tables = result_tables(data)
-    page = _template().render(
+    view: DiscrepancyView[_Picture] | None = None
+    if data.discrepancy is not None:
+        view = discrepancy_view(data.discrepancy, lambda exhibit: _picture(exhibit, settings, figures))
+    page = _template("report.html.j2").render(
         title=data.title,
         data=data,
         sentence=sentence(data),
@@ -93,18 +99,33 @@ def render_report(data: ReportData, settings: ReportSettings | None = None) -> R
         sections=_sections(data, settings, pictures, tables),
         tables=[table for table in tables if table.id not in _TABLE_PLACE],
         provenance=provenance_tables(data),
+        view=view,
+        how_to_discover=f"pchem discrepancy {data.run.get('store', 'RUN')}",
     )
-    return RenderedReport(page, report_json(data), figures)
+    pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
+    return RenderedReport(page, report_json(data), figures, pages)
 
 
-def _template() -> jinja2.Template:
+def _discrepancy_page(data: ReportData, view: DiscrepancyView[_Picture]) -> str:
+    about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
+    if data.n_frames:
+        about += f"{', ' if about else ''}{data.n_frames:,} frames"
+    return _template("discrepancy.html.j2").render(
+        title=data.title, about=about, view=view, flag_words=_FLAG_WORDS, flag_signs=_FLAG_SIGNS
+    )
+
+
+def _template(name: str) -> jinja2.Template:
     folder = importlib.resources.files("pchem_pipeline.render") / "templates"
-    text = (folder / "report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=jinja2.FunctionLoader(lambda each: (folder / each).read_text(encoding="utf-8")),
     )
     environment.filters["together"] = _together
-    return environment.from_string(text)
+    return environment.get_template(name)
 
 
 def _together(text: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from pchem_pipeline.model.fit_status import FitStatus
 from pchem_pipeline.model.maps import status_counts
 from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.findings import headline
 from pchem_pipeline.render.ranges import finite
 from pchem_pipeline.render.verdict import flags, pixel_counts, sentence, summaries
 from pchem_pipeline.render.wording import stored_unit
@@ -49,6 +50,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             "electron_numbers": _electron_numbers(data),
             "truth": _truth(data),
             "missing": dict(data.missing),
+            "discrepancy": _discrepancy(data),
             "run": dict(data.run),
             "inputs": list(data.inputs),
             "stages": list(data.stages),
@@ -134,6 +136,14 @@ def _truth(data: ReportData) -> dict[str, Any]:
             "pull_sd": float(pull.std()) if pull.size else None,
         }
     return found
+
+
+def _discrepancy(data: ReportData) -> dict[str, Any] | None:
+    """Return the verdict; its evidence is in ``discrepancy.json``."""
+    if data.discrepancy is None:
+        return None
+    found = data.discrepancy.found
+    return {"verdict": found.verdict, "sentence": headline(found), "effects": found.effects}
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pchem_pipeline.model.maps import MapSummary, summarise
 from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.findings import headline
 from pchem_pipeline.render.map_figures import status_counts
 from pchem_pipeline.render.ranges import finite
 from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol
@@ -153,6 +154,7 @@ def flags(data: ReportData) -> list[Flag]:
         *_cautions(data),
         *_goodness(data),
         *_agreement(data),
+        *_discrepancy(data),
         *_conditions(data),
     ]
     order = ("serious", "caution", "note", "good")
@@ -230,6 +232,15 @@ def _agreement(data: ReportData) -> list[Flag]:
         else:
             found.append(Flag("serious", f"{text}: the model does not explain the data."))
     return found
+
+
+def _discrepancy(data: ReportData) -> list[Flag]:
+    """Say what was found to be missing from the model."""
+    if data.discrepancy is None:
+        return []
+    found = data.discrepancy.found
+    levels: dict[str, Level] = {"consistent": "good", "ambiguous": "caution", "unexplained": "serious"}
+    return [Flag(levels.get(found.verdict, "note"), _as_sentence(headline(found)))]
 
 
 def _conditions(data: ReportData) -> list[Flag]:

@@ -15,9 +15,12 @@ from pchem_pipeline.model.components import COMPONENT_CASES
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS, describe
 from pchem_pipeline.render.captions import case_name
 from pchem_pipeline.render.data import PixelFit, ReportData
+from pchem_pipeline.render.discrepancy_exhibits import DISCREPANCY_NAMES
+from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE
 from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
+from pchem_pipeline.stages.discrepancy_result import discrepancy_state, read_discrepancy
 from pchem_pipeline.variables import PARAMETERS, variables_of
 
 if TYPE_CHECKING:
@@ -35,6 +38,7 @@ __all__ = [
     "VERSION",
     "WRITES",
     "choose_pixels",
+    "identity",
     "report_tile",
     "run",
 ]
@@ -108,6 +112,12 @@ def report_tile(data: ReportData, settings: ReportSettings) -> RenderedReport:
     return render_report(data, settings)
 
 
+def identity(context: StageContext) -> dict[str, str] | None:
+    """Return what the report depends on beside its upstream stages: a verdict, where there is one."""
+    state = discrepancy_state(context.store)
+    return None if state is None else {"discrepancy": state}
+
+
 def run(context: StageContext) -> None:
     """Write the report.
 
@@ -142,8 +152,12 @@ def _write(
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):
-        if old.name not in rendered.figures and old.stem in EXHIBIT_NAMES:
+        if old.name not in rendered.figures and old.stem in (*EXHIBIT_NAMES, *DISCREPANCY_NAMES):
             old.unlink(missing_ok=True)
+    for name, page in rendered.pages.items():
+        store.write_file(name, page.encode())
+    if not rendered.pages:
+        (path / DISCREPANCY_PAGE).unlink(missing_ok=True)
     store.write_file("report.json", rendered.json.encode())
     store.write_file("report.html", rendered.html.encode())
     return {"figures": len(rendered.figures), "html_bytes": len(rendered.html.encode())}
@@ -200,6 +214,7 @@ def gather(
         ],
         stages=list(stages),
         missing=_missing(maps, ensemble),
+        discrepancy=read_discrepancy(store),
     )
 
 

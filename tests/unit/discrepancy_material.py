@@ -1,0 +1,312 @@
+"""Synthetic discrepancy verdicts: evidence drawn by hand, and ``discrepancy.json`` of each verdict."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.effects.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
+from pchem_pipeline.render.discrepancy_data import DiscrepancyData
+from pchem_pipeline.stages.discrepancy_arrays import evidence_arrays
+
+VERDICTS = ("named", "ambiguous", "unexplained", "consistent")
+UNTESTABLE = {
+    "charge_lag": "Poisson electrons that are delayed by chance stay Poisson",
+    "charge_diffusion": "Poisson electrons that move by chance stay Poisson",
+    "spurious_charge": "electrons that come from elsewhere add to H and nothing else",
+}
+
+
+def evidence(shape: tuple[int, int] = (32, 40), n_frames: int = 1200, seed: int = 5) -> Evidence:
+    """Pure chance, with some structure: a drift, stripes, a comb of codes, a few odd pixels."""
+    rng = np.random.default_rng(seed)
+    ny, nx = shape
+    usable = rng.random(shape) > 0.01
+    maps = PixelMaps(
+        *(np.where(usable, m, np.nan) for m in (
+            rng.uniform(0.5, 4, shape), np.full(shape, 0.09), rng.normal(100, 2, shape),
+            rng.normal(3.4, 0.1, shape),
+        )),
+        usable=usable,
+    )  # fmt: skip
+    charge_std = np.sqrt(maps.quanta_exposure) * 0.97
+    readout_std = np.where(usable, 2.9, np.nan)
+    normal = {name: rng.standard_normal(shape).astype(np.float32) for name in SCORES}
+    goodness = rng.standard_normal(shape).astype(np.float32)
+    odd = rng.integers(0, (ny, nx), (12, 2))
+    for y, x in odd:
+        goodness[y, x] += rng.uniform(6, 30)
+        normal["He4"][y, x] += rng.uniform(10, 40)
+    for values in (*normal.values(), goodness):
+        values[~usable] = np.nan
+    code = np.arange(70, 190)
+    expected = 4e6 * np.exp(-0.5 * ((code - 118) / 16) ** 2) / 40
+    observed = rng.poisson(expected * (1 + 0.006 * (-1.0) ** code)).astype(float)
+    observed[code == 150] += 2500
+    return Evidence(
+        maps=maps,
+        n_frames=n_frames,
+        charge_std=charge_std,
+        readout_std=readout_std,
+        scores=normal,
+        goodness=goodness,
+        tail_low=rng.poisson(0.01, shape).astype(np.uint32),
+        tail_high=rng.poisson(0.01, shape).astype(np.uint32),
+        code=CodeResiduals(70, observed, expected, 72, 186),
+        time=time_series(shape, n_frames, charge_std, readout_std, usable, maps, rng),
+        z={name: float(rng.standard_normal() * 1.2) for name in STATISTICS},
+    )
+
+
+def time_series(
+    shape: tuple[int, int], n: int, charge_std: Any, readout_std: Any, usable: Any, maps: Any, rng: Any
+) -> TimeSeries:
+    ny, nx = shape
+    block = 100
+    kept = np.concatenate([np.arange(s, s + block) for s in range(0, 2 * n, 2 * block)])[:n]
+    starts = kept[::block]
+    h_sum, n_good = float(np.nansum(maps.quanta_exposure)), int(usable.sum())
+    sd_k = np.sqrt(np.nansum(charge_std**2)) / h_sum
+    sd_r = np.sqrt(np.nansum(readout_std**2)) / n_good
+    position = kept / kept[-1] - 0.5
+    row_sd = np.sqrt(np.nansum(readout_std**2, axis=1)) / usable.sum(axis=1)
+    column_sd = np.sqrt(np.nansum(readout_std**2, axis=0)) / usable.sum(axis=0)
+    row_k = np.sqrt(np.nansum(charge_std**2, axis=1)) / usable.sum(axis=1)
+    column_k = np.sqrt(np.nansum(charge_std**2, axis=0)) / usable.sum(axis=0)
+    pickup = 1.6 * np.sin(2 * np.pi * (0.17 * np.arange(ny)[None, :] + 0.031 * np.arange(n)[:, None]))
+    blocks = (starts.size, ny, nx)
+    return TimeSeries(
+        frames=kept,
+        n_run=2 * n,
+        block_frames=block,
+        block_start=starts,
+        frame_charge=rng.normal(0, sd_k, n) + 0.004 * position,
+        frame_readout=rng.normal(0, sd_r, n) + 0.12 * position,
+        frame_gain=rng.normal(0, 1e-3, n),
+        quadrant_charge=rng.normal(0, 2 * sd_k, (n, 4)),
+        quadrant_readout=rng.normal(0, 2 * sd_r, (n, 4)),
+        row_charge=(row_k * rng.standard_normal((n, ny))).astype(np.float32),
+        row_readout=(row_sd * (rng.standard_normal((n, ny)) + pickup)).astype(np.float32),
+        column_charge=(column_k * rng.standard_normal((n, nx))).astype(np.float32),
+        column_readout=(column_sd * rng.standard_normal((n, nx))).astype(np.float32),
+        block_charge=(charge_std / 10 * rng.standard_normal(blocks)).astype(np.float32),
+        block_readout=(readout_std / 10 * rng.standard_normal(blocks)).astype(np.float32),
+        lag_charge=(rng.standard_normal((3, ny, nx)) / np.sqrt(n)).astype(np.float32),
+        lag_readout=(rng.standard_normal((3, ny, nx)) / np.sqrt(n)).astype(np.float32),
+        lag_readout_charge=(rng.standard_normal(shape) / np.sqrt(n)).astype(np.float32),
+        lag_charge_readout=(rng.standard_normal(shape) / np.sqrt(n)).astype(np.float32),
+        n_pairs=n,
+        neighbours={f"{axis}.{pair}": 0.0 for axis in "xy" for pair in ("kk", "rr", "rk")},
+        neighbour_pairs={f"{axis}.{pair}": 1000 for axis in "xy" for pair in ("kk", "rr", "rk")},
+        repeated=np.empty(0, np.int64),
+        repeated_rows=0,
+        hits=np.empty((0, 4), np.int64),
+    )
+
+
+def _candidates(*scored: tuple[str, float, float, float]) -> list[dict[str, Any]]:
+    return [
+        {"effect": e, "score": s, "stderr": err, "probability": p, "parameters": {"amplitude_dn": 0.21}}
+        for e, s, err, p in scored
+    ]
+
+
+def _pulls(grown: bool) -> list[dict[str, Any]]:
+    befores = (84.0, -31.2, 22.5, 14.1, -9.8, 8.0, 6.1, -5.2, 4.9, 4.4, -4.3, 3.1)
+    afters = (1.1, -0.4, 2.2, -1.3, 0.2, 0.9, -1.7, 0.1, 1.2, -0.8, 2.6, 0.5)
+    names = [
+        "space.row.readout.variance",
+        "frame.readout.trend",
+        "code.alternating",
+        "frame.readout.slow",
+        "space.row.readout.lag1",
+        "shape.He4.cnt",
+        "code.top",
+        "shape.goodness.mean",
+        "space.x.rr",
+        "frame.readout.variance",
+        "shape.C2.mean",
+        "tail.low.count",
+    ]
+    return [
+        {"statistic": n, "sentence": STATISTICS[n].sentence, "before": b, "after": a if grown else None}
+        for n, b, a in zip(names, befores, afters, strict=True)
+    ]
+
+
+def step(effect: str | None, verdict: str, before: float, after: float) -> dict[str, Any]:
+    """One round of the workflow; gaps in micro-nats per sample."""
+    micro = 1e-6
+    return {
+        "effect": effect,
+        "verdict": verdict,
+        "candidates": _candidates(
+            (effect or "row_noise", 0.0, 0.0, 0.985),
+            ("periodic_pickup", -16.8, 3.3, 0.012),
+            ("interpixel_capacitance", -262.0, 9.0, 0.0),
+        ),
+        "parameters": {"row_noise_dn": {"value": 0.3512, "stderr": 0.0041, "unit": "DN"}},
+        "gap_before": before * micro,
+        "gap_after": after * micro,
+        "gap_floor": 0.66 * micro,
+        "gap_interval_after": [max(after - 0.5, 0.1) * micro, (after + 0.7) * micro],
+        "families": {
+            "before": {
+                "shape": 4 * micro,
+                "code": 12 * micro,
+                "tail": -0.1 * micro,
+                "time": 0.3 * micro,
+                "frame": 60 * micro,
+                "space": (before - 76) * micro,
+            },
+            "after": {
+                "shape": 0.2 * micro,
+                "code": 0.1 * micro,
+                "tail": -0.1 * micro,
+                "time": 0.2 * micro,
+                "frame": 0.7 * micro,
+                "space": 0.7 * micro,
+            },
+        },
+        "runner_up": {"effect": "periodic_pickup", "gap_after": 120 * micro},
+        "placebo": {"effect": "flicker_noise", "gap_after": before * 0.97 * micro},
+        "moved": {
+            "quanta_exposure": {"median": 0.0004, "in_stderr": 0.02, "unit": "e-"},
+            "conversion_gain": {"median": -2.1e-5, "in_stderr": -0.08, "unit": "e-/DN"},
+            "bias": {"median": 0.001, "in_stderr": 0.02, "unit": "DN"},
+            "read_noise_dn": {"median": -0.0182, "in_stderr": -0.64, "unit": "DN"},
+        },
+        "separate": {
+            "periodic_pickup": "a faster or slower row time moves the line of a pickup, not row noise"
+        },
+        "pulls": _pulls(grown=effect is not None),
+    }
+
+
+def result(verdict: str) -> dict[str, Any]:
+    """``discrepancy.json`` of a verdict."""
+    micro = 1e-6
+    steps = {
+        "named": [step("row_noise", "named", 477.0, 31.0), {**step("bias_drift", "named", 120.0, 1.8)}],
+        "ambiguous": [step(None, "ambiguous", 120.0, 120.0)],
+        "unexplained": [step("row_noise", "named", 477.0, 31.0), step(None, "unexplained", 31.0, 31.0)],
+        "consistent": [],
+    }[verdict]
+    effects = [s["effect"] for s in steps if s["effect"]]
+    after = steps[-1]["gap_after"] if steps else 0.2 * micro
+    before = steps[0]["gap_before"] if steps else 0.2 * micro
+    where = [
+        {
+            "statistic": "space.row.readout.variance",
+            "channel": "readout",
+            "direction": "+",
+            "z": 84.0,
+            "p": 0.0,
+            "sentence": STATISTICS["space.row.readout.variance"].sentence,
+            "pixels": [],
+            "dn": [],
+            "frames": [],
+        },
+        {
+            "statistic": "code.alternating",
+            "channel": "digital",
+            "direction": "+",
+            "z": 22.5,
+            "p": 1e-4,
+            "sentence": STATISTICS["code.alternating"].sentence,
+            "pixels": [],
+            "dn": [148, 152],
+            "frames": [],
+        },
+        {
+            "statistic": "shape.He4.cnt",
+            "channel": "readout",
+            "direction": "+",
+            "z": 8.0,
+            "p": 2e-3,
+            "sentence": STATISTICS["shape.He4.cnt"].sentence,
+            "pixels": [[3, 4], [10, 20], [30, 39]],
+            "dn": [],
+            "frames": [],
+        },
+        {
+            "statistic": "frame.readout.trend",
+            "channel": "readout",
+            "direction": "+",
+            "z": 31.2,
+            "p": 0.0,
+            "sentence": STATISTICS["frame.readout.trend"].sentence,
+            "pixels": [],
+            "dn": [],
+            "frames": [0, 1, 2],
+        },
+    ]
+    return {
+        "schema": 1,
+        "verdict": verdict,
+        "sentence": {
+            "named": "Row noise of 0.351 DN and a drift of the bias explain the disagreement.",
+            "ambiguous": "Something is missing: row noise or periodic pickup; these data cannot tell which.",
+            "unexplained": "Row noise is part of it; a comb of codes remains that no known effect explains.",
+            "consistent": "",
+        }[verdict],
+        "effects": effects,
+        "model_effects": [{"tag": tag} for tag in effects],
+        "steps": steps,
+        "gap": {
+            "unit": "nats/sample",
+            "before": before,
+            "after": after,
+            "floor": 0.66 * micro,
+            "closed_fraction": 1 - after / before if steps else None,
+            "interval_after": [0.5 * after, 1.6 * after],
+        },
+        "where": where if verdict != "consistent" else [],
+        "untestable": list(UNTESTABLE),
+        "untestable_reasons": UNTESTABLE,
+        "unexplained": [
+            {"statistic": "code.alternating", "z": 22.5, "sentence": STATISTICS["code.alternating"].sentence}
+        ]
+        if verdict == "unexplained"
+        else [],
+        "examined": {
+            "frames": 4000,
+            "rows": [0, 64],
+            "columns": [0, 64],
+            "train": 1800,
+            "test": 1800,
+            "final": 400,
+        },
+        "left_out": {"odd_plugin": "ValueError: boom"} if verdict == "named" else {},
+        "p_global": {
+            "before": 1e-4 if verdict != "consistent" else 0.41,
+            "after": 0.37 if verdict == "named" else None,
+        },
+        "replicates": 100,
+        "versions": {"statistics": "1", "numpy": "2.1"},
+    }
+
+
+def discrepancy_data(verdict: str = "named", **changes: Any) -> DiscrepancyData:
+    """What the page is drawn from."""
+    seen = evidence()
+    after = {name: float(np.tanh(z)) for name, z in seen.z.items()}
+    arrays = evidence_arrays(seen, after=after if verdict in ("named", "unexplained") else None)
+    if verdict == "named":
+        position = arrays["frame_number"] / arrays["frame_number"][-1] - 0.5
+        arrays["frame_readout_model"] = 0.12 * position
+        arrays["frame_charge_model"] = 0.004 * position
+    data = DiscrepancyData(
+        result={**result(verdict), **changes},
+        arrays=arrays,
+        statistics={name: (s.channel, s.sentence) for name, s in STATISTICS.items()},
+        titles={
+            "row_noise": "Row noise",
+            "periodic_pickup": "Periodic pickup (EMI)",
+            "bias_drift": "Bias drift",
+        },
+        sources={"row_noise": "Janesick 2007"},
+    )
+    return data

@@ -1,0 +1,82 @@
+"""The verdict in the terminal: short, plain, and never an error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from discrepancy_material import VERDICTS, result
+
+from pchem_pipeline.stages.discrepancy_words import verdict_text
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_the_verdict_comes_first_and_lines_are_short(verdict: str) -> None:
+    lines = verdict_text(result(verdict)).splitlines()
+    assert lines[0].startswith(f"{verdict.upper()}: ")
+    assert len(lines[0]) > len(verdict) + 20
+    assert all(0 < len(line) <= 100 for line in lines)
+    assert all(line.isascii() for line in lines)
+    assert len(lines) <= 25
+    assert lines[-1].startswith("not testable with such frames: charge_lag, charge_diffusion")
+
+
+def test_what_a_named_effect_is_told_with() -> None:
+    text = " ".join(verdict_text(result("named")).split())
+    assert "where: row means of the readout residuals scatter from frame to frame (+84.0 sd)" in text
+    assert "148 to 152 DN" in text
+    assert "and 1 more" in text
+    assert "step 2" in text
+    assert "row_noise_dn = 0.3512 +- 0.0041 DN" in text
+    assert "gap: 477 -> 1.8 micro-nats per sample (floor 0.66, 99.6 % closed)" in text
+    assert "runner-up periodic_pickup leaves 120" in text
+    assert "placebo flicker_noise leaves 116" in text
+    assert "left out: odd_plugin: ValueError: boom" in text
+    lines = verdict_text(result("named")).splitlines()
+    assert [line.split()[0] for line in lines if line.endswith(" <-")] == ["row_noise", "bias_drift"]
+
+
+def test_an_ambiguous_verdict_says_what_would_decide() -> None:
+    text = verdict_text(result("ambiguous"))
+    assert "to tell periodic_pickup apart: a faster or slower row time" in text
+    assert "<-" not in text
+
+
+def test_an_unexplained_verdict_says_what_is_left() -> None:
+    assert "left unexplained: code.alternating (+22.5 sd)" in verdict_text(result("unexplained"))
+    assert "left unexplained" not in verdict_text(result("named"))
+
+
+def test_a_consistent_verdict_has_no_candidates() -> None:
+    text = verdict_text(result("consistent"))
+    assert "CONSISTENT: The data agree with the model within chance." in text
+    assert "score" not in text
+    assert "->" not in text
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {},
+        {"verdict": None, "steps": None, "gap": [], "where": {"a": 1}},
+        {"verdict": "named", "steps": [{}, None, 3], "gap": {"before": "x"}, "effects": ["a"]},
+        {
+            "verdict": "named",
+            "steps": [{"candidates": [{}], "parameters": {"a": 3.5, "b": None}, "effect": "e"}],
+        },
+        {"verdict": "unheard of", "unexplained": [{}], "left_out": {"a\nb": "x" * 300}},
+    ],
+)
+def test_missing_and_odd_keys_are_no_error(odd: dict[str, Any]) -> None:
+    text = verdict_text(odd)
+    assert text
+    assert all(len(line) <= 100 for line in text.splitlines())
+
+
+def test_every_key_may_be_missing() -> None:
+    whole = result("named")
+    for key in whole:
+        assert verdict_text({k: v for k, v in whole.items() if k != key})
+    for key in whole["steps"][0]:
+        steps = [{k: v for k, v in step.items() if k != key} for step in whole["steps"]]
+        assert verdict_text({**whole, "steps": steps})
