@@ -26,9 +26,10 @@ from pchem_pipeline.stages.ensemble_result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble_tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
 from pchem_pipeline.stages.frame_source import open_source
 from pchem_pipeline.stages.tile_bands import tile_bands
-from pchem_pipeline.variables import PARAMETERS
+from pchem_pipeline.variables import FREE_LOBES, PARAMETERS
 
 if TYPE_CHECKING:
+    from pchem_pipeline.effects.base import Effect
     from pchem_pipeline.stages.bands import Band
     from pchem_pipeline.stages.frame_source import FrameSource
     from pchem_pipeline.store.tiles import Tile
@@ -38,7 +39,7 @@ __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "ensemb
 NAME = "ensemble"
 VERSION = 1
 UPSTREAM: tuple[str, ...] = ("histogram", "fit")
-SETTINGS: tuple[str, ...] = ("ensemble", "run.tile")
+SETTINGS: tuple[str, ...] = ("ensemble", "model", "run.tile")
 READS: tuple[str, ...] = ("frames", "histogram", "fit", "truth")
 WRITES: tuple[str, ...] = ("ensemble", "ensemble_tiles")
 
@@ -59,6 +60,7 @@ class _Job:
         frames: the chosen frames (first, end), or None for all of the histogram.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
+        effects: of the run's model.
     """
 
     store: Path
@@ -67,6 +69,7 @@ class _Job:
     frames: tuple[int, int] | None
     source: FrameSource | None
     truth: tuple[int, int, int] | None
+    effects: tuple[Effect, ...]
 
 
 def run(context: StageContext) -> None:
@@ -101,6 +104,7 @@ def run(context: StageContext) -> None:
         None if everything else frames,
         source,
         truth,
+        context.config.model.effects,
     )
     bins = context.store.array("histogram/counts").shape[2]
     rows = max(1, _BAND_BYTES // (context.sensor.nx * bins * 4))
@@ -160,7 +164,8 @@ def _axes(context: StageContext, tiles: list[Tile]) -> EnsembleAxes | None:
     nuced = nuced_axis(pixels, dn, width=settings.nuced_bin_width, steps=settings.nuced_bin_steps)
     largest = min(float(pixels.quanta_exposure.max()), 60_000.0)
     mass = electron_pmf(pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
-    return EnsembleAxes(dn, nuced, int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2)
+    n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
+    return EnsembleAxes(dn, nuced, n_k, bool(context.config.model.effects))
 
 
 def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
@@ -186,6 +191,9 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     counts = store.read("histogram/counts", (*rows, slice(None)))
     outside = store.read("histogram/under", rows) + store.read("histogram/over", rows)
     maps = tuple(store.read(f"fit/{name}", rows) for name in PARAMETERS)
+    lobes = None
+    if job.effects:
+        lobes = tuple(store.read(f"fit/{name}", rows) for name in FREE_LOBES)
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
@@ -200,6 +208,8 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             PixelHistograms(chosen[part].reshape(n, -1), chosen_outside[part].ravel()),
             PixelHistograms(counts[part].reshape(n, -1), outside[part].ravel()),
             job.axes,
+            job.effects,
+            None if lobes is None else (lobes[0][part].ravel(), lobes[1][part].ravel()),
         )
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.components import COMPONENT_CASES, moment_errors, predicted_moments
+from pchem_pipeline.effects.compose import model_words
+from pchem_pipeline.model.components import (
+    COMPONENT_CASES,
+    EnsembleMoments,
+    moment_errors,
+    predicted_moments,
+)
 from pchem_pipeline.model.pixels import PixelParameters
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.stages.ensemble_curves import components, curves, electron_numbers, error_rates
@@ -69,6 +76,8 @@ def write_result(
         "tiles": len(tiles),
         "tiles_missing": context.n_keys - len(tiles),
     }
+    if axes.grown:
+        facts["model"] = model_words(context.config.model.effects)
     for name, values in arrays.items():
         context.store.write_array(f"ensemble/{name}", values)
     per_pixel: int | NDArray[Any] = samples[0]
@@ -135,6 +144,9 @@ def moment_rows(
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data.
 
+    Under a grown model mean and variance are those of its masses, and what its effects add to the variance
+    that the parameters explain is a term of its own.
+
     Args:
         totals: the sums.
         pixels: the pixels.
@@ -143,7 +155,8 @@ def moment_rows(
     Returns:
         Rows ``{name, quantity, unit, predicted, observed, stderr}``; terms have nothing to be observed.
     """
-    expected, errors = predicted_moments(pixels), moment_errors(pixels, per_pixel)
+    plain_ones, errors = predicted_moments(pixels), moment_errors(pixels, per_pixel)
+    expected = _grown_moments(totals, plain_ones) if totals.axes.grown else plain_ones
     share, dn = totals.mean("share"), totals.axes.dn.dn
     mean = float(share @ dn / share.sum())
     variance = float(share @ (dn - mean) ** 2 / share.sum())
@@ -182,8 +195,28 @@ def moment_rows(
             errors.nuced_variance,
         ),
     ]
+    if totals.axes.grown:
+        added = expected.variance - plain_ones.variance
+        rows.insert(7, ("effects", "of which the effects of the model", "DN2", added, None, None))
     names = ("name", "quantity", "unit", "predicted", "observed", "stderr")
     return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _grown_moments(totals: EnsembleTotals, plain_ones: EnsembleMoments) -> EnsembleMoments:
+    """Return the moments with those replaced that the effects of the model change."""
+    mass, dn = totals.mean("pcd"), totals.axes.dn.dn
+    whole = mass.sum()
+    mean = float(mass @ dn / whole)
+    nuced_mean, nuced_square = (
+        float(totals.mean(f"nuced_predicted_{name}")[0] / whole) for name in ("sum", "sum_square")
+    )
+    return replace(
+        plain_ones,
+        mean=mean,
+        variance=float(mass @ (dn - mean) ** 2 / whole),
+        nuced_mean=nuced_mean,
+        nuced_variance=nuced_square - nuced_mean**2,
+    )
 
 
 def _missing(context: StageContext, totals: EnsembleTotals, frames: tuple[int, int] | None) -> dict[str, str]:

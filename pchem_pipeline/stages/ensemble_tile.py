@@ -6,6 +6,7 @@ counts the same: its samples are divided by their number before they are added.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,8 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
 from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, ensemble_sums, tally
+from pchem_pipeline.model.grown_ensemble import grown_sums
 from pchem_pipeline.model.pixels import FloatArray, PixelParameters
 
 __all__ = ["ERROR_SIZES", "EnsembleAxes", "EnsembleTotals", "PixelHistograms", "ensemble_tile"]
@@ -33,6 +37,8 @@ _INTEGERS = (
     "signed_error",
 )
 _FLOATS = ("nuced_sum", "nuced_sum_square", "error", "error_variance")
+#: The same two, predicted; without effects they follow from the parameters.
+_GROWN_FLOATS = ("nuced_predicted_sum", "nuced_predicted_sum_square")
 
 
 @dataclass(frozen=True)
@@ -65,11 +71,13 @@ class EnsembleAxes:
         dn: DN of the raw ensemble.
         nuced: bins of the NUCed ensemble.
         n_k: number of electron numbers.
+        grown: whether the model of the pixels holds effects.
     """
 
     dn: DnAxis
     nuced: NucedAxis
     n_k: int
+    grown: bool = False
 
     @cached_property
     def integers(self) -> dict[str, slice]:
@@ -88,7 +96,7 @@ class EnsembleAxes:
             lengths[name] = self.nuced.size
         for name in ("electron_share", "electron_expected"):
             lengths[name] = self.n_k
-        return _places(lengths | dict.fromkeys(_FLOATS, 1))
+        return _places(lengths | dict.fromkeys((*_FLOATS, *(_GROWN_FLOATS if self.grown else ())), 1))
 
 
 def _places(lengths: dict[str, int]) -> dict[str, slice]:
@@ -135,6 +143,8 @@ def ensemble_tile(
     chosen: PixelHistograms,
     everything: PixelHistograms,
     axes: EnsembleAxes,
+    effects: Sequence[Effect] = (),
+    lobes: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return what some pixels add to the ensemble.
 
@@ -144,6 +154,8 @@ def ensemble_tile(
         chosen: histograms of the chosen frames.
         everything: histograms of all frames, on the same bins.
         axes: axes of the ensemble.
+        effects: of the run's model, the axes being ``grown`` where there are any.
+        lobes: amplitude (e-) and weight of the pixels' free lobes, shape (n,); None: none.
 
     Returns:
         A row of integers and a row of floats, in the places that ``axes`` gives.
@@ -162,7 +174,34 @@ def ensemble_tile(
         sets = (chosen.of(group), int(n)), (everything.of(group), int(n_all))
         if n > 0:
             _add_group(part, origin[group], *sets, axes, integers, floats)
+            if effects:
+                own = None if lobes is None else (lobes[0][mask][group], lobes[1][mask][group])
+                _add_grown(part, own, int(n), axes, effects, floats)
     return integers, floats
+
+
+def _add_grown(
+    pixels: PixelParameters,
+    lobes: tuple[FloatArray, FloatArray] | None,
+    n: int,
+    axes: EnsembleAxes,
+    effects: Sequence[Effect],
+    floats: FloatArray,
+) -> None:
+    """Add what the grown law predicts of pixels that have the same number of samples."""
+    maps = pixel_maps(pixels.columns(), np.ones(len(pixels), bool))
+    grown = grown_sums(pixels, lobes, marginal_model(effects, maps), axes.dn, axes.nuced)
+    sums = grown.sums
+    parts: dict[str, Any] = {
+        "pcd": sums.raw,
+        "pcd_variance": (sums.raw - sums.raw_square) / n,
+        "nuced": sums.nuced,
+        "nuced_variance": (sums.nuced - sums.nuced_square) / n,
+        "nuced_predicted_sum": grown.nuced_sum,
+        "nuced_predicted_sum_square": grown.nuced_sum_square,
+    }
+    for name, part in parts.items():
+        floats[axes.floats[name]] += part
 
 
 def _add_group(
@@ -176,7 +215,6 @@ def _add_group(
 ) -> None:
     """Add pixels that have the same number of samples."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
-    sums = ensemble_sums(pixels, axes.dn, axes.nuced)
     data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
     data_all = tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
     numbers, beyond = electron_counts(histograms.counts, origin, pixels, axes.n_k)
@@ -193,12 +231,8 @@ def _add_group(
         "electrons_beyond": beyond + outside,
     }
     parts: dict[str, Any] = {
-        "pcd": sums.raw,
-        "pcd_variance": (sums.raw - sums.raw_square) / n,
         "share": data.raw / n,
         "share_all": data_all.raw / n_all,
-        "nuced": sums.nuced,
-        "nuced_variance": (sums.nuced - sums.nuced_square) / n,
         "nuced_share": data.nuced / n,
         "electron_share": numbers / n,
         "electron_expected": cells.estimated,
@@ -207,6 +241,14 @@ def _add_group(
         "error": cells.error.sum(),
         "error_variance": np.sum(cells.error * (1.0 - cells.error)),
     }
+    if not axes.grown:
+        sums = ensemble_sums(pixels, axes.dn, axes.nuced)
+        parts |= {
+            "pcd": sums.raw,
+            "pcd_variance": (sums.raw - sums.raw_square) / n,
+            "nuced": sums.nuced,
+            "nuced_variance": (sums.nuced - sums.nuced_square) / n,
+        }
     for name, tallied in tallies.items():
         integers[axes.integers[name]] += tallied
     for name, part in parts.items():
