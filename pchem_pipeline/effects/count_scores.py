@@ -25,12 +25,16 @@ FloatArray = NDArray[np.float64]
 _EXPOSURES = np.geomspace(0.02, 60.0, 25)
 _NOISES = np.geomspace(0.08, 1.6, 14)
 _POINTS_PER_SIGMA = 4
+# standard deviations from what is expected beyond which a score is cut, and rounds of it
+_CUT = 4.0
+_ROUNDS = 4
 
 
 def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
     """Return c and its standard error for ``Var K = H + c H^(2 + power)``, from the scores of C2.
 
-    Every pixel gives ``score = c H^power sqrt(N I) + noise of variance 1``; this is their least squares.
+    Every pixel gives ``score = c H^power sqrt(N I) + noise of variance 1``; this is their least squares, with
+    pixels that are far off (another effect's) cut back.
 
     Args:
         evidence: what a split of the frames shows.
@@ -46,7 +50,12 @@ def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
     weight = float(slope @ slope)
     if not weight > 0:
         return 0.0, np.inf
-    return float(slope @ score[good]) / weight, weight**-0.5
+    seen = np.asarray(score[good], np.float64)
+    excess = float(np.median(seen) / np.median(slope))
+    for _ in range(_ROUNDS):
+        expected = excess * slope
+        excess = float(slope @ (expected + np.clip(seen - expected, -_CUT, _CUT))) / weight
+    return excess, weight**-0.5
 
 
 def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:

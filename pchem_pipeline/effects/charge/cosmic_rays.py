@@ -2,7 +2,8 @@
 
 A relativistic particle frees about 80 electrons per micrometre of silicon (Groom 2002, "Cosmic rays and
 other nonsense in astronomical CCD imagers"); muons at sea level come at one to two per square centimetre and
-minute. The tracks are independent, Poisson many per frame; what a track leaves in a pixel is Poisson about its share.
+minute. The tracks are independent, Poisson many per frame; what a track leaves in a pixel is Poisson about
+its share.
 """
 
 from __future__ import annotations

@@ -168,23 +168,25 @@ class _Telegraph(NamedTuple):
 
 
 def _telegraph(evidence: Evidence, blocks: BlockCharge, found: NDArray[np.bool_]) -> _Telegraph:
-    """Fit ``S exp(-lag / tau)`` to the autocovariances, and its average to the blocks' excess variance."""
+    """Fit ``S exp(-lag / tau)`` to the autocovariances and to the variogram of the block means."""
     assert evidence.time is not None
     single = blocks.variance[found]
     lags = np.asarray(evidence.time.lag_charge, np.float64)[:, blocks.y[found], blocks.x[found]]
-    length, n_blocks = float(np.median(blocks.length)), blocks.length.size
-    whole = np.sum(blocks.length[:, None] * blocks.deviation[:, found] ** 2, axis=0) / (n_blocks - 1)
-    seen = np.append((lags * single).mean(axis=1), ((whole - single) / length).mean())
-    errors = np.append(
-        np.full(lags.shape[0], evidence.time.n_pairs**-0.5), np.sqrt(2.0 / (n_blocks - 1)) / length
-    ) * np.sqrt(np.mean(single**2))
-    # what blinks is not Poisson: leave room for the spread of the walk itself
-    errors = np.hypot(errors, 0.1 * np.abs(seen))
-    tau = np.geomspace(0.5, 20.0 * float(blocks.start[-1] + length), 120)[:, None]
-    shape = np.hstack([np.exp(-np.arange(1.0, lags.shape[0] + 1) / tau), _averaged(length / tau)])
-    run = float(blocks.start[-1] + length - blocks.start[0])
-    # the mean over the run is taken out
-    shape = np.maximum(shape - _averaged(run / tau), 1e-12)
+    length = float(np.median(blocks.length))
+    run = float(blocks.start[-1] + blocks.length[-1] - blocks.start[0])
+    distance, variogram = _variogram(blocks, found)
+    seen = np.append((lags * single).mean(axis=1), variogram - float(single.mean()) / length)
+    noise = np.append(
+        np.full(lags.shape[0], evidence.time.n_pairs**-0.5),
+        np.full(distance.size, blocks.length.size**-0.5 / length),
+    ) * np.sqrt(np.mean(single**2) / single.size)
+    # few jumps make the walk itself uncertain
+    errors = np.hypot(noise, 0.1 * np.abs(seen).max())
+    tau = np.geomspace(0.5, run, 120)[:, None]
+    # the mean over the run is taken out of the autocovariances, and cancels in a variogram
+    short = np.exp(-np.arange(1.0, lags.shape[0] + 1) / tau) - _averaged(run / tau)
+    apart = np.exp(-distance / tau) * _averaged_apart(length / tau)
+    shape = np.maximum(np.hstack([short, _averaged(length / tau) - apart]), 1e-12)
     weight = errors**-2.0
     variance = (shape * weight) @ seen / ((shape**2) @ weight)
     misfit = ((seen - variance[:, None] * shape) ** 2) @ weight
@@ -192,6 +194,29 @@ def _telegraph(evidence: Evidence, blocks: BlockCharge, found: NDArray[np.bool_]
     return _Telegraph(float(variance[best]), float(tau[best, 0]))
 
 
+def _variogram(
+    blocks: BlockCharge, found: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances in time, frames, and half the mean squared difference of block means so far apart."""
+    deviation = blocks.deviation[:, found]
+    products = deviation @ deviation.T / deviation.shape[1]
+    power = np.diag(products)
+    first, second = np.triu_indices(power.size, 1)
+    half = 0.5 * (power[first] + power[second]) - products[first, second]
+    apart = blocks.start[second] - blocks.start[first]
+    group = np.floor(2.0 * np.log2(apart / apart.min())).astype(np.int64)
+    held = np.bincount(group)
+    kept = held > 0
+    distance = np.bincount(group, apart)[kept] / held[kept]
+    return distance, np.bincount(group, half)[kept] / held[kept]
+
+
 def _averaged(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the variance of the mean over x time constants of an exponential memory of variance 1."""
     return np.where(x > 1e-4, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-4) ** 2, 1.0)
+
+
+def _averaged_apart(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance of two such means over its value for points in their centres."""
+    x = np.minimum(x, 50.0)
+    return np.where(x > 1e-3, 2.0 * (np.cosh(x) - 1.0) / np.maximum(x, 1e-3) ** 2, 1.0)

@@ -28,10 +28,12 @@ __all__ = ["ExposureDrift"]
 
 _T = TypeVar("_T", bound="ExposureDrift")
 
-_NODES = 9
+# nodes of a free path, and the chi-square that each must explain
+_NODES = (5, 9, 17, 33)
+_PRICE_OF_NODE = 2.5
 _SETTLING = (0.05, 0.1, 0.2, 0.4)
-# chi-square that chance explains, seldom more, with the freedom of a line, a settling curve, a path
-_FREEDOM = (0.0, 3.0, 20.0)
+# chi-square that the choice of the time constant explains by chance
+_PRICE_OF_SETTLING = 3.0
 
 
 @register_effect
@@ -133,12 +135,10 @@ class ExposureDrift(Effect):
         # what flickers from frame to frame is noise to a drift
         noise = max(course.variance, 0.5 * float(np.mean(np.diff(course.deviation) ** 2)))
         settling = [_fit(cls(drift=1.0, settling_fraction=s), course, position, noise) for s in _SETTLING]
-        found = [
-            _fit(cls(drift=1.0), course, position, noise),
-            max(settling, key=lambda pair: pair[0]),
-            _fit_path(cls, course, position, noise),
-        ]
-        net = [(chi2 - free, effect) for (chi2, effect), free in zip(found, _FREEDOM, strict=True)]
+        line = _fit(cls(drift=1.0), course, position, noise)
+        curve = max(settling, key=lambda pair: pair[0])
+        path = _fit_path(cls, course, position, noise)
+        net = [line, (curve[0] - _PRICE_OF_SETTLING, curve[1]), path]
         best = max(chi2 for chi2, _ in net)
         likely = [pair for pair in net if pair[0] > max(9.0, best - 25.0)]
         return [effect for _, effect in sorted(likely, key=lambda pair: -pair[0])]
@@ -167,16 +167,18 @@ def _fit(unit: _T, course: ExposureCourse, position: NDArray[np.float64], noise:
 def _fit_path(
     cls: type[_T], course: ExposureCourse, position: NDArray[np.float64], noise: float
 ) -> tuple[float, _T]:
-    """Return the same for a broken line with free nodes."""
-    at = np.linspace(0.0, 1.0, _NODES)
-    hats = np.stack([np.interp(position, at, row) for row in np.eye(_NODES)], axis=1)
-    # a little stiffness, so that nodes without frames follow their neighbours
-    stiff = 1e-3 * position.size / _NODES * np.diff(np.eye(_NODES), 2, axis=0)
+    """Return the same for a broken line with free nodes, as many as pay; the chi-square less their price."""
     deviation = course.deviation - course.deviation.mean()
-    nodes = np.linalg.solve(hats.T @ hats + stiff.T @ stiff, hats.T @ deviation)
-    fitted = hats @ nodes
-    chi2 = float(deviation @ deviation - np.sum((deviation - fitted) ** 2)) / noise
-    spread = float(np.ptp(nodes))
-    if not spread > 0:
-        return 0.0, cls(drift=0.0)
-    return chi2, cls(drift=min(spread, 2.0), path=tuple(float(round(v / spread, 4)) for v in nodes))
+    best = (0.0, cls(drift=0.0))
+    for n in _NODES:
+        hats = np.stack([np.interp(position, np.linspace(0.0, 1.0, n), row) for row in np.eye(n)], axis=1)
+        # a little stiffness, so that nodes without frames follow their neighbours
+        stiff = 1e-3 * position.size / n * np.diff(np.eye(n), 2, axis=0)
+        nodes = np.linalg.solve(hats.T @ hats + stiff.T @ stiff, hats.T @ deviation)
+        left = deviation - hats @ nodes
+        net = float(deviation @ deviation - left @ left) / noise - _PRICE_OF_NODE * (n - 1)
+        spread = float(np.ptp(nodes))
+        if net > best[0] and spread > 0:
+            path = tuple(float(round(v / spread, 4)) for v in nodes)
+            best = (net, cls(drift=min(spread, 2.0), path=path))
+    return best

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = ["ExposureFlicker"]
 
+# cycles in the run below which a change is a drift
+_SLOWEST = 20
+# frequencies on either side of a line that say what is there without it
+_AROUND = 100
+
 _T = TypeVar("_T", bound="ExposureFlicker")
 
 
@@ -157,23 +162,26 @@ def _random(cls: type[_T], course: ExposureCourse) -> list[_T]:
     rho = 1.0 - fast / whole if whole > 3.0 * whole_error else 0.0
     if 0.0 < rho < 0.98 and whole - fast > 3.0 * np.hypot(fast_error, whole_error):
         memory = float(-1.0 / np.log(rho))
-        found.insert(0, cls(rms=min(float(np.sqrt(whole)), 1.0), correlation_frames=memory))
+        if memory < n / _SLOWEST:
+            found.insert(0, cls(rms=min(float(np.sqrt(whole)), 1.0), correlation_frames=memory))
     return found
 
 
 def _sine(cls: type[_T], course: ExposureCourse) -> list[_T]:
     """Return a sine at the highest line of the spectrum that stands out of shot noise and of the rest."""
     first, n = int(course.frames[0]), int(course.frames[-1] - course.frames[0]) + 1
+    place = course.frames.astype(np.int64) - first
     series = np.zeros(n)
-    series[course.frames.astype(np.int64) - first] = course.deviation - course.deviation.mean()
+    series[place] = course.deviation - _slow(place / n, course.deviation)
     # padded to twice the length, so that a line between two frequencies keeps most of its height
     spectrum = np.fft.rfft(series, 2 * n)
     power = np.abs(spectrum) ** 2 / course.deviation.size
-    # slow changes are a drift
-    power[: 2 * 20] = 0.0
+    power[: 2 * _SLOWEST] = 0.0
     peak = int(np.argmax(power))
-    floor = max(course.variance, float(np.median(power)) / np.log(2.0))
-    if power[peak] < 16.0 * floor or peak == 0:
+    # the median of exponentially distributed powers is ln 2 of their mean; a memory raises it nearby
+    around = power[max(peak - _AROUND, 0) : peak + _AROUND]
+    floor = max(course.variance, float(np.median(around)) / np.log(2.0))
+    if power[peak] < 16.0 * floor:
         return []
     frequency = _refined(series, peak / (2 * n))
     phase = np.exp(-2j * np.pi * frequency * np.arange(n))
@@ -184,6 +192,15 @@ def _sine(cls: type[_T], course: ExposureCourse) -> list[_T]:
     if not 0 < frequency < 0.999 or rms > 0.7:
         return []
     return [cls(rms=float(rms), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
+
+
+def _slow(position: NDArray[np.float64], deviation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the least squares broken line of ``_SLOWEST`` pieces: the gaps between blocks would alias it."""
+    hats = np.stack(
+        [np.interp(position, np.linspace(0, 1, _SLOWEST + 1), h) for h in np.eye(_SLOWEST + 1)], 1
+    )
+    slow: NDArray[np.float64] = hats @ np.linalg.lstsq(hats, deviation, rcond=1e-9)[0]
+    return slow
 
 
 def _refined(series: NDArray[np.float64], frequency: float) -> float:

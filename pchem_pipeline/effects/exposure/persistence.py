@@ -2,21 +2,21 @@
 
 Traps that a bright exposure has filled empty with their own time constants, and the exposure of frame t
 becomes ``H + A_p exp(-t / tau)`` with the image A of before (Smith et al. 2008, "A theory for image
-persistence in HgCdTe photodiodes"). Its map is that of the earlier image and not of H: a spot here, or any image on a
-coarse grid.
+persistence in HgCdTe photodiodes"). Its map is that of the earlier image and not of H: a spot here, or any
+image on a coarse grid.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.charge_sums import BlockCharge, block_charge
+from pchem_pipeline.effects.charge_sums import block_charge
+from pchem_pipeline.effects.fading_images import FadingCells, fading_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,9 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Persistence"]
 
-_T = TypeVar("_T", bound="Persistence")
-
-_GRID = 8
+# rows and columns of the grids tried for the image
+_GRIDS = (8, 16, 32)
 # time constants tried, in lengths of the run
 _DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
 
@@ -59,6 +58,12 @@ class Persistence(Effect):
     }
     peak_e: float = Field(ge=0, description="largest additional exposure in the first frame, e- per frame")
     decay_frames: float = Field(gt=0, description="time constant of the fading, frames")
+    slow_decay_frames: float | None = Field(
+        default=None, gt=0, description="time constant of a second, slower part, frames; null: none"
+    )
+    slow_share: float = Field(
+        default=0.5, ge=0, le=1, description="share of the slower part in the first frame, no unit"
+    )
     centre_y: float = Field(
         default=0.5, ge=0, le=1, description="row of the spot's centre over the number of rows, no unit"
     )
@@ -105,7 +110,12 @@ class Persistence(Effect):
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
         if self.peak_e == 0:
             return values.copy()
-        left = self.peak_e * np.exp(-np.maximum(context.frames, 0) / self.decay_frames)
+        # frames before the run are simulated only as memory of the first: as exposed as that one
+        t = np.maximum(context.frames, 0)
+        left = np.exp(-t / self.decay_frames)
+        if self.slow_decay_frames is not None:
+            left = (1.0 - self.slow_share) * left + self.slow_share * np.exp(-t / self.slow_decay_frames)
+        left = self.peak_e * left
         result: NDArray[Any] = values + left[:, None, None] * self.pattern(context.rows, context.shape)
         return result
 
@@ -125,72 +135,34 @@ class Persistence(Effect):
         if blocks is None or evidence.time is None:
             return ()
         exposure = evidence.maps.quanta_exposure
-        tried = [_Cells.of(blocks, exposure, decay * evidence.time.n_run) for decay in _DECAYS]
+        tried = [
+            FadingCells.of(blocks, exposure, decay * evidence.time.n_run, _GRIDS[0]) for decay in _DECAYS
+        ]
         best = max(tried, key=lambda cells: cells.score)
         if best.score < 4.0:
             return ()
-        amplitude = best.above_background()
-        found: list[Self] = [] if amplitude.max() <= 0 else [_spot(cls, best, exposure.shape)]
-        bright = np.where(amplitude > 2.0 * best.noise, amplitude, 0.0)
-        if bright.any():
+        finer = [best, *(FadingCells.of(blocks, exposure, best.decay, grid) for grid in _GRIDS[1:])]
+        image = max(finer, key=lambda cells: cells.worth())
+        fading = fading_of(blocks, best, evidence.time.n_run)
+        fields: dict[str, Any] = {
+            "decay_frames": fading.decay,
+            "slow_decay_frames": fading.slow_decay,
+            "slow_share": fading.slow_share,
+        }
+        found: list[Self] = []
+        if image.worth() > 0:
+            bright = image.bright()
             peak = float(bright.max())
-            image = tuple(tuple(float(round(v / peak, 3)) for v in row) for row in bright)
-            found.append(cls(peak_e=peak, decay_frames=best.decay, image=image))
+            rows = tuple(tuple(float(round(v / peak, 3)) for v in row) for row in bright)
+            found.append(cls(peak_e=peak * fading.scale, image=rows, **fields))
+        spot = _spot(finer[1], exposure.shape)
+        if spot.pop("worth") > 0:
+            peak = spot.pop("peak_e")
+            found.append(cls(peak_e=peak * fading.scale, **spot, **fields))
         return found
 
 
-@dataclass(frozen=True)
-class _Cells:
-    """Amplitudes of a falling exponential in the cells of a grid over the sensor.
-
-    Attributes:
-        decay: time constant, frames.
-        amplitude: e-, less what goes with H, shape (rows, columns); 0 in cells without pixels.
-        noise: standard errors, e-; infinite in cells without pixels.
-        exposure: mean H, e-.
-        score: chi-square of all cells against 0, as a standard normal number.
-    """
-
-    decay: float
-    amplitude: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    exposure: NDArray[np.float64]
-    score: float
-
-    @classmethod
-    def of(cls, blocks: BlockCharge, exposure: NDArray[np.float64], decay: float) -> _Cells:
-        """Return the least squares amplitudes at a time constant."""
-        mean = decay / blocks.length * np.exp(-blocks.start / decay) * -np.expm1(-blocks.length / decay)
-        shape = mean - np.average(mean, weights=blocks.length)
-        weight = blocks.length * shape
-        found = weight @ blocks.deviation / (weight @ shape)
-        stderr = np.sqrt(blocks.variance / (weight @ shape))
-        # single pixels that jump are another effect
-        found = np.clip(found, -4.0 * stderr, 4.0 * stderr)
-        rows, columns = (min(_GRID, n) for n in exposure.shape)
-        cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
-        n = rows * columns
-
-        def mean_of(values: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
-
-        inverse = stderr**-2
-        amplitude, held = mean_of(found, inverse), np.bincount(cell, inverse, n)
-        noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
-        freedom = max(int((held > 0).sum()) - 1, 1)
-        score = (float(np.sum((amplitude / noise) ** 2)) - freedom) / np.sqrt(2.0 * freedom)
-        bright = mean_of(exposure[blocks.y, blocks.x], inverse)
-        grid = (rows, columns)
-        return cls(decay, amplitude.reshape(grid), noise.reshape(grid), bright.reshape(grid), score)
-
-    def above_background(self) -> NDArray[np.float64]:
-        """Return the amplitudes with that part of H added which makes the darkest quarter 0."""
-        held = np.isfinite(self.noise) & (self.exposure > 0)
-        background = float(np.quantile(self.amplitude[held] / self.exposure[held], 0.25))
-        return np.where(held, self.amplitude - background * self.exposure, 0.0)
-
-
-def _spot(cls: type[_T], cells: _Cells, shape: tuple[int, ...]) -> _T:
+def _spot(cells: FadingCells, shape: tuple[int, ...]) -> dict[str, Any]:
     """Return the Gaussian spot that fits the cells best, with a part of H as background."""
     rows, columns = cells.amplitude.shape
     y, x = (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns
@@ -211,8 +183,8 @@ def _spot(cls: type[_T], cells: _Cells, shape: tuple[int, ...]) -> _T:
             i = int(np.argmax(gain))
             if gain[i] > best[0]:
                 best = (float(gain[i]), float(overlap[i] / size[i]), float(cy), i / 16.0, radius)
-    _, peak, centre_y, centre_x, radius = best
-    return cls(peak_e=peak, decay_frames=cells.decay, centre_y=centre_y, centre_x=centre_x, radius=radius)
+    worth, peak, centre_y, centre_x, radius = best
+    return {"worth": worth, "peak_e": peak, "centre_y": centre_y, "centre_x": centre_x, "radius": radius}
 
 
 def _hats(position: NDArray[np.float64], n: int) -> NDArray[np.float64]:
