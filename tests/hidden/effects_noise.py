@@ -34,6 +34,8 @@ class RtsNoise(Hidden):
         kind = self.pick("sampling", "difference", "averaged", "single", p=(0.6, 0.25, 0.15))
         self.reads = {"difference": 1, "averaged": self.rng.choice([2, 4]), "single": 0}[kind]
         self.parameters["reads"] = int(self.reads)
+        # averaging makes the same trap quieter: those that show at all are larger
+        self.amplitude *= max(self.reads, 1) ** 0.6
         self.occupied = self.rng.uniform(0.25, 0.75, n)
         # correlation of the trap from one read to the next, e^(-dt / tau)
         self.kept = np.exp(-1 / np.exp(self.rng.uniform(np.log(0.1), np.log(1.0), n)))

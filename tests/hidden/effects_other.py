@@ -66,7 +66,7 @@ class TrapLimitedLag(Hidden):
     """One trap per pixel holds at most one electron; strength: chance that an empty one catches one."""
 
     tag: ClassVar[str] = "trap_limited_lag"
-    s95: ClassVar[float] = 0.01
+    s95: ClassVar[float] = 0.005
     most: ClassVar[float] = 0.9
     warmup: ClassVar[int] = 60
 
@@ -85,7 +85,7 @@ class SelfTriggerCut(Hidden):
     """Samples without an electron are partly not taken, but awaited anew; strength: that part."""
 
     tag: ClassVar[str] = "self_trigger_cut"
-    s95: ClassVar[float] = 0.003
+    s95: ClassVar[float] = 0.01
     most: ClassVar[float] = 0.9
 
     def electrons(self, t, k):
@@ -97,7 +97,7 @@ class OutputCrosstalk(Hidden):
     """The right half sees a part of what the left half's output reads at the same time; strength: part."""
 
     tag: ClassVar[str] = "output_crosstalk"
-    s95: ClassVar[float] = 0.002
+    s95: ClassVar[float] = 0.01
     most: ClassVar[float] = 0.2
 
     def draw(self):
@@ -114,7 +114,7 @@ class CheckerboardOffset(Hidden):
     """Two colours of pixels, like a chessboard, swap the sign of an offset from frame to frame; DN."""
 
     tag: ClassVar[str] = "checkerboard_offset"
-    s95: ClassVar[float] = 0.08
+    s95: ClassVar[float] = 0.15
     scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
 
     def draw(self):

@@ -297,7 +297,7 @@ def test_the_untestable_leave_the_electrons_poisson_and_independent(tag):
 
 
 def test_those_outside_the_library_do_something():
-    trapped = made("trap_limited_lag")
+    trapped = hide(("trap_limited_lag",), 20.0, SEED, SHAPE, FRAMES)
     v = View(trapped)
     value, error = lagged(v, v.h.sum())
     assert value < -5 * error
