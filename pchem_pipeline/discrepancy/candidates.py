@@ -20,7 +20,7 @@ from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.registry import broken_plugins, effect_classes
 from pchem_pipeline.errors import ConfigError, PchEmError
 
-__all__ = ["Laboratory", "Mapper", "candidate_classes", "serial"]
+__all__ = ["Laboratory", "Mapper", "candidate_classes", "placebo_for", "serial"]
 
 FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
@@ -61,6 +61,26 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
             + (f" (left out: {broken})" if broken else "")
         )
     return {tag: known[tag] for tag in wanted if tag not in settings.exclude and not known[tag].untestable}
+
+
+def placebo_for(guesses: Sequence[Effect], classes: Mapping[str, type[Effect]]) -> list[Effect]:
+    """Return an effect for which nothing speaks and that is no relative of those for which something does.
+
+    It is fitted like the others: a gap that it closes as well proves nothing.
+    """
+    guessed = {effect.tag: type(effect) for effect in guesses}
+    related = {tag for effect in guessed.values() for tag in effect.separate}
+    for tag in sorted(classes):
+        effect = classes[tag]
+        if tag in guessed or tag in related or guessed.keys() & effect.separate.keys() or not effect.strength:
+            continue
+        try:
+            typical = effect.typical()
+        except Exception:
+            continue  # it was left out, or will be, where it is asked for its guesses
+        if typical:
+            return [typical[0]]
+    return []
 
 
 @dataclass
@@ -132,7 +152,7 @@ class Laboratory:
                 fit = fit_set([hypothesis], shift, noise)
                 scored.append((fit.log_score(shift, noise), float(fit.factors[0]), hypothesis))
             scored.sort(key=lambda item: item[0], reverse=True)
-            kept = [h for _, factor, h in scored if factor > 0.0]
+            kept = [h for _, _, h in scored]
             renewed = [
                 (h, h.rescaled(float(np.clip(factor, 1.0 / _LARGEST_STEP, _LARGEST_STEP))))
                 for _, factor, h in scored[:_REFINED]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, serial
+from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
 from pchem_pipeline.discrepancy.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
 from pchem_pipeline.discrepancy.naming import Choice, choose
@@ -38,8 +38,9 @@ FloatArray = NDArray[np.float64]
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
 _EXACT = ("frame.repeated",)  # tests without false positives: one split is enough
 _FEWEST_PIXELS = 32
-_REFINEMENTS = 2
-_CLOSE = 0.08  # relative: strengths known so well are not simulated again
+_REFINEMENTS = 4
+_CLOSE = 0.02  # relative: strengths known so well are not simulated again
+_FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
 def find_discrepancies(
@@ -243,7 +244,8 @@ class _Search:
         null: NullModel,
     ) -> list[Hypothesis]:
         guesses = laboratory.guesses(classes, evidence)
-        hypotheses = laboratory.fingerprints(guesses)
+        placebo = placebo_for(guesses, classes)
+        hypotheses = laboratory.fingerprints([*guesses, *placebo])
         shift = (shifts[0] + shifts[1]) / 2.0
         return laboratory.refined(hypotheses, shift, self._noise(null, 2))
 
@@ -255,11 +257,11 @@ class _Search:
         null: NullModel,
     ) -> Any:
         """Refine the strengths of the chosen set together, on both splits."""
-        noise = self._noise(null, 2)
+        noise = Noise(self._noise(null, 2).covariance, _FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
         fit = fit_set(choice.best.hypotheses, shift, noise)
         for _ in range(_REFINEMENTS):
-            if np.all(np.abs(fit.factors - 1.0) < _CLOSE):
+            if np.all(np.abs(fit.factors - 1.0) < np.maximum(_CLOSE, fit.stderr / 2.0)):
                 break
             effects = [h.rescaled(max(c, 1e-3)) for h, c in zip(fit.hypotheses, fit.factors, strict=True)]
             renewed = laboratory.fingerprints(effects)
