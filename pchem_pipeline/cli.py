@@ -248,16 +248,29 @@ def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
     frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
-    seed: Annotated[int, typer.Option(min=0, help="root of the random numbers")] = 1,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="root of the random numbers [default: 1; --hidden random: a new one]"),
+    ] = None,
+    hidden: Annotated[
+        str | None,
+        typer.Option(help="hide this effect (a tag, or random: not told before the end) and search for it"),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Run everything on a small simulated sensor.
 
     Prints the estimated parameters beside the true ones, and the path of the report.
     """
-    from pchem_pipeline.stages.demo import run_demo
+    if hidden is not None:
+        from pchem_pipeline.stages.demo_hidden import run_hidden_demo
 
-    typer.echo(run_demo(output, size=size, n_frames=frames, seed=seed, quiet=quiet))
+        text = run_hidden_demo(output, hidden=hidden, size=size, n_frames=frames, seed=seed, quiet=quiet)
+    else:
+        from pchem_pipeline.stages.demo import run_demo
+
+        text = run_demo(output, size=size, n_frames=frames, seed=1 if seed is None else seed, quiet=quiet)
+    typer.echo(text)
 
 
 def _version(wanted: bool) -> None:
