@@ -21,11 +21,18 @@ __all__ = ["between_grid_points", "frame_key"]
 
 # frames apart by that many correlation times are independent but for 1e-7
 _FAR = 16.0
+_BITS = 29
+_FRAMES = (1 << _BITS) - 1
 
 
-def frame_key(frame: int) -> int:
-    """Return the number of the draw that belongs to a frame, also to one that is not in the block."""
-    return frame & 0xFFFFFFFF
+def frame_key(frame: int, process: int = 0) -> int:
+    """Return the number of the draw that belongs to a frame, also to one that is not in the block.
+
+    Args:
+        frame: its number; those before the run are negative.
+        process: tells up to 7 independent processes of one effect apart (0 to 6).
+    """
+    return frame & _FRAMES | process << _BITS
 
 
 def between_grid_points(

@@ -2,15 +2,15 @@
 
 The low-frequency noise of a source follower that correlated double sampling does not remove (1/f noise; van
 Vliet 1976; Kansy 1980 for its passage through double sampling) correlates successive frames of a pixel,
-each pixel by itself. Here it is one Lorentzian: a stationary Ornstein-Uhlenbeck process of correlation time
-tau, ``R_t = (1 - share)^(1/2) sigma Z_t + share^(1/2) sigma U_t`` with ``cov(U_t, U_{t+l}) = exp(-l /
-tau)``. Several of them, with tau spaced by powers, add up to 1/f (McWhorter 1957).
+each pixel by itself: ``R_t = (1 - share)^(1/2) sigma Z_t + share^(1/2) sigma U_t``. U is a stationary
+Ornstein-Uhlenbeck process, ``cov(U_t, U_{t+l}) = exp(-l / tau)``, whose spectrum is a Lorentzian, or the
+sum of three of them with tau spaced by factors of 8, nearly 1/f in between (McWhorter 1957).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = ["FlickerNoise"]
 
+_Flicker = TypeVar("_Flicker", bound="FlickerNoise")
+
 # correlation times, frames, among which the estimator looks
 _TIMES = np.array([0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0, 400.0, 1000.0])
+_SPACING = (1.0, 1 / 8, 1 / 64)
 
 
 @register_effect
@@ -58,22 +61,38 @@ class FlickerNoise(Effect):
     }
     share: float = Field(ge=0, le=1, description="part of the power of the read noise, no unit")
     correlation_frames: float = Field(
-        default=30.0, gt=0, le=1e6, description="correlation time of that part, frames"
+        default=30.0,
+        gt=0,
+        le=1e6,
+        description="correlation time of that part, frames; one_over_f: the longest one",
+    )
+    spectrum: Literal["lorentzian", "one_over_f"] = Field(
+        default="lorentzian",
+        description="lorentzian: one correlation time; one_over_f: it, an eighth and a 64th, of equal power",
     )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with a part of the noise exchanged for a correlated one."""
-        noise = _ornstein_uhlenbeck(context.random, context.frames, self.correlation_frames)
-        noise *= np.sqrt(self.share) * context.truth["analog_read_noise_e"]
+        times = self._times()
+        noise = _ornstein_uhlenbeck(context.random, context.frames, times[0], 0)
+        for process, tau in enumerate(times[1:], 1):
+            noise += _ornstein_uhlenbeck(context.random, context.frames, tau, process)
+        noise *= np.sqrt(self.share / len(times)) * context.truth["analog_read_noise_e"]
         if context.read_noise is not None:
             noise -= (1.0 - np.sqrt(1.0 - self.share)) * context.read_noise
         noise += values
         return noise
 
+    def _times(self) -> tuple[float, ...]:
+        """Return the correlation times, frames."""
+        factors = (1.0,) if self.spectrum == "lorentzian" else _SPACING
+        return tuple(self.correlation_frames * factor for factor in factors)
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
-        """Return it from some frames to hundreds of frames long."""
-        return tuple(cls(share=0.0036, correlation_frames=tau) for tau in (3.0, 30.0, 300.0))
+        """Return it from some frames to hundreds of frames long, and 1/f."""
+        lorentzian = [cls(share=0.0036, correlation_frames=tau) for tau in (3.0, 30.0, 300.0)]
+        return *lorentzian, cls(share=0.0036, correlation_frames=300.0, spectrum="one_over_f")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -85,28 +104,30 @@ class FlickerNoise(Effect):
         if evidence.time is None:
             return ()
         seen, error, response = _correlations(evidence, evidence.time)
-        best: list[tuple[float, float, float]] = []
-        for tau in _TIMES:
-            shape = response * _shape(evidence.time, tau)
-            information = float(((shape / error) ** 2).sum())
-            if information > 0:
-                share = float((shape * seen / error**2).sum()) / information
-                best.append((share * np.sqrt(information), share, float(tau)))
-        best.sort(reverse=True)
-        if not best or best[0][0] < 3.0:
-            return ()
-        return tuple(
-            cls(share=min(share, 1.0), correlation_frames=tau) for _, share, tau in _spread_out(best)
-        )
+        best: list[tuple[float, Self]] = []
+        for spectrum in ("lorentzian", "one_over_f"):
+            for tau in _TIMES if spectrum == "lorentzian" else _TIMES[_TIMES >= 25.0]:
+                unit = cls(share=1.0, correlation_frames=float(tau), spectrum=spectrum)
+                shape = response * _shape(evidence.time, unit._times())
+                information = float(((shape / error) ** 2).sum())
+                if np.isfinite(information) and information > 0:
+                    share = float((shape * seen / error**2).sum()) / information
+                    best.append((share * np.sqrt(information), unit.scaled(share)))
+        best.sort(key=lambda item: item[0], reverse=True)
+        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > 3.0 else ()
 
 
-def _spread_out(ranked: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """Return the best of (sigmas, share, tau) and up to two others, nearly as good and far off in tau."""
+def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flicker]]:
+    """Return the best of (sigmas, effect) and up to three others, nearly as good but far off in tau."""
     kept = [ranked[0]]
-    for candidate in ranked[1:]:
-        far = all(abs(np.log(candidate[2] / other[2])) > 1.2 for other in kept)
-        if far and candidate[0] > 0.6 * ranked[0][0] and len(kept) < 3:
-            kept.append(candidate)
+    for sigmas, effect in ranked[1:]:
+        far = all(
+            effect.spectrum != other.spectrum
+            or abs(np.log(effect.correlation_frames / other.correlation_frames)) > 1.2
+            for _, other in kept
+        )
+        if far and sigmas > 0.6 * ranked[0][0] and len(kept) < 4:
+            kept.append((sigmas, effect))
     return kept
 
 
@@ -136,8 +157,13 @@ def _frames_of_block(time: TimeSeries) -> float:
     return float(time.frames.size / max(time.block_start.size, 1))
 
 
-def _shape(time: TimeSeries, tau: float) -> NDArray[np.float64]:
+def _shape(time: TimeSeries, times: Sequence[float]) -> NDArray[np.float64]:
     """Return what a share of 1 gives: correlations at lags 1 to 3, excess of the block means' variance."""
+    found: NDArray[np.float64] = np.mean([_lorentzian_shape(time, tau) for tau in times], axis=0)
+    return found
+
+
+def _lorentzian_shape(time: TimeSeries, tau: float) -> NDArray[np.float64]:
     lags = np.exp(-np.arange(1, 4) / tau)
     if time.block_readout.shape[0] < 2:
         return lags
@@ -153,12 +179,12 @@ def _shape(time: TimeSeries, tau: float) -> NDArray[np.float64]:
 
 
 def _ornstein_uhlenbeck(
-    random: RandomSource, frames: NDArray[np.int64], correlation_frames: float
+    random: RandomSource, frames: NDArray[np.int64], correlation_frames: float, process: int
 ) -> NDArray[np.float64]:
     """Return a stationary Gaussian process with covariance exp(-lag / tau), (frame, y, x), by pixel."""
 
     def normal(frame: int) -> NDArray[np.float64]:
-        return random.normal(("y", "x"), frame_key(frame))
+        return random.normal(("y", "x"), frame_key(frame, process))
 
     def midpoint(
         frame: int, before: NDArray[np.float64], after: NDArray[np.float64], rho: float

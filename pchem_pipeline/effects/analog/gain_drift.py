@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.common_modes import run_position
-from pchem_pipeline.effects.response import PixelLaw, typical_pixels
+from pchem_pipeline.effects.pixel_law import PixelLaw, typical_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -151,65 +151,42 @@ def _chi_square(
 def _block_gains(
     evidence: Evidence, time: TimeSeries
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return relative gain, standard error and position in the run of each block.
-
-    Two independent estimates are combined: block means of r regressed on ``H / g`` over the pixels (with an
-    offset common to all, which is the bias's), and the slope of r against k within the frames. A change of
-    the gain by a factor 1 + c moves them by ``c Var(r) / sigma^2`` and by what the exact law says.
-    """
+    """Return relative gain, standard error and position in the run of each block."""
     owner = np.searchsorted(time.block_start, time.frames, side="right") - 1
-    blocks, counts = np.unique(owner[owner >= 0], return_counts=True)
-    position = np.array([run_position(time.frames[owner == b], time.n_run).mean() for b in blocks])
-    between, between_error = _slopes_of_means(evidence, time, blocks, counts)
-    within, within_error = _slopes_within(evidence, time, owner, blocks)
-    weight, other = between_error**-2.0, within_error**-2.0
-    good = weight + other > 0
-    weight, other = weight[good], other[good]
-    gain = (np.nan_to_num(between)[good] * weight + np.nan_to_num(within)[good] * other) / (weight + other)
-    return gain, (weight + other) ** -0.5, position[good]
+    blocks = [np.flatnonzero(owner == b) for b in np.unique(owner[owner >= 0])]
+    scatter = np.sqrt(np.mean([time.frame_gain[b].var() for b in blocks]))
+    response = _response(evidence)
+    if not (scatter > 0 and np.isfinite(scatter) and response > 1e-3):
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    gain = np.array([time.frame_gain[b].mean() for b in blocks]) / response
+    position = np.array([run_position(time.frames[b], time.n_run).mean() for b in blocks])
+    return gain, scatter / response / np.sqrt([b.size for b in blocks]), position
 
 
-def _slopes_of_means(
-    evidence: Evidence, time: TimeSeries, blocks: NDArray[np.intp], counts: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _response(evidence: Evidence) -> float:
+    """Return by how much the gain of a frame, as it is seen, rises with the true one.
+
+    It is the regression of r on k / g, among the samples of a pixel and among the means of the pixels. A
+    gain 1 + c shifts r by ``c H / g`` times ``Var(r) / sigma^2`` on average, and the mean of r k by what the
+    law of the codes says, since a part of the change is taken for charge.
+    """
     maps = evidence.maps
-    response = (evidence.readout_std / maps.read_noise_dn) ** 2 * maps.quanta_exposure / maps.conversion_gain
-    good = maps.usable & np.isfinite(response) & (evidence.readout_std > 0)
+    good = maps.usable & np.isfinite(evidence.readout_std) & (evidence.readout_std > 0)
+    if not good.any():
+        return 0.0
+    signal = maps.quanta_exposure[good] / maps.conversion_gain[good]
     weight = evidence.readout_std[good] ** -2.0
-    response = response[good]
-    centred = response - (weight * response).sum() / weight.sum() if response.size else response
-    information = float((weight * centred**2).sum())
-    error = np.full(blocks.size, np.inf)
-    # without a spread of exposures a drift of the gain looks like one of the bias
-    if response.size < 3 or information < 1e-6 * float((weight * response**2).sum()):
-        return np.zeros(blocks.size), error
-    means = np.asarray(time.block_readout, np.float64)[blocks][:, good]
-    slopes = np.nan_to_num(means) @ (weight * centred) / information
-    return slopes, np.asarray((information * counts) ** -0.5, np.float64)
-
-
-def _slopes_within(
-    evidence: Evidence, time: TimeSeries, owner: NDArray[np.intp], blocks: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    response = _slope_response(evidence)
-    frames = [time.frame_gain[owner == b] for b in blocks]
-    scatter = float(np.sqrt(np.nanmean([np.nanvar(f) for f in frames])))
-    if not np.isfinite(scatter) or scatter <= 0 or abs(response) < 1e-3:
-        return np.zeros(blocks.size), np.full(blocks.size, np.inf)
-    mean = np.nanmean(time.frame_gain)
-    slopes = np.array([np.nanmean(f) - mean for f in frames]) / response
-    return slopes, scatter / abs(response) / np.sqrt([f.size for f in frames])
-
-
-def _slope_response(evidence: Evidence) -> float:
-    """Return by how much the slope of r against k (in units of 1/g) rises with the relative gain."""
-    above = below = 0.0
-    for pixel, group in zip(*typical_pixels(evidence.maps, 4), strict=True):
-        law = PixelLaw(evidence.maps, int(pixel))
-        gain = float(np.asarray(evidence.maps.conversion_gain).reshape(-1)[pixel])
-        centred = law.charge - law.charge @ law.mass
-        small = 1e-4
-        change = (law.scaled_mass(1.0 + small) - law.mass) / small
-        above += group.size * float((law.readout * gain * centred) @ change)
-        below += group.size * float((centred**2) @ law.mass)
+    pattern = signal - (weight * signal).sum() / weight.sum()
+    taken = (evidence.readout_std[good] / maps.read_noise_dn[good]) ** 2
+    above = float((weight * pattern * taken * signal).sum())
+    below = float((weight * pattern * signal).sum())
+    small = 1e-4
+    for pixel, group in zip(*typical_pixels(maps), strict=True):
+        law = PixelLaw(maps, int(pixel), evidence.n_frames)
+        step = 1.0 / float(law.maps.conversion_gain[0])
+        charge, readout = law.charge - law.charge @ law.mass, law.readout - law.readout @ law.mass
+        change = law.change(law.scaled(1.0 + small)) / small
+        scale = group.size * step / float(readout**2 @ law.mass)
+        above += scale * float((charge * readout) @ change)
+        below += scale * step * float(charge**2 @ law.mass)
     return above / below if below > 0 else 0.0

@@ -10,22 +10,25 @@ imagers with such tails are attributed to random telegraph noise of the source f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.response import strength_of
+from pchem_pipeline.model.marginal import MarginalModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
     from pchem_pipeline.effects.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["HeavyTailedNoise"]
+
+_Heavy = TypeVar("_Heavy", bound="HeavyTailedNoise")
 
 
 @register_effect
@@ -45,7 +48,7 @@ class HeavyTailedNoise(Effect):
         "of CMOS read noise)"
     )
     signature: ClassVar[tuple[str, ...]] = (
-        "shape.He4.mean", "tail.low.count", "tail.low.pixels", "shape.goodness.mean", "shape.He2C2.mean",
+        "tail.low.count", "shape.He4.mean", "tail.low.pixels", "shape.goodness.mean", "shape.He2C2.mean",
     )  # fmt: skip
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 1.0
@@ -78,8 +81,13 @@ class HeavyTailedNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return mixtures with the fourth Hermite score that is seen, of several factors."""
+        """Return mixtures with the number of samples below the codes, or else the He4, that are seen."""
+        below = _tail_below(evidence)
         found: list[Self] = []
+        for effect in cls.typical():
+            found += _of_tail(effect, evidence, *below)
+        if found:
+            return found
         for effect in cls.typical():
             found += strength_of(evidence, effect, "He4")
         return found
@@ -87,3 +95,36 @@ class HeavyTailedNoise(Effect):
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with noise of two widths."""
         return model.with_noise(np.array([1.0 - self.share, self.share]), width=np.array([1.0, self.factor]))
+
+
+def _tail_below(evidence: Evidence) -> tuple[float, list[PixelLaw], list[int]]:
+    """Return the samples seen below the codes of the pixels, typical pixels, and how many each stands for.
+
+    Single pixels with very many are another effect's: a pixel counts for at most a few more than the others.
+    """
+    usable = evidence.maps.usable
+    seen = evidence.tail_low[usable].astype(np.float64)
+    if not seen.size:
+        return 0.0, [], []
+    limit = 3.0 + 5.0 * float(seen.mean())
+    chosen, groups = typical_pixels(evidence.maps)
+    laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
+    return float(np.minimum(seen, limit).sum()), laws, [group.size for group in groups]
+
+
+def _of_tail(
+    effect: _Heavy,
+    evidence: Evidence,
+    seen: float,
+    laws: Sequence[PixelLaw],
+    numbers: Sequence[int],
+) -> list[_Heavy]:
+    """Return the effect with the share that explains the samples below the codes; empty if there are few."""
+    expected = more = 0.0
+    for law, number in zip(laws, numbers, strict=True):
+        wide = law.below(MarginalModel().with_noise([1.0], width=effect.factor))
+        expected += number * evidence.n_frames * law.below(MarginalModel())
+        more += number * evidence.n_frames * wide
+    if seen < 5 or more <= 0 or seen - expected < 4.0 * np.sqrt(expected + 1.0):
+        return []
+    return [effect.model_copy(update={"share": min((seen - expected) / more, 1.0)})]

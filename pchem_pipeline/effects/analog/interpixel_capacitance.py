@@ -1,7 +1,8 @@
 """Interpixel capacitance: a pixel shows a little of its neighbours' charge.
 
 Sense nodes couple electrically, so charge in one raises the voltage of the next: ``v_i = K_i + a sum_j (K_j -
-K_i)`` over the four nearest neighbours (Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018). Unlike
+K_i)`` over the four nearest neighbours (Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018). Along
+rows and columns it may differ, as the wiring does. Unlike
 diffusion or crosstalk by light the coupling is noiseless and deterministic: no electron moves.
 """
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps, TimeSeries
     from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["InterpixelCapacitance"]
@@ -50,7 +51,13 @@ class InterpixelCapacitance(Effect):
         "column_noise": "distant pixels of a column: column noise reaches them, capacitance does not",
     }
     coupling: float = Field(
-        ge=0, le=0.2, description="part of a neighbour's charge that a pixel shows (each of four), no unit"
+        ge=0, le=0.2, description="part of a neighbour's charge that a pixel shows (mean of four), no unit"
+    )
+    anisotropy: float = Field(
+        default=0.0,
+        ge=-1,
+        le=1,
+        description="(coupling along x less that along y) / (sum of the two), no unit",
     )
 
     def halo(self) -> int:
@@ -65,11 +72,13 @@ class InterpixelCapacitance(Effect):
         result: NDArray[Any] = values.copy()
         if context.charge is None:
             return result
-        charge = self.coupling * context.charge
+        charge = context.charge.astype(np.float64)
         down = charge[:, 1:] - charge[:, :-1]
+        down *= self.coupling * (1.0 - self.anisotropy)
         result[:, :-1] += down
         result[:, 1:] -= down
         across = charge[:, :, 1:] - charge[:, :, :-1]
+        across *= self.coupling * (1.0 + self.anisotropy)
         result[:, :, :-1] += across
         result[:, :, 1:] -= across
         return result
@@ -81,26 +90,21 @@ class InterpixelCapacitance(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the residual on the charge of the neighbour.
-
-        A shift by d changes ``E[R | x]`` by ``d Var(r) / sigma^2`` on average, so that the correlation of
-        one's r with the other's k is ``a`` times the mean of ``sd(r_i) sd(k_j) / sigma_i^2``, all in
-        electrons.
-        """
-        time = evidence.time
-        if time is None:
+        """Return the regression of the residual on the charge of the neighbour, anisotropic if that shows."""
+        if evidence.time is None:
             return ()
-        above = below = 0.0
-        readout, charge = _responses(evidence)
-        for axis, name in ((1, "x.rk"), (0, "y.rk")):
-            pairs = time.neighbour_pairs.get(name, 0)
-            response = _pair_mean(readout, charge, axis)
-            if pairs and np.isfinite(response):
-                above += pairs * response * time.neighbours[name]
-                below += pairs * response**2
-        if below <= 0 or above < 3.0 * np.sqrt(below):
+        (x, x_error), (y, y_error) = (_coupling(evidence, evidence.time, axis) for axis in ("x", "y"))
+        weight, other = x_error**-2.0, y_error**-2.0
+        if weight + other == 0:
             return ()
-        return (cls(coupling=min(above / below, 0.2)),)
+        mean = (x * weight + y * other) / (weight + other)
+        if mean * np.sqrt(weight + other) < 3.0:
+            return ()
+        found = [cls(coupling=min(mean, 0.2))]
+        if abs(x - y) > 3.0 * np.hypot(x_error, y_error):
+            x, y = max(x, 0.0), max(y, 0.0)
+            found.insert(0, cls(coupling=min((x + y) / 2.0, 0.2), anisotropy=(x - y) / (x + y)))
+        return found
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with a smaller step, the neighbours' mean charge and its variance.
@@ -108,26 +112,40 @@ class InterpixelCapacitance(Effect):
         The four neighbours are taken to have the pixel's own exposure.
         """
         exposure = np.nan_to_num(maps.quanta_exposure)
+        squares = 4.0 * self.coupling**2 * (1.0 + self.anisotropy**2)
         return model.with_levels(
             scale=1.0 - 4.0 * self.coupling, shift_e=4.0 * self.coupling * exposure
-        ).with_variance(e2=4.0 * self.coupling**2 * exposure)
+        ).with_variance(e2=squares * exposure)
 
 
-def _responses(evidence: Evidence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sd(r) / sigma^2 (1/e-) and sd(k) (e-) of each pixel, NaN where there is no fit."""
-    maps = evidence.maps
-    noise = np.where(maps.usable, maps.read_noise_dn, np.nan)
-    return evidence.readout_std / noise**2 / maps.conversion_gain, np.where(
-        maps.usable, evidence.charge_std, np.nan
-    )
+def _coupling(evidence: Evidence, time: TimeSeries, axis: str) -> tuple[float, float]:
+    """Return the coupling along an axis and its standard error, which is infinite where nothing shows it.
+
+    A shift of i by ``a K_j`` changes ``E[R_i | x]`` by ``a K_j Var(r_i) / sigma_i^2`` on average, and that
+    of j by ``a K_i`` changes ``E[K_j | x]`` by ``a K_i c_j / sigma_j^2`` with ``c = Cov(k, R) = Cov(r, K)``,
+    part of the shift being taken for charge. So ``Cov(r_i, k_j) = a [Var(r_i) Var(k_j) / sigma_i^2 + c_i c_j /
+    sigma_j^2]``, all in electrons.
+    """
+    maps, name = evidence.maps, f"{axis}.rk"
+    gain = np.where(maps.usable, maps.conversion_gain, np.nan)
+    noise = (maps.read_noise_dn * gain) ** 2
+    readout, charge = (evidence.readout_std * gain) ** 2, evidence.charge_std**2
+    mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
+    pairs = time.neighbour_pairs.get(name, 0)
+    # of the correlation, so each divided by the standard deviations of r_i and k_j
+    first = _neighbour_mean(np.sqrt(readout) / noise, np.sqrt(charge), axis)
+    second = _neighbour_mean(mixed / np.sqrt(readout), mixed / np.sqrt(charge) / noise, axis)
+    response = first + second
+    if not (pairs and np.isfinite(response) and response > 0):
+        return 0.0, np.inf
+    return time.neighbours[name] / response, 1.0 / (response * np.sqrt(pairs))
 
 
-def _pair_mean(readout: NDArray[np.float64], charge: NDArray[np.float64], axis: int) -> float:
-    """Return the mean of readout times the neighbour's charge along an axis, both ways; NaN without pairs."""
-    n = readout.shape[axis]
-    first, second = np.arange(n - 1), np.arange(1, n)
-    products = [
-        np.take(readout, a, axis) * np.take(charge, b, axis) for a, b in ((first, second), (second, first))
-    ]
-    found = np.concatenate([p[np.isfinite(p)] for p in products])
-    return float(found.mean()) if found.size else np.nan
+def _neighbour_mean(one: NDArray[np.float64], other: NDArray[np.float64], axis: str) -> float:
+    """Return the mean of one map times the other at the neighbour, both ways; NaN without neighbours."""
+    front, back = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
+    if axis == "y":
+        front, back = front[::-1], back[::-1]
+    products = np.concatenate([(one[a] * other[b]).ravel() for a, b in ((front, back), (back, front))])
+    products = products[np.isfinite(products)]
+    return float(products.mean()) if products.size else np.nan

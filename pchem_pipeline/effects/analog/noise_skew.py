@@ -33,7 +33,7 @@ _LOBES = 6
 class NoiseSkew(Effect):
     """Exponential part of the read noise; mean and variance of the noise stay as they are.
 
-    Signature: the third Hermite score has one sign in all pixels, then the fourth is positive; nothing in
+    Signature: the third Hermite score has one sign in all pixels, and with it He4 and He3C1; nothing in
     time or space. Peaks lean to high DN (``share`` positive) or low DN (negative).
     """
 

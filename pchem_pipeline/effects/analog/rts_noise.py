@@ -18,7 +18,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.long_memory import between_grid_points, frame_key
-from pchem_pipeline.effects.response import PixelLaw, typical_pixels
+from pchem_pipeline.effects.pixel_law import PixelLaw, refitted, typical_pixels
 from pchem_pipeline.model.marginal import MarginalModel
 
 if TYPE_CHECKING:
@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 __all__ = ["RtsNoise"]
 
 # draws that are no frame's
-_WHERE, _SIZE = 0x7FFFFFFE, 0x7FFFFFFF
-_AMPLITUDES = (1.0, 0.7, 1.5, 2.5, 4.0)
-_PROBABILITIES = np.geomspace(0.01, 0.6, 25)
+_WHERE, _SIZE = 0xFFFFFFFE, 0xFFFFFFFF
+# steps, e-, and samples averaged that the estimator looks for, with probabilities
+_STEPS = ((0.5, 1), (0.7, 1), (1.0, 1), (1.5, 1), (2.5, 1), (4.0, 1), (1.5, 4), (3.0, 4))
+_PROBABILITIES = (0.01, 0.03, 0.08, 0.2, 0.4)
+_PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
 # a pixel stands out beyond that many standard deviations
 _OUTLYING = 5.0
 _EQUAL, _EXPONENTIAL = (0.6, 0.8, 1.0, 1.25, 1.6), (0.3, 0.55, 1.0, 1.6, 2.5)
@@ -167,8 +169,8 @@ class RtsNoise(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return steps of several sizes, each with the probability and share that outlying pixels ask for.
 
-        How far a pixel stands out (the larger of He4 and goodness of fit) gives the probability; how many do
-        gives the share, corrected for those too weak to stand out.
+        Probability and order are those whose goodness of fit and scores resemble the outlying pixels'; the
+        number of these gives the share.
         """
         found = cls._correlated(evidence)
         slow = cls._single(evidence)
@@ -176,39 +178,28 @@ class RtsNoise(Effect):
 
     @classmethod
     def _correlated(cls, evidence: Evidence) -> list[Self]:
-        usable = evidence.maps.usable
-        outlying = np.fmax(evidence.scores["He4"], evidence.goodness)[usable]
-        outlying = outlying[outlying > _OUTLYING]
-        n = int(usable.sum())
+        outlying = _outlying(evidence)
+        n, count = int(evidence.maps.usable.sum()), int(outlying.sum())
         # fewer are chance; where most pixels stand out something else is wrong
-        if outlying.size < 3 or outlying.size > 0.3 * n:
+        if count < 3 or count > 0.3 * n:
             return []
-        mean = float(outlying.mean())
-        laws = [PixelLaw(evidence.maps, int(pixel)) for pixel in typical_pixels(evidence.maps, 6)[0]]
-        kinds: tuple[tuple[float, int], ...] = (*((a, 1) for a in _AMPLITUDES),)
-        found = []
-        for amplitude, samples in kinds:
-            effect = cls(fraction=1.0, amplitude_e=amplitude, probability=1.0, samples=samples)
-            shifts = effect._standing_out(laws, evidence.n_frames)
-            power = _survival(_OUTLYING - shifts).mean(axis=1)
-            seen = _mean_above(_OUTLYING, shifts).mean(axis=1)
-            at = int(np.argmin(np.abs(np.log(seen / mean)) + np.where(power < 0.02, 10.0, 0.0)))
-            fraction = outlying.size / (n * max(float(power[at]), 0.02))
-            misfit = abs(float(np.log(seen[at] / mean)))
-            values = {"fraction": min(fraction, 1.0), "probability": float(_PROBABILITIES[at])}
-            found.append((misfit > 0.3, effect.model_copy(update=values)))
-        # a size that cannot make pixels stand out as they do comes last
-        return [effect for _, effect in sorted(found, key=lambda item: item[0])]
-
-    def _standing_out(self, laws: Sequence[PixelLaw], n_frames: int) -> NDArray[np.float64]:
-        """Return by how many standard deviations a pixel with a trap stands out, (probability, pixel)."""
-        rows = []
-        for law in laws:
-            change = law.change(self._as_noise())
-            score = law.score_shift("He4", change) * np.sqrt(n_frames) * _PROBABILITIES
-            chi = law.noncentrality(change) * n_frames * _PROBABILITIES**2
-            rows.append(np.fmax(score, chi / np.sqrt(2.0 * (law.mass * n_frames > 5).sum() + 4.0 * chi)))
-        return np.array(rows).T
+        seen = np.array([np.median(values[outlying]) for values in _profile(evidence)])
+        chosen = typical_pixels(evidence.maps, 3)[0]
+        laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
+        kinds = [
+            cls(fraction=count / n, amplitude_e=amplitude, samples=samples, probability=q)
+            for amplitude, samples in _STEPS
+            for q in _PROBABILITIES
+        ]
+        profiles = _expected_profiles([kind._as_noise() for kind in kinds], laws, evidence.n_frames)
+        misfit = ((np.arcsinh(profiles / 3.0) - np.arcsinh(seen / 3.0)) ** 2).sum(axis=1)
+        best = []
+        for step in np.split(np.arange(len(kinds)), len(_STEPS)):
+            at = step[np.argmin(misfit[step])]
+            # those too weak to stand out count too
+            power = max(float(_survival(_OUTLYING - max(profiles[at, :2]))), 0.3)
+            best.append((misfit[at], kinds[at].model_copy(update={"fraction": min(count / n / power, 1.0)})))
+        return [effect for _, effect in sorted(best, key=lambda item: float(item[0]))]
 
     @classmethod
     def _single(cls, evidence: Evidence) -> list[Self]:
@@ -263,19 +254,41 @@ class RtsNoise(Effect):
         )
 
 
-def _survival(z: NDArray[np.float64]) -> NDArray[np.float64]:
+def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
+    """Return what outlying pixels are compared by: goodness of fit and some scores of the usable pixels."""
+    usable = evidence.maps.usable
+    return [
+        np.nan_to_num(values[usable].astype(np.float64))
+        for values in (evidence.goodness, *(evidence.scores[name] for name in _PROFILE))
+    ]
+
+
+def _outlying(evidence: Evidence) -> NDArray[np.bool_]:
+    """Return which usable pixels stand out, by goodness of fit or the first of the scores."""
+    found: NDArray[np.bool_] = np.fmax(*_profile(evidence)[:2]) > _OUTLYING
+    return found
+
+
+def _expected_profiles(
+    kinds: Sequence[MarginalModel], laws: Sequence[PixelLaw], n_frames: int
+) -> NDArray[np.float64]:
+    """Return the same for pixels of other laws, the median over the pixels: (kind, profile).
+
+    The PCD is fitted to the exact law of such pixels, since it takes up much of the steps.
+    """
+    masses = [law.mass_of(kind) for kind in kinds for law in laws]
+    fits = refitted(list(laws) * len(kinds), masses, n_frames)
+    rows = []
+    for fit, mass in zip(fits, masses, strict=True):
+        change = fit.on_codes(*mass) - fit.mass
+        scores = [fit.score_shift(name, change) * np.sqrt(n_frames) for name in _PROFILE]
+        rows.append([fit.goodness(change, n_frames), *scores])
+    found: NDArray[np.float64] = np.median(np.array(rows).reshape(len(kinds), len(laws), -1), axis=1)
+    return found
+
+
+def _survival(z: float) -> float:
     """Return the probability that a standard normal number is above z."""
-    from scipy.special import ndtr
+    from math import erfc, sqrt
 
-    found: NDArray[np.float64] = ndtr(-z)
-    return found
-
-
-def _mean_above(limit: float, mean: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of a normal number of unit variance, given that it is above a limit."""
-    from scipy.special import log_ndtr
-
-    z = limit - mean
-    # the inverse Mills ratio, far tails included
-    found: NDArray[np.float64] = mean + np.exp(-0.5 * z**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
-    return found
+    return 0.5 * erfc(z / sqrt(2.0))
