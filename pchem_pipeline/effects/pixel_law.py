@@ -29,6 +29,7 @@ FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 _PARAMETERS = ((1, 0), (0, 1), (1, 1), (2, 0))
 _SMALLEST_MASS = 1e-100
 _SMALLEST_WIDTH = 0.1  # DN
+_ROUNDING = 1 / 12  # DN^2, of rounding to whole DN
 # samples expected beyond the codes of a pixel, on either side
 _ALLOWED = 1e-2
 # samples expected in a code for it to count in chi squared
@@ -77,31 +78,25 @@ class PixelLaw:
     def __init__(self, maps: PixelMaps, where: int, n_frames: int):
         """Tabulate the PCD of one pixel of the maps, by its flat index, for that many samples."""
         self.maps = select_pixels(maps, np.array([where]))
-        self._parameters = tuple(
-            float(values[0])
-            for values in (
-                self.maps.quanta_exposure,
-                self.maps.conversion_gain,
-                self.maps.bias,
-                self.maps.read_noise_dn,
-            )
+        exposure, gain, bias, sigma = (
+            float(getattr(self.maps, name)[0])
+            for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
         )
-        exposure, gain, bias, sigma = self._parameters
-        self._analog = float(np.sqrt(max(sigma**2 - 1 / 12, _SMALLEST_WIDTH**2)))
-        self._counts = _counts(exposure)
-        levels = bias + self._counts / gain
-        self._wide = _wide_codes(levels, self._analog, gain)
-        parts = [_hermite_cells(a, self._wide, levels, self._analog) for a in range(5)]
-        weights = [_poisson(self._counts, exposure) * _charlier(b, self._counts, exposure) for b in range(4)]
+        analog = float(np.sqrt(max(sigma**2 - _ROUNDING, _SMALLEST_WIDTH**2)))
+        counts = _counts(exposure)
+        levels = bias + counts / gain
+        self._wide = _wide_codes(levels, analog, gain)
+        parts = [_hermite_cells(a, self._wide, levels, analog) for a in range(5)]
+        weights = [_poisson(counts, exposure) * _charlier(b, counts, exposure) for b in range(4)]
         mass = weights[0] @ parts[0]
         below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]
-        inside = (below * n_frames >= _ALLOWED) & (above * n_frames >= _ALLOWED) & (mass > _SMALLEST_MASS)
+        inside = (below * n_frames >= _ALLOWED) & (above * n_frames >= _ALLOWED)
         self.codes = self._wide[inside]
-        self.mass = self.on_codes(self._wide, mass)
-        self._scores = {
-            (a, b): (weights[b] @ parts[a])[inside] / mass[inside] for a in range(5) for b in range(4)
-        }
-        self.charge = ((weights[0] * self._counts) @ parts[0])[inside] / mass[inside]
+        # between narrow peaks there may be nothing
+        within = np.maximum(mass[inside], _SMALLEST_MASS)
+        self.mass = np.maximum(self.on_codes(self._wide, mass), _SMALLEST_MASS)
+        self._scores = {(a, b): (weights[b] @ parts[a])[inside] / within for a in range(5) for b in range(4)}
+        self.charge = ((weights[0] * counts) @ parts[0])[inside] / within
         self.readout = self.codes - bias - self.charge / gain
         self._nuisance = np.stack([np.ones(self.codes.size), *(self._scores[order] for order in _PARAMETERS)])
 
@@ -149,21 +144,10 @@ class PixelLaw:
         return float((np.cbrt(1.0 + excess / degrees) - (1.0 - width)) / np.sqrt(width))
 
     def mass_of(self, law: MarginalModel) -> tuple[FloatArray, FloatArray]:
-        """Return codes, DN, and their mass under the law of one pixel with Poisson counts and ideal edges."""
-        exposure, gain, bias, _ = self._parameters
-        counts = self._counts
-        bend = 1.0 + law.curvature * (counts - 1.0) / 2.0
-        levels = bias + (law.level_scale[0] * counts * bend + law.level_shift_e[0]) / gain
-        more = law.extra_variance_e2[0] + law.variance_per_electron * counts
-        more = (more + law.variance_per_electron2 * counts**2) / gain**2 + law.extra_variance_dn2[0]
-        mixture = zip(law.exposure_weights, law.exposure_factors, strict=True)
-        weights = np.sum([w * _poisson(counts, exposure * f) for w, f in mixture], axis=0)
-        mass = np.zeros(self._wide.size)
-        for j in range(law.lobe_weights.shape[1]):
-            shift = law.lobe_shift_e[0, j] / gain + law.lobe_shift_dn[0, j]
-            shift += law.lobe_shift_sigma[0, j] * self._analog
-            sigma = np.sqrt((self._analog * law.lobe_width[0, j]) ** 2 + more)
-            mass += law.lobe_weights[0, j] * (weights @ _cells(self._wide, levels + shift, sigma))
+        """Return codes, DN, somewhat beyond those of the PCD, and their mass under a law."""
+        from pchem_pipeline.model.grown import marginal_mass
+
+        mass: FloatArray = marginal_mass(law, self.maps, self._wide)[0]
         return self._wide, mass
 
     def scaled(self, factor: float) -> MarginalModel:

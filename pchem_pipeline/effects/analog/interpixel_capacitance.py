@@ -123,8 +123,8 @@ def _coupling(evidence: Evidence, time: TimeSeries, axis: str) -> tuple[float, f
 
     A shift of i by ``a K_j`` changes ``E[R_i | x]`` by ``a K_j Var(r_i) / sigma_i^2`` on average, and that
     of j by ``a K_i`` changes ``E[K_j | x]`` by ``a K_i c_j / sigma_j^2`` with ``c = Cov(k, R) = Cov(r, K)``,
-    part of the shift being taken for charge. So ``Cov(r_i, k_j) = a [Var(r_i) Var(k_j) / sigma_i^2 + c_i c_j /
-    sigma_j^2]``, all in electrons.
+    part of the shift being taken for charge. So ``Cov(r_i, k_j) = a [Var(r_i) Var(k_j) / sigma_i^2 + c_i
+    c_j / sigma_j^2]``, all in electrons.
     """
     maps, name = evidence.maps, f"{axis}.rk"
     gain = np.where(maps.usable, maps.conversion_gain, np.nan)
