@@ -78,10 +78,10 @@ class BranchingCounts(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return l from the scores of the second Charlier polynomial, where they are positive by 3 sigma."""
+        """Return l from the scores of the second Charlier polynomial, where they exceed 2.5 sigma."""
         c, stderr = count_excess(evidence, power=-1.0)
         # Var K = H + 2 l H + ... against H + c H
-        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > 3.0 * stderr else ()
+        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > 2.5 * stderr else ()
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with generalised Poisson electron numbers."""

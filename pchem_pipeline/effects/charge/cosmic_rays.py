@@ -102,23 +102,27 @@ class CosmicRays(Effect):
         A frame with such samples counts as one with tracks (their number is Poisson); a track that covers
         m pixels in the mean is about (m - 1) pi / 4 pixels long.
         """
-        time = evidence.time
+        time, maps = evidence.time, evidence.maps
         if time is None or time.hits.shape[0] < 3:
             return ()
-        frames, y, x, dn = time.hits.T
         whole = time.hits.shape[0] < _MOST_HITS
-        n_seen = time.frames.size if whole else int(np.searchsorted(time.frames, frames.max())) + 1
-        n_hit = np.unique(frames).size
+        n_seen = time.frames.size if whole else int(np.searchsorted(time.frames, time.hits[:, 0].max())) + 1
+        y, x = time.hits[:, 1], time.hits[:, 2]
+        exposure = maps.quanta_exposure[y, x]
+        charge = (time.hits[:, 3] - maps.bias[y, x]) * maps.conversion_gain[y, x] - exposure
+        # by chance a few samples lie just beyond the support; a track leaves far more
+        far = charge > 6.0 * np.sqrt(exposure) + 6.0
+        if far.sum() < 3:
+            return ()
+        n_hit = np.unique(time.hits[far, 0]).size
         tracks = -n_seen * np.log1p(-min(n_hit / n_seen, 1.0 - 0.5 / n_seen))
-        pixels = frames.size / tracks
+        pixels = float(far.sum()) / tracks
         # tracks are longer than a pixel; hits that stay alone are something else
         if pixels < 1.2:
             return ()
-        maps = evidence.maps
-        charge = (dn - maps.bias[y, x]) * maps.conversion_gain[y, x] - maps.quanta_exposure[y, x]
         pitch = float(cls.model_fields["pixel_pitch_um"].default)
         length = (pixels - 1.0) * np.pi / 4.0 * pitch
-        per_um = float(np.nansum(charge)) / tracks / length
+        per_um = float(charge[far].sum()) / tracks / length
         if not per_um > 0:
             return ()
         return (cls(tracks_per_frame=float(tracks / n_seen), length_um=length, electrons_per_um=per_um),)

@@ -78,7 +78,7 @@ class OpticalCrosstalk(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return p from the correlations of neighbours' electron numbers, where these are above 3 sigma."""
+        """Return p from the correlations of neighbours' electron numbers, where these are above 2.5 sigma."""
         found, weight = 0.0, 0.0
         for axis, name in ((1, "x.kk"), (0, "y.kk")):
             response = _response(evidence, axis)
@@ -87,7 +87,7 @@ class OpticalCrosstalk(Effect):
                 continue
             found += pairs * response * evidence.time.neighbours[name]
             weight += pairs * response**2
-        if weight == 0 or found < 3.0 * np.sqrt(weight):
+        if weight == 0 or found < 2.5 * np.sqrt(weight):
             return ()
         return (cls(probability=min(found / weight, 0.5)),)
 

@@ -80,9 +80,9 @@ class OverdispersedCounts(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return a from the scores of the second Charlier polynomial, where they are positive by 3 sigma."""
+        """Return a from the scores of the second Charlier polynomial, where they exceed 2.5 sigma."""
         a, stderr = count_excess(evidence, power=0.0)
-        return (cls(relative_variance=min(a, 1.0)),) if a > 3.0 * stderr else ()
+        return (cls(relative_variance=min(a, 1.0)),) if a > 2.5 * stderr else ()
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with negative binomial electron numbers."""

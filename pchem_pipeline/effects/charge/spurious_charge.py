@@ -43,7 +43,9 @@ class SpuriousCharge(Effect):
         "sums of Poisson electrons are Poisson, so it is part of H; a series of integration times would show "
         "it (the part of H that does not grow with time)"
     )
-    mean_e: float = Field(ge=0, description="mean number of spurious electrons per pixel and frame, e-")
+    mean_e: float = Field(
+        ge=0, le=1e6, description="mean number of spurious electrons per pixel and frame, e-"
+    )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return electron numbers (frame, y, x), e-, spurious ones included."""

@@ -64,7 +64,10 @@ class DarkCurrentRts(Effect):
     }
     fraction: float = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
     step_e: float = Field(
-        default=1.0, ge=0, description="additional exposure of the upper level, mean over these pixels, e-"
+        default=1.0,
+        ge=0,
+        le=1e6,
+        description="additional exposure of the upper level, mean over these pixels, e-",
     )
     steps: Literal["equal", "exponential"] = Field(
         default="equal", description="equal: step_e in each of these pixels; exponential: distributed so"

@@ -125,8 +125,8 @@ class ExposureDrift(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the courses that least squares on the frames' exposures cannot tell from the best one.
 
-        A course is taken seriously where it explains more than chance by three standard deviations; one with
-        more freedom only where it beats the simpler ones by as much.
+        A course is taken seriously where it explains two and a half standard deviations more than chance; one
+        with more freedom only where that is not far below the best.
         """
         course = exposure_course(evidence)
         if course is None or evidence.time is None:
@@ -140,7 +140,7 @@ class ExposureDrift(Effect):
         path = _fit_path(cls, course, position, noise)
         net = [line, (curve[0] - _PRICE_OF_SETTLING, curve[1]), path]
         best = max(chi2 for chi2, _ in net)
-        likely = [pair for pair in net if pair[0] > max(9.0, best - 25.0)]
+        likely = [pair for pair in net if pair[0] > max(6.5, best - 25.0)]
         return [effect for _, effect in sorted(likely, key=lambda pair: -pair[0])]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:

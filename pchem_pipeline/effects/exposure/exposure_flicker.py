@@ -81,10 +81,6 @@ class ExposureFlicker(Effect):
     def _one_kind(self) -> Self:
         if self.period_frames is not None and self.correlation_frames > 0:
             raise ValueError("exposure_flicker: a sine has no correlation_frames; leave one of them out")
-        if self.period_frames is not None and self.rms > 0.7:
-            raise ValueError(
-                "exposure_flicker: a sine of rms above 0.7 makes the exposure negative; lower it"
-            )
         return self
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
@@ -93,7 +89,7 @@ class ExposureFlicker(Effect):
             return values.copy()
         if self.period_frames is not None:
             phase = context.frames / self.period_frames + self.phase_cycles
-            factor = 1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * phase)
+            factor = np.maximum(1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * phase), 0.0)
         else:
             # log-normal: never negative, mean exactly 1
             width = np.sqrt(np.log1p(self.rms**2))
@@ -189,7 +185,7 @@ def _sine(cls: type[_T], course: ExposureCourse) -> list[_T]:
     rms = abs(line) / np.sqrt(2.0)
     # a sine that rises through the mean at frame 0 has the phase of -i
     cycles = (np.angle(line * 1j) / (2.0 * np.pi) - frequency * first) % 1.0
-    if not 0 < frequency < 0.999 or rms > 0.7:
+    if not 0 < frequency < 0.999:
         return []
     return [cls(rms=float(rms), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
 

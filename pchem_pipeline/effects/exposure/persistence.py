@@ -56,7 +56,9 @@ class Persistence(Effect):
         "dark_current_rts": "a longer run: single pixels jump up and down there, regions fade once here",
         "bias_drift": "frames without exposure: the residual stays here",
     }
-    peak_e: float = Field(ge=0, description="largest additional exposure in the first frame, e- per frame")
+    peak_e: float = Field(
+        ge=0, le=1e6, description="largest additional exposure in the first frame, e- per frame"
+    )
     decay_frames: float = Field(gt=0, description="time constant of the fading, frames")
     slow_decay_frames: float | None = Field(
         default=None, gt=0, description="time constant of a second, slower part, frames; null: none"
