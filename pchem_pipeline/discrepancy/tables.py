@@ -109,6 +109,8 @@ def pixel_laws(
         laws.moments, laws.scores, laws.good, laws.support, laws.tables, laws.codes,
         laws.fold, laws.fold_covariance, laws.bins, laws.bin_covariance,
     )  # fmt: skip
+    for covariance in (laws.fold_covariance, laws.bin_covariance):
+        covariance += np.tril(covariance, -1).T
     return laws
 
 

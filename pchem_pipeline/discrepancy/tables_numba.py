@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.law_numba import (
     N_COLUMNS,
     N_NUISANCE,
-    N_TESTS,
     NOTHING,
     fill_law,
     within,
 )
+from pchem_pipeline.discrepancy.scores_numba import pixel_scores, whiten
 
 __all__ = ["N_MOMENTS", "summarise_pixels"]
 
@@ -28,75 +28,6 @@ N_MOMENTS = 15
 MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET_K = range(8)
 CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
 _FOLD = 16
-
-
-@njit(nogil=True, cache=True)
-def _whiten(law: FloatArray, gram: FloatArray) -> bool:
-    """Make the first columns of ``law`` orthonormal in the metric sum(. . / p), the rest orthogonal to them.
-
-    Args:
-        law: columns times mass; changed in place.
-        gram: workspace (N_NUISANCE, N_COLUMNS).
-
-    Returns:
-        False if the parameters cannot be told apart.
-    """
-    n = law.shape[0]
-    gram[:] = 0.0
-    for x in range(n):
-        p = law[x, 0]
-        if p > NOTHING:
-            for i in range(N_NUISANCE):
-                value = law[x, i] / p
-                for j in range(i, N_COLUMNS):
-                    gram[i, j] += value * law[x, j]
-    # Gaussian elimination of the Gram matrix is Gram-Schmidt of the columns
-    for i in range(N_NUISANCE):
-        pivot = gram[i, i]
-        if not pivot > 1e-9:
-            return False
-        scale = 1.0 / math.sqrt(pivot)
-        for j in range(i, N_COLUMNS):
-            gram[i, j] *= scale
-        for k in range(i + 1, N_NUISANCE):
-            for j in range(k, N_COLUMNS):
-                gram[k, j] -= gram[i, k] * gram[i, j]
-    for x in range(n):
-        row = law[x]
-        for i in range(N_NUISANCE):
-            for k in range(i):
-                row[i] -= gram[k, i] * row[k]
-            row[i] /= gram[i, i]
-        for j in range(N_NUISANCE, N_COLUMNS):
-            for i in range(N_NUISANCE):
-                row[j] -= gram[i, j] * row[i]
-    return True
-
-
-@njit(nogil=True, cache=True)
-def _scores(mass: FloatArray, law: FloatArray, seen: FloatArray, out: FloatArray, sums: FloatArray) -> None:
-    """Fill ``out`` (3, N_TESTS): standardised score, skewness and kurtosis excess of one sample's score."""
-    sums[:] = 0.0
-    n = 0.0
-    for x in range(mass.size):
-        p, c = mass[x], seen[x]
-        n += c
-        if p > NOTHING:
-            for j in range(N_TESTS):
-                psi = law[x, N_NUISANCE + j] / p
-                weighted = p * psi * psi
-                sums[0, j] += c * psi
-                sums[1, j] += weighted
-                sums[2, j] += weighted * psi
-                sums[3, j] += weighted * psi * psi
-    for j in range(N_TESTS):
-        variance = sums[1, j]
-        if variance > 1e-9 and n > 0.0:
-            out[0, j] = sums[0, j] / math.sqrt(n * variance)
-            out[1, j] = sums[2, j] / (variance * math.sqrt(variance * n))
-            out[2, j] = (sums[3, j] / (variance * variance) - 3.0) / n
-        else:
-            out[:, j] = math.nan
 
 
 @njit(nogil=True, cache=True)
@@ -193,7 +124,10 @@ def _code_sums(
     bins: FloatArray,
     bin_covariance: FloatArray,
 ) -> None:
-    """Add a pixel's residuals and covariance: per code, per code modulo 16, per bin of ``coarse`` codes."""
+    """Add a pixel's residuals and covariance: per code, per code modulo 16, per bin of ``coarse`` codes.
+
+    Only the lower triangles of the covariances are filled.
+    """
     size = seen.size
     folded = np.zeros((N_NUISANCE, _FOLD))
     begin = (first - origin) // coarse
@@ -218,11 +152,13 @@ def _code_sums(
         bin_covariance[b, b] += expected[x]
     for i in range(N_NUISANCE):
         for a in range(_FOLD):
-            for b in range(_FOLD):
-                fold_covariance[a, b] -= n * folded[i, a] * folded[i, b]
+            value = n * folded[i, a]
+            for b in range(a + 1):
+                fold_covariance[a, b] -= value * folded[i, b]
         for a in range(n_bins):
-            for b in range(n_bins):
-                bin_covariance[begin + a, begin + b] -= n * binned[i, a] * binned[i, b]
+            value = n * binned[i, a]
+            for b in range(a + 1):
+                bin_covariance[begin + a, begin + b] -= value * binned[i, b]
 
 
 @njit(nogil=True, cache=True)
@@ -250,17 +186,37 @@ def _count(
 
 @njit(nogil=True, cache=True)
 def _fill_tables(
-    law: FloatArray, exposure: float, step: float, offset: float, electrons: IntArray, table: FloatArray
+    law: FloatArray,
+    inverse: FloatArray,
+    exposure: float,
+    step: float,
+    offset: float,
+    electrons: IntArray,
+    table: FloatArray,
 ) -> None:
     """Fill ``table`` (2, code) with k = E[K | x] and r = x - mu - k / g; ``offset``: mu from the first DN."""
     root = math.sqrt(exposure)
     for x in range(law.shape[0]):
-        if law[x, 0] > NOTHING:
-            k = exposure + root * law[x, 1] / law[x, 0]
+        if inverse[x] > 0.0:
+            k = exposure + root * law[x, 1] * inverse[x]
         else:  # between two peaks far apart
             k = min(max(math.floor((x - offset) / step + 0.5), float(electrons[0])), float(electrons[1]))
         table[0, x] = k
         table[1, x] = x - offset - k * step
+
+
+@njit(nogil=True, cache=True)
+def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: FloatArray) -> None:
+    """Fill what is expected of each code, the parameters moved (first order) to suit the samples."""
+    total = np.zeros(N_NUISANCE)
+    for x in range(seen.size):
+        weight = seen[x] * inverse[x]
+        if weight > 0.0:
+            for i in range(N_NUISANCE):
+                total[i] += weight * law[x, i]
+    for x in range(seen.size):
+        for i in range(N_NUISANCE):
+            expected[x] += total[i] * law[x, i]
 
 
 @njit(nogil=True, cache=True)
@@ -306,46 +262,39 @@ def summarise_pixels(
         tables: k and r, centred on the samples, (rows, 2).
         codes: counts, expectation, residual and its variance per DN, (4, n_codes).
         fold: residuals by DN modulo 16, (16,).
-        fold_covariance: theirs.
+        fold_covariance: theirs; only the lower triangle, as of all covariances.
         bins: residuals and expectation per bin, (2, n_bins).
         bin_covariance: of the residuals.
     """
-    gram, sums = np.empty((N_NUISANCE, N_COLUMNS)), np.empty((4, N_TESTS))
+    gram = np.empty((N_NUISANCE, N_COLUMNS))
     for p in range(counts.shape[0]):
         if not good[p]:
             continue
         exposure, step, bias, width = parameters[p]
-        length = window[p, 1] - window[p, 0] + 1
-        full = np.empty((length, N_COLUMNS))
+        full = np.empty((window[p, 1] - window[p, 0] + 1, N_COLUMNS))
         fill_law(exposure, step, bias - window[p, 0], width, electrons[p, 0], electrons[p, 1], full)
-        n = outside[p, 0] + outside[p, 1]
-        for b in range(counts.shape[1]):
-            n += counts[p, b]
+        n = outside[p, 0] + outside[p, 1] + counts[p].sum()
         low, high, below, above = within(full, n, allowed)
         law, first = full[low : high + 1], window[p, 0] + low
         size = high - low + 1
-        table, mass = np.empty((2, size)), law[:, 0].copy()
-        _fill_tables(law, exposure, step, bias - first, electrons[p], table)
-        if not _whiten(law, gram):
+        mass, inverse, seen, expected = np.empty(size), np.empty(size), np.empty(size), np.zeros(size)
+        for x in range(size):
+            mass[x] = law[x, 0]
+            inverse[x] = 1.0 / mass[x] if mass[x] > NOTHING else 0.0
+        table = np.empty((2, size))
+        _fill_tables(law, inverse, exposure, step, bias - first, electrons[p], table)
+        if not whiten(law, inverse, gram):
             good[p] = False
             continue
-        seen = np.empty(size)
         under, over = _count(counts[p], origin[p], first, seen, axis, codes)
-        inside = seen.sum()
-        expected = np.zeros(size)
-        for i in range(N_NUISANCE):
-            total = 0.0
-            for x in range(size):
-                if mass[x] > NOTHING:
-                    total += seen[x] * law[x, i] / mass[x]
-            for x in range(size):
-                expected[x] += total * law[x, i]
-        for x in range(length):
+        _expect(law, inverse, seen, expected)
+        for x in range(full.shape[0]):
             at = window[p, 0] + x - axis
             if 0 <= at < codes.shape[1]:
                 codes[1, at] += expected[x - low] if low <= x <= high else n * full[x, 0]
-        _scores(mass, law, seen, scores[p], sums)
+        pixel_scores(law, inverse, seen, gram, exposure, scores[p])
         out = moments[p]
+        inside = seen.sum()
         out[CHI2], out[CHI2_MEAN], out[CHI2_VARIANCE] = _goodness(law, seen, expected, inside, 5.0)
         out[EXPECTED_LOW], out[EXPECTED_HIGH] = below, above
         out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
