@@ -1,21 +1,36 @@
-"""Sudden changes of level in a noisy series: binary segmentation with local refinement.
+"""Sudden changes of level in several noisy series that share a common mode.
 
-A series of constant levels in white noise is cut where the sum of squares falls the most, the two parts are
-cut again, and so on, until no cut gains what the Bayesian information criterion asks for (Scott and Knott
-1974; Fryzlewicz 2014). Afterwards each cut is moved to its best place between its neighbours and dropped if
-it no longer pays.
+Each series is piecewise constant in white noise; whatever is added to all of them alike (drift, noise of the
+whole frame) is projected out. Cuts are added one at a time, that which lowers the sum of squares the most
+(binary segmentation: Scott and Knott 1974; Fryzlewicz 2014), with all levels fitted anew after each, so that
+a jump in one series is not taken for jumps in the others. At the end each cut is moved to its best place
+between its neighbours and dropped if it no longer pays.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["find_changes", "noise_variance", "segment_means"]
+__all__ = ["Steps", "find_steps", "noise_variance"]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Levels of one series.
+
+    Attributes:
+        starts: where each level begins, the first at 0, shape (s,).
+        levels: shape (s,), with mean 0 over the series.
+    """
+
+    starts: NDArray[np.int64]
+    levels: NDArray[np.float64]
 
 
 def noise_variance(series: NDArray[np.float64]) -> float:
@@ -29,62 +44,101 @@ def noise_variance(series: NDArray[np.float64]) -> float:
     return float(kept.mean() / 2.0 / 0.774)
 
 
-def find_changes(
-    series: NDArray[np.float64], variance: float, *, penalty: float | None = None, largest: int = 256
-) -> NDArray[np.int64]:
-    """Return where new levels begin (indices, increasing; empty if the level never changes).
+def find_steps(
+    series: NDArray[np.float64], gaps: NDArray[np.float64] | None = None, *, largest: int = 100
+) -> list[Steps]:
+    """Return the levels of each series and where they begin.
+
+    A cut must lower the sum of squares by ``4 log(n m) + 6`` times the variance of the noise (twice what the
+    Bayesian information criterion asks for: series without steps are cut about once in a thousand times).
 
     Args:
-        series: shape (n,).
-        variance: of the noise around the levels.
-        penalty: fall of the sum of squares, in units of the variance, that a cut must bring; by default
-            ``4 log n + 6``, at which a series without changes is cut about once in a thousand times.
+        series: shape (n, m), m of 2 or more.
+        gaps: time between each value and the one before, in units of the shortest, shape (n,): a change
+            during a long gap is so much likelier than one between two neighbours. All alike if None.
         largest: most cuts.
     """
-    n = series.size
+    n, m = series.shape
+    contrast = series - series.mean(axis=1, keepdims=True)
+    contrast = contrast - contrast.mean(axis=0)
+    variance = float(np.mean([noise_variance(one) for one in contrast.T])) if n > 3 else 0.0
+    starts = [[0] for _ in range(m)]
     if n < 4 or not variance > 0:
-        return np.zeros(0, np.int64)
-    least = (4.0 * np.log(n) + 6.0 if penalty is None else penalty) * variance
-    sums = np.concatenate([[0.0], np.cumsum(series - series.mean())])
-    cuts: list[int] = []
-    parts = [(0, n)]
-    while parts and len(cuts) < largest:
-        first, last = parts.pop()
-        place, gain = _best_cut(sums, first, last)
-        if gain > least:
-            cuts.append(place)
-            parts += [(first, place), (place, last)]
-    return _refined(sums, sorted(cuts), n, least)
-
-
-def segment_means(series: NDArray[np.float64], cuts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the mean of each part of the series, shape (cuts + 1,)."""
-    edges = np.concatenate([[0], cuts])
-    lengths = np.diff(np.concatenate([edges, [series.size]]))
-    return np.asarray(np.add.reduceat(series, edges) / lengths)
-
-
-def _best_cut(sums: NDArray[np.float64], first: int, last: int) -> tuple[int, float]:
-    """Return the best place to cut a part in two, and by how much the sum of squares falls."""
-    if last - first < 2:
-        return first, 0.0
-    places: NDArray[Any] = np.arange(first + 1, last)
-    left, right = places - first, last - places
-    mean_left = (sums[places] - sums[first]) / left
-    mean_right = (sums[last] - sums[places]) / right
-    gains = left * right / (left + right) * (mean_left - mean_right) ** 2
-    best = int(gains.argmax())
-    return int(places[best]), float(gains[best])
-
-
-def _refined(sums: NDArray[np.float64], cuts: list[int], n: int, least: float) -> NDArray[np.int64]:
-    """Return the cuts, each at its best place between its neighbours, without those that do not pay."""
+        return [Steps(np.zeros(1, np.int64), np.zeros(1)) for _ in range(m)]
+    bonus = 2.0 * variance * np.log(np.ones(n) if gaps is None else np.maximum(gaps, 1.0))
+    least = (4.0 * np.log(n * m) + 6.0) * variance
+    for _ in range(largest):
+        rest = contrast - _fitted(contrast, starts)[1]
+        found = max(
+            (*_best_cut(rest[:, q], first, last, bonus), q)
+            for q in range(m)
+            for first, last in zip(starts[q], [*starts[q][1:], n], strict=True)
+        )
+        if found[0] <= least:
+            break
+        starts[found[2]] = sorted([*starts[found[2]], found[1]])
     for _ in range(2):
-        kept = [0]
-        for i in range(len(cuts)):
-            upper = cuts[i + 1] if i + 1 < len(cuts) else n
-            place, gain = _best_cut(sums, kept[-1], upper)
-            if gain > least:
-                kept.append(place)
-        cuts = kept[1:]
-    return np.array(cuts, np.int64)
+        _refine(contrast, starts, bonus, least)
+    levels, _ = _fitted(contrast, starts)
+    return [
+        Steps(np.array(begins, np.int64), _centred(level, begins, n))
+        for level, begins in zip(levels, starts, strict=True)
+    ]
+
+
+def _centred(levels: NDArray[np.float64], starts: list[int], n: int) -> NDArray[np.float64]:
+    lengths = np.diff([*starts, n])
+    return np.asarray(levels - (levels * lengths).sum() / n)
+
+
+def _fitted(
+    contrast: NDArray[np.float64], starts: list[list[int]]
+) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return the least-squares levels of all series, and their contrast at each time, (n, m).
+
+    Normal equations of the contrasts: the length of a segment on the diagonal, less its overlap in time with
+    every other over m.
+    """
+    n, m = contrast.shape
+    owner = np.repeat(np.arange(m), [len(s) for s in starts])
+    first = np.concatenate([np.array(s) for s in starts])
+    last = np.concatenate([np.array([*s[1:], n]) for s in starts])
+    overlap = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
+    system = np.diag((last - first).astype(np.float64)) - overlap.clip(0) / m
+    sums = np.concatenate([np.zeros((1, m)), np.cumsum(contrast, axis=0)])
+    levels = np.linalg.lstsq(system, sums[last, owner] - sums[first, owner], rcond=1e-10)[0]
+    found = [levels[owner == q] for q in range(m)]
+    profile = np.stack([np.repeat(v, np.diff([*s, n])) for v, s in zip(found, starts, strict=True)], axis=1)
+    return found, profile - profile.mean(axis=1, keepdims=True)
+
+
+def _best_cut(
+    series: NDArray[np.float64], first: int, last: int, bonus: NDArray[np.float64]
+) -> tuple[float, int]:
+    """Return by how much the best cut of a part lowers the sum of squares, and its place."""
+    n = last - first
+    if n < 2:
+        return 0.0, first
+    left = np.arange(1, n)
+    sums = np.cumsum(series[first:last])
+    mean = sums[-1] / n
+    gains = (sums[:-1] - left * mean) ** 2 * n / (left * (n - left)) + bonus[first + 1 : last]
+    best = int(gains.argmax())
+    return float(gains[best]), first + 1 + best
+
+
+def _refine(
+    contrast: NDArray[np.float64], starts: list[list[int]], bonus: NDArray[np.float64], least: float
+) -> None:
+    """Move each cut to its best place between its neighbours; take out those that do not pay."""
+    n, m = contrast.shape
+    for q in range(m):
+        for begin in starts[q][1:]:
+            levels, profile = _fitted(contrast, starts)
+            i = starts[q].index(begin)
+            first, last = starts[q][i - 1], [*starts[q], n][i + 1]
+            part = contrast[:, q] - profile[:, q]
+            # the cut's own step comes back: a step in one of m series is this large in their contrast
+            part[begin:last] += (levels[q][i] - levels[q][i - 1]) * (1.0 - 1.0 / m)
+            gain, place = _best_cut(part, first, last, bonus)
+            starts[q] = starts[q][:i] + ([place] if gain > least else []) + starts[q][i + 1 :]

@@ -25,6 +25,8 @@ _MOST_CELLS = 1 << 24
 _SLOW_WAVES = 6
 # frequencies along frames over which the noise is taken as one
 _STRETCH = 128
+# lowest frequencies along lines (at half the resolution's steps), each with a noise of its own
+_FRAME_LIKE = 5
 
 
 @dataclass(frozen=True)
@@ -132,16 +134,19 @@ def _without_slow(field: NDArray[np.float64], frames: NDArray[np.int64]) -> NDAr
 def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the noise power around each place, so that broad humps of the spectrum are no lines.
 
-    Stretches of frequencies along frames, each at one frequency along lines: the median of exponentially
+    Stretches of frequencies along frames: long ones at each of the lowest frequencies along lines, where
+    jumps and noise of frames are, and shorter ones for all the others together. The median of exponentially
     distributed powers is log 2 of their mean.
     """
     level = np.empty_like(power)
-    pieces = np.array_split(np.arange(power.shape[0]), max(power.shape[0] // _STRETCH, 1))
-    for piece in pieces:
-        level[piece] = np.median(power[piece], axis=0) / np.log(2.0)
-    # what was fitted and taken away leaves holes: never less than the typical level
-    typical = np.median(level)
-    return np.asarray(np.maximum(level, np.float32(0.5 * typical)), np.float32)
+    length = power.shape[0]
+    for piece in np.array_split(np.arange(length), max(length // (4 * _STRETCH), 1)):
+        level[piece, :_FRAME_LIKE] = np.median(power[piece, :_FRAME_LIKE], axis=0)
+    for piece in np.array_split(np.arange(length), max(length // _STRETCH, 1)):
+        if power.shape[1] > _FRAME_LIKE:
+            level[piece, _FRAME_LIKE:] = np.median(power[piece, _FRAME_LIKE:])
+    # what was fitted and taken away leaves holes: never less than half the typical level
+    return np.asarray(np.maximum(level, np.float32(0.5) * np.median(level)) / np.log(2.0), np.float32)
 
 
 def _mean_power(

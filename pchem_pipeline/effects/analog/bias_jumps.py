@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.change_points import find_changes, noise_variance, segment_means
+from pchem_pipeline.effects.change_points import Steps, find_steps, noise_variance
 from pchem_pipeline.effects.common_modes import add_offset, quantile_means, responsivity, with_offsets
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ Path = tuple[tuple[int, float], ...]
 
 _QUADRANTS = 4
 _LOBES = 7
-_SWEEPS = 4
 _LAGS = 40
 
 
@@ -131,20 +130,18 @@ class BiasJumps(Effect):
         """
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
-        series, cuts = _contrasts(evidence.time)
-        number = sum(c.size for c in cuts)
-        drawn = _correlated(evidence.time)
-        random = [cls(amplitude_dn=drawn[0] / responsivity(evidence), rate=drawn[1])] if drawn else []
-        if not number:
+        time, alpha = evidence.time, responsivity(evidence)
+        drawn = _correlated(time)
+        random = [cls(amplitude_dn=drawn[0] / alpha, rate=drawn[1])] if drawn else []
+        found = find_steps(time.quadrant_readout.astype(np.float64), np.diff(time.frames, prepend=-1))
+        jumps = np.concatenate([np.diff(steps.levels) for steps in found])
+        if not jumps.size:
             return random
-        means = [segment_means(one, c) for one, c in zip(series.T, cuts, strict=True)]
-        steps = np.concatenate([np.diff(m) for m in means])
-        size = float(np.sqrt((steps**2).mean())) / responsivity(evidence)
-        rate = min(max(number / (_QUADRANTS * evidence.time.frames.size), 1e-6), 0.5)
-        path = tuple(
-            _as_path(evidence.time.frames, c, m / responsivity(evidence) / size)
-            for c, m in zip(cuts, means, strict=True)
-        )
+        size = float(np.sqrt((jumps**2).mean()))
+        covered = _QUADRANTS * (int(time.frames[-1]) - int(time.frames[0]) + 1)
+        rate = min(max(jumps.size / covered, 1e-6), 0.5)
+        path = tuple(_as_path(time, steps, size) for steps in found)
+        size /= alpha
         return [cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate), *random]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
@@ -176,7 +173,7 @@ def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
     The length of the run is not known here: the last level is taken to last as long as the others do.
     """
     last = max((path[-1][0] for path in paths if path), default=0)
-    end = last + max(1, last // max(1, max(len(path) for path in paths)))
+    end = last + max(1, last // max(1, max(len(path) for path in paths) - 1))
     found = [np.zeros(1)]
     for path in paths:
         starts, levels = _steps(path, end)
@@ -184,28 +181,6 @@ def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
             lasting = np.diff(np.concatenate([[0], starts[1:], [end]]))
             found.append(np.repeat(levels, np.maximum(lasting * 512 // end, 1)))
     return np.concatenate(found)
-
-
-def _contrasts(time: TimeSeries) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """Return the quadrants' means of r without what they have in common, (n, 4), and their change points.
-
-    The common mode is the median of the other three, each without its own jumps as far as they are known;
-    it is left in where it is no more than the noise of the quadrants.
-    """
-    means = time.quadrant_readout.astype(np.float64)
-    steps = np.zeros_like(means)
-    common = np.zeros_like(means)
-    cuts = [np.zeros(0, np.int64)] * _QUADRANTS
-    for _ in range(_SWEEPS):
-        for q in range(_QUADRANTS):
-            common[:, q] = np.median(np.delete(means - steps, q, axis=1), axis=1)
-            series = means[:, q] - common[:, q]
-            cuts[q] = find_changes(series, noise_variance(series))
-            lengths = np.diff(np.concatenate([[0], cuts[q], [series.size]]))
-            steps[:, q] = np.repeat(segment_means(series, cuts[q]), lengths)
-    if not _is_white((means - steps).mean(axis=1)):
-        return means - common, cuts
-    return means, [find_changes(one, noise_variance(one)) for one in means.T]
 
 
 def _correlated(time: TimeSeries) -> tuple[float, float] | None:
@@ -237,16 +212,8 @@ def _correlated(time: TimeSeries) -> tuple[float, float] | None:
     return None if best is None else best[1:]
 
 
-def _is_white(series: NDArray[np.float64]) -> bool:
-    """Return whether means of 16 values scatter as those of independent values do."""
-    bins = series[: series.size // 16 * 16].reshape(-1, 16).mean(axis=1)
-    allowed = 1.0 + 3.0 * np.sqrt(2.0 / max(bins.size, 1))
-    return bool(bins.size < 2 or 16.0 * bins.var() < allowed * noise_variance(series))
-
-
-def _as_path(
-    frames: NDArray[np.int64], cuts: NDArray[np.int64], levels: NDArray[np.float64]
-) -> tuple[tuple[int, float], ...]:
-    """Return the levels with the frames at which they begin; the middle of a gap between blocks of frames."""
-    starts = [int(frames[0]), *((frames[cuts - 1] + frames[cuts] + 1) // 2).tolist()]
-    return tuple(zip(starts, np.round(levels, 6).tolist(), strict=True))
+def _as_path(time: TimeSeries, steps: Steps, scale: float) -> Path:
+    """Return the levels over ``scale`` with the frames at which they begin (the middle of a gap in time)."""
+    cuts = steps.starts[1:]
+    starts = [int(time.frames[0]), *((time.frames[cuts - 1] + time.frames[cuts] + 1) // 2).tolist()]
+    return tuple(zip(starts, np.round(steps.levels / scale, 6).tolist(), strict=True))

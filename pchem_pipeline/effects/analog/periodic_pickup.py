@@ -110,13 +110,13 @@ class PeriodicPickup(Effect):
         time, alpha = evidence.time, responsivity(evidence)
         found: list[tuple[float, Self]] = []
         for name, means in (("cycles_per_row", time.row_readout), ("cycles_per_column", time.column_readout)):
-            line = coherent_line(means, time.frames, time.n_run)
+            line, loose = coherent_line(means, time.frames, time.n_run), incoherent_line(means)
             if line is not None:
                 fields: dict[str, Any] = {name: line.along, "cycles_per_frame": line.per_frame}
                 fields |= {"amplitude_dn": line.amplitude / alpha, "phase": line.phase}
                 found.append((line.excess, cls(**fields)))
-            loose = incoherent_line(means)
-            if loose is not None:
+            # a phase that runs on explains all that a random one would
+            if loose is not None and (line is None or line.amplitude < 0.7 * loose.amplitude):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
         return _without_doubles(found)

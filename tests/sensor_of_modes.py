@@ -1,0 +1,45 @@
+"""A small sensor for the tests of common modes, of the ADC and of the data path."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe import observe
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.evidence import Evidence
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+
+BLOCK = 50
+
+
+def drawn_truth(shape, seed=5, *, exposure=(0.5, 3.0), noise_e=(0.2, 0.3), step=(8.0, 16.0)) -> TruthMaps:
+    """Return maps of a sensor drawn evenly from ranges; bias 100..104 DN."""
+    rng = np.random.default_rng(seed)
+    gain = 1.0 / rng.uniform(*step, shape)
+    return TruthMaps(
+        quanta_exposure=rng.uniform(*exposure, shape),
+        conversion_gain=gain,
+        bias=rng.uniform(100.0, 104.0, shape),
+        analog_read_noise_e=rng.uniform(*noise_e, shape),
+        defect=np.zeros(shape, np.uint8),
+    )
+
+
+def taken(truth: TruthMaps, *effects: Effect, n_frames: int, seed: int = 1) -> NDArray[np.uint16]:
+    """Return frames (frame, y, x) of a sensor with effects."""
+    settings = SimulateSettings(shape=truth.shape, n_frames=n_frames, seed=seed, effects=effects)
+    return simulate_block(truth, settings, (0, n_frames), electron_frames=0)[0]
+
+
+def every_third_block(n_frames: int) -> NDArray[np.int64]:
+    """Return the frame numbers of every third block."""
+    return np.flatnonzero(np.arange(n_frames) // BLOCK % 3 == 0)
+
+
+def seen(frames: NDArray[np.uint16], numbers: NDArray[np.int64] | None = None) -> Evidence:
+    """Return the evidence of the numbered frames (all of them by default)."""
+    numbers = np.arange(len(frames)) if numbers is None else numbers
+    return observe(frames[numbers], numbers, n_run=len(frames), block_frames=BLOCK)

@@ -1,0 +1,208 @@
+"""What the estimators of common modes, ADC and data path make of simulated frames."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from sensor_of_modes import drawn_truth, every_third_block, seen, taken
+
+from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
+from pchem_pipeline.effects.adc.adc_inl import AdcInl
+from pchem_pipeline.effects.adc.clipping import Clipping
+from pchem_pipeline.effects.analog.bias_drift import BiasDrift
+from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
+from pchem_pipeline.effects.analog.column_noise import ColumnNoise
+from pchem_pipeline.effects.analog.frame_noise import FrameNoise
+from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
+from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.change_points import find_steps, noise_variance
+from pchem_pipeline.effects.evidence import Evidence
+from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.simulate.streams import KeyedStreams
+
+SHAPE, N_FRAMES = (24, 24), 2400
+CLASSES: tuple[type[Effect], ...] = (
+    AdcDnl, AdcInl, BiasDrift, BiasJumps, Clipping, ColumnNoise, FrameNoise, PeriodicPickup,
+    ReadoutAlternation, RepeatedFrames, RowNoise,
+)  # fmt: skip
+TRUTH = drawn_truth(SHAPE)
+
+
+@functools.cache
+def evidence_of(*effects: Effect, third: bool = True, seed: int = 1) -> Evidence:
+    frames = taken(TRUTH, *effects, n_frames=N_FRAMES, seed=seed)
+    return seen(frames, every_third_block(N_FRAMES) if third else None)
+
+
+def estimated(effect: Effect, **kwargs: Any) -> list[Any]:
+    return list(type(effect).estimate(evidence_of(effect, **kwargs)))
+
+
+def test_nothing_is_guessed_where_nothing_is():
+    # each effect fires by chance in about one stack in 300
+    fired = [c.__name__ for seed in range(4) for c in CLASSES if c.estimate(evidence_of(seed=10 + seed))]
+    assert len(fired) <= 2, fired
+
+
+@pytest.mark.parametrize(
+    ("effect", "within"),
+    [
+        # standard errors: of the mean of 576 pixels of 2.2 DN in 800 frames, 0.0033 DN, and what follows
+        (BiasDrift(drift_dn=0.3), 0.07),
+        (BiasDrift(drift_dn=-0.3), 0.07),
+        (FrameNoise(frame_noise_dn=0.3), 0.05),
+        (RowNoise(row_noise_dn=0.8), 0.05),
+        (ColumnNoise(column_noise_dn=0.8), 0.05),
+        (ReadoutAlternation(alternation_dn=-0.08), 0.025),
+        (PeriodicPickup(amplitude_dn=0.3, cycles_per_row=0.17, cycles_per_frame=0.231), 0.05),
+        (PeriodicPickup(amplitude_dn=0.3, cycles_per_frame=0.231), 0.05),
+        (PeriodicPickup(amplitude_dn=0.5, cycles_per_row=0.17, random_phase=True), 0.1),
+        (PeriodicPickup(amplitude_dn=0.3, cycles_per_column=0.4, cycles_per_frame=-0.1), 0.05),
+        (AdcDnl(dnl_lsb=0.05, pattern="bit", bit=0), 0.02),
+        (AdcDnl(dnl_lsb=-0.05, pattern="bit", bit=2), 0.03),
+        (AdcInl(inl_lsb=0.4, period_dn=60.0, phase=1.0), 0.15),
+    ],
+    ids=lambda v: v.tag if isinstance(v, Effect) else "",
+)
+def test_the_strength_is_found(effect, within):
+    first = estimated(effect)[0]
+    assert abs(getattr(first, effect.strength) - getattr(effect, effect.strength)) < within
+    for name in ("cycles_per_row", "cycles_per_frame", "cycles_per_column"):
+        if isinstance(effect, PeriodicPickup):
+            resolution = 1e-4 if "frame" in name else 0.01
+            assert abs(getattr(first, name) - getattr(effect, name)) < resolution
+    for name in ("pattern", "bit", "random_phase", "shape"):
+        assert getattr(first, name, None) == getattr(effect, name, None)
+
+
+def test_the_phase_of_pickup_predicts_the_frames_between():
+    effect = PeriodicPickup(amplitude_dn=0.4, cycles_per_row=0.17, cycles_per_frame=0.231, phase=2.0)
+    first = estimated(effect)[0]
+    t, y = np.ogrid[:N_FRAMES, : SHAPE[0]]
+    waves = [
+        np.sin(2 * np.pi * (p.cycles_per_row * y + p.cycles_per_frame * t) + p.phase) for p in (first, effect)
+    ]
+    assert (waves[0] * waves[1]).mean() > 0.45
+
+
+def test_a_drift_of_its_own_shape_is_found_as_a_path():
+    effect = BiasDrift(drift_dn=0.6, shape="path", path=(-0.5, 0.5, -0.5))
+    first = estimated(effect)[0]
+    assert first.shape == "path"
+    place = np.linspace(0, 1, 50)
+    found = first.drift_dn * np.interp(place, np.linspace(0, 1, len(first.path)), first.path)
+    true = 0.6 * np.interp(place, [0, 0.5, 1], effect.path)
+    assert np.abs(found - found.mean() - true + true.mean()).max() < 0.1
+    assert [e.shape for e in estimated(BiasDrift(drift_dn=0.6))] == ["linear"]
+
+
+def test_jumps_are_found_with_their_frames_and_levels():
+    path = (((0, 0.0), (1000, 1.0)), ((0, 0.0),), ((0, 0.0), (400, -1.0), (2000, 0.0)), ((0, 0.0),))
+    effect = BiasJumps(amplitude_dn=0.8, path=path)
+    first = estimated(effect, third=False)[0]
+    for found, true in zip(first.path, path, strict=True):
+        assert len(found) == len(true)
+        for (frame, _), (other, _) in zip(found, true, strict=True):
+            assert abs(frame - other) < 40
+        steps = [np.diff([level for _, level in p]) for p in (found, true)]
+        assert np.abs(first.amplitude_dn * steps[0] - 0.8 * steps[1]).max(initial=0.0) < 0.15
+
+
+def test_a_common_drift_is_no_jump_and_jumps_too_many_to_tell_apart_still_count():
+    assert not estimated_as(BiasJumps, BiasDrift(drift_dn=1.0))
+    assert not estimated_as(BiasJumps, FrameNoise(frame_noise_dn=0.5))
+    many = BiasJumps(amplitude_dn=0.5, rate=0.05)
+    sizes = [(e.amplitude_dn, e.rate) for e in estimated(many) if not e.path]
+    assert any(abs(a - 0.5) < 0.15 and 0.02 < q < 0.12 for a, q in sizes)
+
+
+def estimated_as(other: type[Effect], *effects: Effect) -> list[Any]:
+    return list(other.estimate(evidence_of(*effects)))
+
+
+def test_noise_of_rows_is_not_taken_for_noise_of_frames():
+    assert not estimated_as(FrameNoise, RowNoise(row_noise_dn=0.8))
+    assert not estimated_as(FrameNoise, ReadoutAlternation(alternation_dn=-0.3))
+    assert not estimated_as(PeriodicPickup, BiasDrift(drift_dn=1.0))
+    assert not estimated_as(PeriodicPickup, ReadoutAlternation(alternation_dn=-0.3))
+    assert not estimated_as(ReadoutAlternation, PeriodicPickup(amplitude_dn=0.3, cycles_per_frame=0.231))
+
+
+def test_edges_are_found_one_by_one():
+    effect = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=120, edges=(1.0,))
+    few = next(e for e in estimated(effect, third=False) if e.pattern == "edges")
+    shifts = dict(enumerate(np.array(few.edges) * few.dnl_lsb, few.first_code))
+    assert abs(shifts[120] - 0.1) < 0.03
+    assert sum(abs(s) for code, s in shifts.items() if code != 120) < 0.06
+    random = AdcDnl(dnl_lsb=0.08)
+    found = estimated(random, third=False)[-1]
+    # how far the listed shifts explain those that were simulated
+    streams = KeyedStreams(1, "effect/adc_dnl/0", np.zeros(1, np.int64), np.zeros(1, np.int64), np.arange(1))
+    drawn = streams.generator(draw=0).standard_normal(1024)
+    true = drawn[found.first_code : found.first_code + len(found.edges)]
+    assert np.corrcoef(np.diff(true), np.diff(found.edges))[0, 1] > 0.8
+
+
+def test_limits_are_found_exactly():
+    assert Clipping.estimate(evidence_of(Clipping(high=140))) == (Clipping(high=140),)
+    assert Clipping.estimate(evidence_of(Clipping(low=96))) == (Clipping(low=96),)
+    both = Clipping.estimate(evidence_of(Clipping(low=96, high=140)))
+    assert both[0] == Clipping(low=96, high=140)
+
+
+def test_repeats_are_counted():
+    listed = (20, 21, 333, 450, 750)
+    first, second = estimated(RepeatedFrames(frames=listed), third=False)
+    assert second.frames == listed
+    assert first.probability == pytest.approx(5 / (N_FRAMES - 1))
+    (part,) = estimated(RepeatedFrames(frames=listed, rows=(0, 6)), third=False)
+    assert part.rows == (0, 6)
+    assert part.probability == pytest.approx(5 / (N_FRAMES - 1))
+
+
+def test_without_an_order_in_time_nothing_is_said_about_it():
+    histograms_only = replace(evidence_of(RowNoise(row_noise_dn=0.8)), time=None)
+    for effect in CLASSES:
+        assert not effect.estimate(histograms_only) or effect in (AdcDnl, AdcInl, Clipping)
+
+
+def test_steps_of_known_series_under_a_common_mode():
+    rng = np.random.default_rng(2)
+    levels = np.zeros((1000, 4))
+    levels[:, 0] = np.repeat([0.0, 1.0, -0.5, 0.5], [300, 200, 30, 470])
+    levels[500:, 2] = 2.0
+    common = 3.0 * np.sin(np.arange(1000) / 70.0)[:, None] + rng.standard_normal((1000, 1))
+    series = levels + common + 0.3 * rng.standard_normal(levels.shape)
+    found = find_steps(series)
+    for q, starts in enumerate(([0, 300, 500, 530], [0], [0, 500], [0])):
+        assert found[q].starts.shape == (len(starts),)
+        assert np.abs(found[q].starts - starts).max() <= 2
+    assert np.abs(np.diff(found[0].levels) - [1, -1.5, 1]).max() < 5 * 0.3 * np.sqrt(1 / 30 + 1 / 200)
+    assert abs(np.diff(found[2].levels)[0] - 2) < 5 * 0.3 * np.sqrt(2 / 500)
+    # the same wave in one of the series alone is cut to pieces
+    alone = 0.3 * rng.standard_normal((1000, 4))
+    alone[:, 1] += 3.0 * np.sin(np.arange(1000) / 70.0)
+    assert find_steps(alone)[1].starts.size > 5
+
+
+def test_series_without_steps_are_left_whole():
+    rng = np.random.default_rng(3)
+    empty = [sum(s.starts.size - 1 for s in find_steps(rng.standard_normal((400, 4)))) for _ in range(100)]
+    assert sum(n > 0 for n in empty) <= 2
+    variances = [noise_variance(rng.standard_normal(400)) for _ in range(100)]
+    assert abs(np.mean(variances) - 1) < 0.05
+
+
+def test_a_change_across_a_gap_is_put_into_the_gap():
+    rng = np.random.default_rng(4)
+    series = 0.5 * rng.standard_normal((200, 4))
+    series[100:, 0] += 1.0
+    gaps = np.ones(200)
+    gaps[100] = 200.0
+    assert find_steps(series, gaps)[0].starts.tolist() == [0, 100]
