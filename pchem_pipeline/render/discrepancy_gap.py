@@ -68,7 +68,8 @@ def gap_bars(found: Findings) -> list[GapBar]:
         after, interval = step.gap.after, step.gap.interval_after
         if i == len(grown) - 1 and not math.isnan(found.gap.after):
             after, interval = found.gap.after, _known(found.gap.interval_after, interval)
-        bars.append(_bar(f"with {words}" if i == 0 else f"… and {words}", after, interval, "after"))
+        lead = "" if words.startswith("nearest") else "with " if i == 0 else "… and "
+        bars.append(_bar(f"{lead}{words}", after, interval, "after"))
     for step, _ in grown[-1:]:
         for rival, role in ((step.runner_up, "runner-up"), (step.placebo, "placebo")):
             if rival is not None:

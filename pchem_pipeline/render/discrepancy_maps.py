@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -153,7 +154,7 @@ def pixel_maps(
         else:
             _draw_map(figure, top, each, limit, flagged, origin)
         _draw_distribution(bottom, each)
-        top.set_title(each.words)
+        top.set_title(textwrap.fill(each.words, 26), fontsize=7.0)
     return figure
 
 

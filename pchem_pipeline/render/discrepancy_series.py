@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -120,7 +121,7 @@ def _bar(n: int, width_mm: float) -> float:
 
 
 def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the means of the frames over stretches of the run, of (nearly) the same number of frames each.
+    """Return the means of the frames over stretches of the run; none spans a gap between frames.
 
     Args:
         number: frame numbers, increasing, shape (n,).
@@ -129,8 +130,11 @@ def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatA
     Returns:
         Mean frame number, mean value, and number of frames of each stretch.
     """
-    edges = np.unique(np.linspace(0, number.size, min(_STRETCHES, number.size // 4) + 1).astype(np.int64))
-    if edges.size < 2:
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(number) > 1) + 1, [number.size]])
+    wanted = max(number.size // _STRETCHES, 4)
+    pieces = [np.linspace(a, b, max((b - a) // wanted, 1) + 1)[:-1] for a, b in itertools.pairwise(starts)]
+    edges = np.append(np.unique(np.concatenate(pieces).astype(np.int64)), number.size)
+    if number.size == 0:
         return np.empty(0), np.empty(0), np.empty(0)
     n = np.diff(edges).astype(np.float64)
     centre, mean = (
@@ -197,7 +201,11 @@ def _strip(axes: Axes, number: FloatArray, values: FloatArray, sd: float, path: 
         axes.fill_between(
             centre, -half, half, color="#333333", alpha=0.18, linewidth=0, label="±2 sd of chance"
         )
-    axes.plot(centre, mean, color=BLUE, linewidth=1.2, label="mean of a stretch")
+    # no line across frames that are not there
+    steps = np.diff(centre)
+    apart = np.flatnonzero(steps > 2.0 * np.median(steps)) + 1 if steps.size else np.empty(0, np.int64)
+    line = [np.insert(v, apart, np.nan) for v in (centre, mean)]
+    axes.plot(*line, color=BLUE, linewidth=1.2, marker="o", markersize=1.8, label="mean of a stretch")
     if path is not None:
         axes.plot(number, path, color=VERMILION, linewidth=1.4, linestyle="--", label="named effects")
     low, high = np.quantile(values, [0.001, 0.999]) if values.size else (-1.0, 1.0)

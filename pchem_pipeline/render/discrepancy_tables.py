@@ -23,7 +23,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
     parts = {
         "where": [_where(data, found.where)],
         "evidence": [
-            *[_candidates(data, step, i, len(found.steps)) for i, step in enumerate(found.steps)],
+            *[_candidates(data, step, i) for i, step in enumerate(found.steps)],
             _separate(found.steps),
         ],
         "shown": [_gaps(found)],
@@ -85,7 +85,7 @@ def _sentence(data: DiscrepancyData, statistic: str) -> str:
     return data.statistics.get(statistic, ("", ""))[1] or statistic
 
 
-def _candidates(data: DiscrepancyData, step: Step, index: int, n_steps: int) -> Table:
+def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     rows = []
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
     for candidate in step.candidates[:_MOST_CANDIDATES]:
@@ -100,12 +100,16 @@ def _candidates(data: DiscrepancyData, step: Step, index: int, n_steps: int) -> 
                 ", ".join(f"{name} {value}" for name, value in candidate.parameters),
             )
         )
-    names = {"named": f"{step.effect} was named", "ambiguous": "these data cannot tell them apart"}
-    outcome = names.get(step.verdict, "none of them explains it" if step.verdict == "unexplained" else "")
-    title = f"Candidates, step {index + 1}" if n_steps > 1 else "Candidates"
+    if step.effect:
+        outcome = f"{step.effect} was named"
+    elif data.found.verdict == "ambiguous":
+        outcome = "these data cannot tell them apart"
+    else:
+        outcome = "none of them explains it"
+    title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
     return Table(
         f"discrepancy-candidates-{index + 1}",
-        f"{title}: {outcome}" if outcome else title,
+        f"{title}: {outcome}",
         "Held-out score with its standard error (nats, larger is better), how far behind the best one, and "
         "the share of the probability among the candidates.",
         ("effect", "in the literature", "score", "behind", "probability", "parameters"),
@@ -155,13 +159,15 @@ def _gaps(found: Findings) -> Table:
 def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
         (
-            f"{step.effect or 'none'}: {p.name}",
+            f"{tag}: {p.name}",
             measured(p.value, p.stderr, unit_text(p.unit)),
-            data.title(step.effect) if step.effect else "",
-            data.sources.get(step.effect, ""),
+            data.title(tag) + ("" if step.effect else " (the likeliest)"),
+            data.sources.get(tag, ""),
         )
         for step in data.found.steps
+        for tag in [step.effect or next((c.effect for c in step.candidates), "")]
         for p in step.parameters
+        if tag and (step.effect or data.found.verdict == "ambiguous")
     )
     return Table(
         "discrepancy-parameters",

@@ -226,9 +226,9 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
             flags.append(Flag("note", f"To tell {rival} apart: {measurement}."))
     if found.unexplained:
-        flags.append(
-            Flag("caution", f"{len(found.unexplained)} of the statistics are left unexplained (table below).")
-        )
+        most = found.unexplained[0]
+        words = most.sentence or most.statistic
+        flags.append(Flag("caution", f"What is left shows most in: {words} ({_signed(most.z)} sd)."))
     flags += [Flag("caution", f"{name} was left out: {why}.") for name, why in found.left_out.items()]
     if found.untestable:
         flags.append(Flag("note", f"Cannot be tested by these data: {', '.join(found.untestable)}."))
