@@ -111,8 +111,10 @@ def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:
 
     A second one where it explains more by three standard deviations.
     """
-    amplitude = cells.amplitude.reshape(-1)[cells.cell]
-    power = float(np.sum(amplitude**2 / blocks.variance))
+    # cells of noise would weigh in with the time constant that they were found with
+    significant = (cells.amplitude / cells.noise) ** 2 > _PRICE_OF_CELL
+    amplitude = np.where(significant, cells.amplitude, 0.0).reshape(-1)[cells.cell]
+    power = max(float(np.sum(amplitude**2 / blocks.variance)), 1e-300)
     course = blocks.deviation @ (amplitude / blocks.variance) / power
     decays = n_run * np.geomspace(0.01, 3.0, 25)
     shapes = np.stack([_exponential(blocks, decay) for decay in decays])

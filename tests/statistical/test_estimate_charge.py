@@ -1,0 +1,215 @@
+"""Estimators of the effects on light and charge: within five standard errors of the truth, silent on noise.
+
+The evidence is that of the workflow, from simulated frames. Standard errors are those of theory, and each
+truth is many of them away from nothing.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from charge_material import a_sensor, evidence_of
+
+from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
+from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
+from pchem_pipeline.effects.charge.charge_lag import ChargeLag
+from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
+from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
+from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
+from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
+from pchem_pipeline.effects.charge_sums import block_charge, exposure_course
+from pchem_pipeline.effects.count_scores import count_excess
+from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
+from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
+from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
+from pchem_pipeline.effects.exposure.persistence import Persistence
+
+CLASSES = (
+    ExposureDrift,
+    Persistence,
+    DarkCurrentRts,
+    ExposureFlicker,
+    OverdispersedCounts,
+    BranchingCounts,
+    OpticalCrosstalk,
+    CosmicRays,
+    ChargeLag,
+    ChargeDiffusion,
+    SpuriousCharge,
+)
+TRUTH = a_sensor((24, 24))
+N = 3000
+
+
+def seen(*effects, seed=1, n_frames=N):
+    """Return the evidence of every second block of frames of a small sensor."""
+    return evidence_of(TRUTH, *effects, n_frames=n_frames, seed=seed, every=2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "hidden",
+    [(), (ChargeLag(fraction=0.3), ChargeDiffusion(fraction=0.3), SpuriousCharge(mean_e=0.3))],
+    ids=["nothing", "what cannot be seen"],
+)
+def test_noise_and_what_cannot_be_seen_give_no_hypothesis(hidden, seed):
+    evidence = seen(*hidden, seed=seed)
+    assert [h for cls in CLASSES for h in cls.estimate(evidence)] == []
+
+
+def test_evidence_without_time_gives_no_hypothesis_on_time():
+    evidence = dataclasses.replace(seen(ExposureDrift(drift=0.5)), time=None)
+    assert exposure_course(evidence) is None
+    assert block_charge(evidence) is None
+    for cls in (ExposureDrift, Persistence, DarkCurrentRts, ExposureFlicker, OpticalCrosstalk, CosmicRays):
+        assert len(cls.estimate(evidence)) == 0
+    nothing = dataclasses.replace(evidence, scores={})
+    assert count_excess(nothing, 0.0) == (0.0, np.inf)
+    unusable = dataclasses.replace(
+        seen(), maps=dataclasses.replace(evidence.maps, usable=np.zeros((24, 24), np.bool_))
+    )
+    assert all(len(cls.estimate(unusable)) == 0 for cls in CLASSES if cls is not CosmicRays)
+
+
+def shot_variance(evidence):
+    """Return the variance of a frame's relative exposure."""
+    good = evidence.maps.usable
+    return 1.0 / np.sum(evidence.charge_std[good] ** 2)
+
+
+@pytest.mark.parametrize("drift", [0.1, -0.1])
+@pytest.mark.parametrize("settling", [None, 0.1])
+def test_drift(drift, settling):
+    truth = ExposureDrift(drift=drift, settling_fraction=settling)
+    evidence = seen(truth)
+    first, *others = ExposureDrift.estimate(evidence)
+    shape = truth.course(np.linspace(0, 1, 1001))
+    stderr = np.sqrt(shot_variance(evidence) / evidence.n_frames / shape.var())
+    assert (first.settling_fraction, first.path) == (settling, ())
+    assert abs(first.drift - drift) < 5 * stderr
+    assert abs(drift) > 20 * stderr
+    assert len(others) <= 2
+
+
+def test_a_drift_of_any_course_is_followed():
+    t = np.linspace(0, 1, 60)
+    truth = ExposureDrift(drift=0.1, path=tuple(np.sin(9 * t)))
+    evidence = seen(truth)
+    first = ExposureDrift.estimate(evidence)[0]
+    at = np.linspace(0, 1, 500)
+    wanted, found = (e.drift * e.course(at) for e in (truth, first))
+    n_nodes = len(first.path)
+    stderr = np.sqrt(shot_variance(evidence) * n_nodes / evidence.n_frames)
+    assert np.sqrt(np.mean((found - found.mean() - wanted + wanted.mean()) ** 2)) < 3 * stderr
+    assert np.std(wanted) > 8 * stderr
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_flicker_from_frame_to_frame(seed):
+    evidence = seen(ExposureFlicker(rms=0.04), seed=seed)
+    (found,) = ExposureFlicker.estimate(evidence)
+    noise = shot_variance(evidence)
+    stderr = (0.04**2 + noise) * np.sqrt(3.0 / evidence.n_frames) / (2 * 0.04)
+    assert abs(found.rms - 0.04) < 5 * stderr
+    assert stderr < 0.04 / 20
+    assert found.correlation_frames == 0
+
+
+def test_flicker_with_a_memory():
+    evidence = seen(ExposureFlicker(rms=0.05, correlation_frames=4.0))
+    found = ExposureFlicker.estimate(evidence)[0]
+    # as many independent values as fit into the frames
+    independent = evidence.n_frames / 4.0
+    assert abs(found.rms / 0.05 - 1) < 5 / np.sqrt(2 * independent)
+    assert abs(found.correlation_frames / 4.0 - 1) < 5 * np.sqrt(2 / independent)
+
+
+def test_flicker_on_a_line():
+    truth = ExposureFlicker(rms=0.02, period_frames=7.3, phase_cycles=0.3)
+    evidence = seen(truth)
+    found = ExposureFlicker.estimate(evidence)[0]
+    noise = shot_variance(evidence)
+    stderr = np.sqrt(noise / evidence.n_frames)
+    assert abs(found.rms - 0.02) < 5 * stderr
+    # Rife and Boorstyn 1974: variance of a frequency
+    frequency = np.sqrt(6 * noise / evidence.n_frames) / (0.02 * np.sqrt(2) * np.pi * N)
+    assert abs(1 / found.period_frames - 1 / 7.3) < 5 * frequency + 1e-7
+    assert abs(found.phase_cycles - 0.3) < 5 * stderr / 0.02 / np.pi
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("truth", "power"),
+    [(OverdispersedCounts(relative_variance=0.03), 0.0), (BranchingCounts(branching=0.03), -1.0)],
+)
+def test_counts_that_vary_more_than_poisson(truth, power, seed):
+    evidence = seen(truth, seed=seed)
+    (found,) = type(truth).estimate(evidence)
+    strength = getattr(truth, truth.strength)
+    excess, stderr = count_excess(evidence, power)
+    if power:
+        stderr *= 0.5
+    # second order in the strength: below 5 % here
+    assert abs(getattr(found, truth.strength) - strength) < 5 * stderr + 0.05 * strength
+    assert strength > 10 * stderr
+    assert excess > 0
+
+
+def test_the_error_of_a_count_score_is_one():
+    # under the null the estimate over its error is standard normal
+    pulls = [count_excess(seen(seed=s, n_frames=1000), 0.0) for s in range(8)]
+    chi2 = sum((c / e) ** 2 for c, e in pulls)
+    assert chi2 < 8 + 5 * np.sqrt(16)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_crosstalk(seed):
+    truth = OpticalCrosstalk(probability=0.04)
+    evidence = seen(truth, seed=seed)
+    (found,) = OpticalCrosstalk.estimate(evidence)
+    pairs = sum(evidence.time.neighbour_pairs[name] for name in ("x.kk", "y.kk"))
+    # a correlation of p / 2, a little less for the width of the peaks
+    stderr = 2.0 * 1.1 / np.sqrt(pairs)
+    assert abs(found.probability - 0.04) < 5 * stderr
+    assert stderr < 0.04 / 10
+
+
+@pytest.mark.parametrize(("low", "high"), [(200.0, 200.0), (20.0, 20.0), (80.0, 20.0)])
+def test_blinking_pixels(low, high):
+    truth = DarkCurrentRts(fraction=0.06, step_e=1.2, dwell_low_frames=low, dwell_high_frames=high)
+    evidence = seen(truth)
+    found = DarkCurrentRts.estimate(evidence)
+    assert len(found) == 3
+    equal = found[0] if low == high else found[1]
+    n = 0.06 * 576
+    assert abs(equal.fraction - 0.06) < 5 * np.sqrt(0.06 * 0.94 / 576)
+    tau = 1 / (1 / low + 1 / high)
+    independent = n * N / (4 * tau)
+    assert abs(equal.step_e / 1.2 - 1) < 5 * np.hypot(0.5 / np.sqrt(independent), 0.5 / n**0.5)
+    seen_tau = 1 / (1 / equal.dwell_low_frames + 1 / equal.dwell_high_frames)
+    assert abs(np.log(seen_tau / tau)) < 5 * np.hypot(2 / np.sqrt(independent), 0.1)
+
+
+def test_persistence():
+    truth = Persistence(peak_e=0.5, decay_frames=600.0, centre_y=0.3, centre_x=0.6, radius=0.13)
+    image, spot = Persistence.estimate(seen(truth))
+    assert len(image.image) in (8, 16, 24)
+    weight = truth.pattern(np.arange(24), (24, 24)).sum()
+    stderr = np.sqrt(2.2 / (N / 2) / weight) / 0.25
+    assert stderr < 0.5 / 10
+    # the grid of radii has steps of 1.4, so the peak is known to half that
+    assert abs(spot.peak_e - 0.5) < 5 * stderr + 0.25 * 0.5
+    assert abs(spot.centre_y - 0.3) < 0.07
+    assert abs(spot.centre_x - 0.6) < 0.07
+    assert 0.09 <= spot.radius <= 0.19
+    # a curve of two parameters: the time constant is half as well known as the amplitude
+    assert abs(np.log(spot.decay_frames / 600)) < 5 * 2 * stderr / 0.5 + 0.12
+
+
+def test_tracks():
+    truth = CosmicRays(tracks_per_frame=0.05)
+    (found,) = CosmicRays.estimate(seen(truth))
+    n = 0.05 * N / 2
+    assert abs(found.tracks_per_frame / 0.05 - 1) < 5 / np.sqrt(n)
+    assert abs(found.length_um / 15.0 - 1) < 5 * 1.5 / np.sqrt(n) + 0.2
+    assert abs(found.electrons_per_um / 80.0 - 1) < 5 * 0.5 / np.sqrt(n) + 0.2
