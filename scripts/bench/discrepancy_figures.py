@@ -83,12 +83,12 @@ def wilson(hits: int, n: int) -> tuple[float, float]:
 
 def _line(title: str, hits: int, n: int, target: str, reached: bool | None) -> None:
     if n == 0:
-        print(f"  {title:62s}{'-':>9s}{'':>16s}   target {target}")
+        print(f"  {title:74s}{'-':>9s}{'':>16s}   target {target}")
         return
     low, high = wilson(hits, n)
     mark = "" if reached is None else ("  reached" if reached else "  MISSED")
     print(
-        f"  {title:62s}{hits:4d}/{n:<4d}{100 * hits / n:6.1f} % [{100 * low:.0f}, {100 * high:.0f}]"
+        f"  {title:74s}{hits:4d}/{n:<4d}{100 * hits / n:6.1f} % [{100 * low:.0f}, {100 * high:.0f}]"
         f"   target {target}{mark}"
     )
 
@@ -241,7 +241,8 @@ def _times(records: Sequence[Record]) -> None:
         stacks = sorted(r["verdict"]["replicates"] for r in records if r.get("verdict"))
         print(f"\nCPU seconds a stack: median {_median(seconds):.0f}, longest {seconds[-1]:.0f}", end="")
         print(f"; simulated stacks: median {_median(stacks):g}, most {stacks[-1]}")
-    failed = Counter(r["error"][:110] for r in records if r.get("error"))
+    errors = [r.get(kind) for r in records for kind in ("error", "bias_error")]
+    failed = Counter(error[:110] for error in errors if error)
     for error, n in failed.most_common(8):
         print(f"failed x{n}: {error}")
 

@@ -31,12 +31,9 @@ def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, 
             record |= _look(case, frames, options)
             # only now is the key opened
             record["hidden"] = json.loads(key.read_text())["effects"]
-            if with_bias and record.get("effects"):
-                affected = np.load(key.with_suffix(".npz"))[f"affected_{case.hidden[0]}"]
-                make((), case.level, case.seed, case.shape, Path(folder) / "twin", Path(folder) / "twin.json")
-                twin = np.load(Path(folder) / "twin" / "frames.npy")
-                record["bias"] = _bias(frames, twin, record.pop("effects"), affected)
-            record.pop("effects", None)
+            effects = record.pop("effects")
+            if with_bias and effects:
+                record |= _compared(case, frames, effects, key)
         # a study of hundreds of cases goes on, and counts this one as failed
         except Exception as error:
             record.pop("effects", None)
@@ -124,6 +121,17 @@ def _grown(plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tupl
     for effect in effects:
         model = effect.marginal(model, maps)
     return fit_grown(counts, origin, plain, model, plain=plain)
+
+
+def _compared(case: Case, frames: NDArray[np.uint16], effects: tuple[Any, ...], key: Path) -> dict[str, Any]:
+    """Return the bias of the maps, or why there is none: the verdict stands by itself."""
+    affected = np.load(key.with_suffix(".npz"))[f"affected_{case.hidden[0]}"]
+    folder = key.parents[1] / "twin"
+    make((), case.level, case.seed, case.shape, folder, folder / "key.json")
+    try:
+        return {"bias": _bias(frames, np.load(folder / "frames.npy"), effects, affected)}
+    except Exception as error:
+        return {"bias_error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()[-2000:]}
 
 
 def _bias(
