@@ -85,7 +85,7 @@ def largest_power(power: FloatArray, averaged: int) -> float:
     return _of_many(_log_gamma_tail(averaged, averaged * float(np.max(power))), power.size)
 
 
-def _of_many(log_tail: float, n: int) -> float:
+def _of_many(log_tail: float, n: float) -> float:
     """Return the quantile of the smallest of n p-values given its logarithm."""
     log_none = n * np.log1p(-np.exp(min(log_tail, -1e-9)))
     if log_none < -1e-6:
@@ -133,6 +133,6 @@ def extreme(count: int, on: float, beyond: float) -> float:
     return float((nothing + piled) / np.sqrt(2.0))
 
 
-def best(*z: float) -> float:
-    """Return the normal quantile of the largest of a few normal quantiles."""
-    return _of_many(float(special.log_ndtr(-max(z))), len(z))
+def best(*z: float, independent: float | None = None) -> float:
+    """Return the normal quantile of the largest of a few normal quantiles, worth so many independent ones."""
+    return _of_many(float(special.log_ndtr(-max(z))), len(z) if independent is None else independent)

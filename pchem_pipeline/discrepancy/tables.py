@@ -26,9 +26,11 @@ IntArray = NDArray[np.int64]
 LONGEST_SUPPORT = 8192
 #: Samples expected beyond the support of a pixel on either side, at most.
 ALLOWED_BEYOND = 1e-2
-_NEGLIGIBLE = 1e-4  # samples expected beyond the electron numbers considered
+#: The same far beyond it, in all pixels together.
+ALLOWED_FAR_BEYOND = 1e-2
+_NEGLIGIBLE = 1e-5  # samples expected beyond the electron numbers considered, in all pixels
 _LONGEST_AXIS = 1 << 17
-_COARSE, _MOST_BINS = 8, 256
+_COARSE, _MOST_BINS = 16, 256
 _SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
 
 
@@ -45,7 +47,8 @@ class PixelLaws:
         first_code: DN of the first element of ``codes``.
         codes: observed, expected, residual, its variance, (4, n_codes).
         fold, fold_covariance: residuals by DN modulo 16.
-        bins, bin_covariance: residuals and expectation by bins of 8 (or more) codes.
+        bins, bin_covariance: score of a shift of the scale, its variance for given expectations, and
+            expectation by bins of 16 (or more) codes.
     """
 
     good: NDArray[np.bool_]
@@ -81,7 +84,7 @@ def pixel_laws(
     natural = _natural(parameters, usable)
     window, electrons = np.zeros((n, 2), np.int64), np.zeros((n, 2), np.int64)
     samples = float(counts.sum(axis=1).max(initial=1)) + float(outside.sum(axis=1).max(initial=0.0))
-    supports(*np.ascontiguousarray(natural.T), np.log(_NEGLIGIBLE / samples), electrons, window)
+    supports(*np.ascontiguousarray(natural.T), np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
     length = window[:, 1] - window[:, 0] + 1
     good = usable & (length <= LONGEST_SUPPORT)
     rows = np.where(good, length, 0)
@@ -101,11 +104,12 @@ def pixel_laws(
         codes=np.zeros((4, n_codes)),
         fold=np.zeros(16),
         fold_covariance=np.zeros((16, 16)),
-        bins=np.zeros((2, n_bins)),
+        bins=np.zeros((3, n_bins)),
         bin_covariance=np.zeros((n_bins, n_bins)),
     )
     kernel.summarise_pixels(
         counts, origin, outside, natural, electrons, window, start, axis, coarse, ALLOWED_BEYOND,
+        ALLOWED_FAR_BEYOND / good.sum(),
         laws.moments, laws.scores, laws.good, laws.support, laws.tables, laws.codes,
         laws.fold, laws.fold_covariance, laws.bins, laws.bin_covariance,
     )  # fmt: skip

@@ -24,9 +24,10 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 #: Columns of ``moments``, see :func:`_channels` for the first eight.
-N_MOMENTS = 15
+N_MOMENTS = 19
 MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET_K = range(8)
 CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
+EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
 _FOLD = 16
 
 
@@ -114,6 +115,7 @@ def _code_sums(
     law: FloatArray,
     seen: FloatArray,
     expected: FloatArray,
+    shift: FloatArray,
     n: float,
     first: int,
     origin: int,
@@ -126,6 +128,8 @@ def _code_sums(
 ) -> None:
     """Add a pixel's residuals and covariance: per code, per code modulo 16, per bin of ``coarse`` codes.
 
+    In the bins they are weighted with what a shift of the scale does to each code, so that they sum to the
+    shift of the scale there.
     Only the lower triangles of the covariances are filled.
     """
     size = seen.size
@@ -142,14 +146,15 @@ def _code_sums(
             u = law[x, i]
             used += u * u
             folded[i, modulo] += u
-            binned[i, b - begin] += u
+            binned[i, b - begin] += u * shift[x]
         codes[2, at] += residual
         codes[3, at] += max(0.0, expected[x] - n * used)
         fold[modulo] += residual
         fold_covariance[modulo, modulo] += expected[x]
-        bins[0, b] += residual
-        bins[1, b] += expected[x]
-        bin_covariance[b, b] += expected[x]
+        bins[0, b] += residual * shift[x]
+        bins[1, b] += expected[x] * shift[x] ** 2
+        bins[2, b] += expected[x]
+        bin_covariance[b, b] += expected[x] * shift[x] ** 2
     for i in range(N_NUISANCE):
         for a in range(_FOLD):
             value = n * folded[i, a]
@@ -231,6 +236,7 @@ def summarise_pixels(
     axis: int,
     coarse: int,
     allowed: float,
+    allowed_far: float,
     moments: FloatArray,
     scores: FloatArray,
     good: NDArray[np.bool_],
@@ -255,6 +261,7 @@ def summarise_pixels(
         axis: DN of the first code of ``codes``.
         coarse: codes in a bin of ``bins``.
         allowed: samples expected beyond the support on either side, at most.
+        allowed_far: the same for samples far beyond.
         moments: see the constants, (n, N_MOMENTS).
         scores: standardised score, its skewness and kurtosis excess, (n, 3, N_TESTS).
         good: pixels to do; unset where the parameters cannot be told apart, (n,).
@@ -263,7 +270,7 @@ def summarise_pixels(
         codes: counts, expectation, residual and its variance per DN, (4, n_codes).
         fold: residuals by DN modulo 16, (16,).
         fold_covariance: theirs; only the lower triangle, as of all covariances.
-        bins: residuals and expectation per bin, (2, n_bins).
+        bins: scores of a shift, variance for given expectations, and expectation per bin, (3, n_bins).
         bin_covariance: of the residuals.
     """
     gram = np.empty((N_NUISANCE, N_COLUMNS))
@@ -299,11 +306,19 @@ def summarise_pixels(
         out[EXPECTED_LOW], out[EXPECTED_HIGH] = below, above
         out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
         _channels(mass, table[0], table[1], seen, out[SEEN_LOW], out[SEEN_HIGH], out)
+        far_low, far_high, out[EXPECTED_FAR_LOW], out[EXPECTED_FAR_HIGH] = within(full, n, allowed_far)
+        out[SEEN_FAR_LOW], out[SEEN_FAR_HIGH] = outside[p]
+        for b in range(counts.shape[1]):
+            at = origin[p] + b - window[p, 0]
+            if at < far_low:
+                out[SEEN_FAR_LOW] += counts[p, b]
+            elif at > far_high:
+                out[SEEN_FAR_HIGH] += counts[p, b]
         support[p, 0], support[p, 1], support[p, 2] = first, size, start[p]
         for x in range(size):
             tables[start[p] + x, 0], tables[start[p] + x, 1] = table[0, x], table[1, x]
         if first >= axis and first + size <= axis + codes.shape[1]:
             _code_sums(
-                law, seen, expected, inside, first, axis, coarse,
+                law, seen, expected, table[1] / (width * width + 1.0 / 12.0), inside, first, axis, coarse,
                 codes, fold, fold_covariance, bins, bin_covariance,
             )  # fmt: skip

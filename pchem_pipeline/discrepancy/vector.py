@@ -25,6 +25,9 @@ STANDS_OUT = 3.5
 _TAIL = 2.3262907903552504e-4  # of the normal distribution, above STANDS_OUT
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
 _SHORT_END = 0.25
+_LOW, _HIGH = [column.SEEN_LOW, column.EXPECTED_LOW], [column.SEEN_HIGH, column.EXPECTED_HIGH]
+_FAR_LOW = [column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW]
+_FAR_HIGH = [column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH]
 _SMALLEST_EIGENVALUE = 0.02  # of residuals, relative to Poisson counts: below it the fits have absorbed them
 
 
@@ -75,15 +78,24 @@ def marginal_statistics(
     found["shape.goodness.mean"] = float(z.sum() / np.sqrt(n))
     found["shape.goodness.chi"] = float((np.sum(z**2) - n) / np.sqrt(2.0 * n))
     found["shape.goodness.cnt"] = outliers(z, two_sided=False)
-    for side, seen, expected in (
-        ("low", moments[:, column.SEEN_LOW], moments[:, column.EXPECTED_LOW]),
-        ("high", moments[:, column.SEEN_HIGH], moments[:, column.EXPECTED_HIGH]),
+    for side, near, far in (
+        ("low", moments[:, _LOW], moments[:, _FAR_LOW]),
+        ("high", moments[:, _HIGH], moments[:, _FAR_HIGH]),
     ):
-        found[f"tail.{side}.count"] = laws.poisson(int(seen.sum()), float(expected.sum()))
-        found[f"tail.{side}.pixels"] = laws.poisson(
-            int(np.count_nonzero(seen)), float(-np.expm1(-expected).sum())
-        )
+        found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
+        pixels_near = [np.count_nonzero(near[:, 0]), -np.expm1(-near[:, 1]).sum()]
+        pixels_far = [np.count_nonzero(far[:, 0]), -np.expm1(-far[:, 1]).sum()]
+        found[f"tail.{side}.pixels"] = _beyond(np.array(pixels_near), np.array(pixels_far))
     return found | _code_statistics(pixels, residuals)
+
+
+def _beyond(near: FloatArray, far: FloatArray) -> float:
+    """Return the statistic of samples (seen, expected) beyond the support and far beyond it.
+
+    Few samples of heavy tails are far out, where none is expected; many of a lobe are near.
+    """
+    z = laws.poisson(int(near[0]), float(near[1]))
+    return laws.best(z, laws.poisson(int(far[0]), float(far[1]))) if far[0] > 0 else z
 
 
 def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str, float]:
@@ -121,7 +133,9 @@ def _code_statistics(pixels: PixelLaws, residuals: CodeResiduals) -> dict[str, f
         )
     if judged.any():
         found["code.largest"] = laws.largest_normal(z[judged])
-    smooth = _absorbed_chi_square(pixels.bins[0], pixels.bin_covariance, pixels.bins[1])
+    smooth = _absorbed_chi_square(
+        pixels.bins[0], pixels.bin_covariance, np.where(pixels.bins[2] >= _ENOUGH, pixels.bins[1], 0.0)
+    )
     if np.isfinite(smooth):
         found["code.smooth"] = smooth
     at = np.array([residuals.maximum, residuals.minimum]) - residuals.first
@@ -156,7 +170,7 @@ def _absorbed_chi_square(values: FloatArray, covariance: FloatArray, poisson: Fl
     Directions in which hardly any variance is left of that of Poisson counts are left out: there the
     linear theory of the fits is not exact enough.
     """
-    used = poisson >= _ENOUGH
+    used = poisson > 0
     if not used.any():
         return float("nan")
     scale = 1.0 / np.sqrt(poisson[used])

@@ -33,6 +33,7 @@ IntArray = NDArray[np.int64]
 
 CHANNELS = ("charge", "readout")
 SHORTEST_PERIODOGRAM = 8
+_SLOWEST = (2, 4, 8, 16, 32)
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,32 @@ class FrameView:
         starts = self.edges[:-1][np.diff(self.edges) == self.block_frames]
         return np.asarray(series[starts[:, None] + np.arange(self.block_frames)])
 
+    def slow_modes(self) -> FloatArray:
+        """Return orthonormal waves along the blocks, slowest first, that centring leaves, (modes, b)."""
+        root = np.sqrt(np.diff(self.edges).astype(np.float64))
+        middle = 0.5 * (self.edges[:-1] + self.edges[1:]) / self.n
+        order = np.arange(min(root.size, 1 + _SLOWEST[-1]))
+        basis, _ = np.linalg.qr(np.cos(np.pi * order * middle[:, None]) * root[:, None])
+        return np.asarray(basis[:, 1:].T)
+
+    def slow(self, series: FloatArray, freedom: int = 1) -> float:
+        """Return the statistic of slow variation of centred series of variance 1.
+
+        The squares of the slowest 2, 4, 8 ... waves over the blocks are summed, and those of all; the most
+        significant sum counts (the adaptive test of Neyman, Fan 1996).
+
+        Args:
+            series: sums over the blocks, divided by the root of their length, (b, m).
+            freedom: independent series among the m.
+        """
+        energy = np.cumsum(np.sum((self.slow_modes() @ series) ** 2, axis=1))
+        unit = freedom * self.n / (self.n - 1.0)
+        cuts = [c for c in _SLOWEST if c < self.edges.size - 2]
+        z = [laws.chi_square(energy[c - 1], c * unit, 2.0 * c * freedom) for c in cuts]
+        z.append(laws.chi_square(np.sum(series**2), freedom * self.freedom))
+        # sums that share terms are alike
+        return laws.best(*(float(value) for value in z), independent=0.5 * (1 + len(z)))
+
     def block_sums(self, series: FloatArray) -> FloatArray:
         """Return ``sum of each block / sqrt(n_b)`` of a series (n, ...), (b, ...)."""
         lengths = np.diff(self.edges).reshape(-1, *[1] * (series.ndim - 1))
@@ -129,7 +156,7 @@ def frame_statistics(view: FrameView, expected_repeats: tuple[float, float]) -> 
         sign -= sign.mean()
         found[f"frame.{name}.variance"] = float(laws.chi_square(u @ u, view.n))
         found[f"frame.{name}.lag1"] = _lag1(view, u)
-        found[f"frame.{name}.slow"] = float(laws.chi_square(np.sum(view.block_sums(u) ** 2), view.freedom))
+        found[f"frame.{name}.slow"] = view.slow(view.block_sums(u)[:, None])
         found[f"frame.{name}.trend"] = _trend(view, u)
         line = _line(view, u)
         if line is not None:
@@ -144,7 +171,7 @@ def frame_statistics(view: FrameView, expected_repeats: tuple[float, float]) -> 
     rho = float(pixels.cross.sum() / np.sqrt(pixels.charge.sum() * pixels.readout.sum()))
     found["frame.covariance"] = float((k @ r - view.n * rho) / np.sqrt(view.n * (1.0 + rho**2)))
     gain = view.sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
-    found["frame.gain.slow"] = float(laws.chi_square(np.sum(view.block_sums(gain) ** 2), view.freedom))
+    found["frame.gain.slow"] = view.slow(view.block_sums(gain)[:, None])
     found["frame.gain.trend"] = _trend(view, gain)
     found["frame.repeated"] = laws.repeats(view.sums.repeated.size, expected_repeats[0])
     found["frame.repeated_rows"] = laws.repeats(view.sums.repeated_rows, expected_repeats[1])
@@ -180,7 +207,7 @@ def _quadrants(view: FrameView, channel: int) -> float | None:
     scale = np.sqrt(variance[some])
     u = quadrant_series(view.sums.rows[2 * channel : 2 * channel + 2])[:, some] / scale
     rest = without_mode(view.block_sums(u), quadrant_sums(view.mode(channel))[some] / scale)
-    return float(laws.chi_square(np.sum(rest**2), (some.sum() - 1) * view.freedom))
+    return view.slow(rest, int(some.sum()) - 1)
 
 
 def pixel_lags(view: FrameView) -> FloatArray:
@@ -220,9 +247,10 @@ def time_statistics(view: FrameView, lags: FloatArray) -> dict[str, float]:
 def _block_statistics(view: FrameView, channel: int, name: str) -> dict[str, float]:
     sums, mode = view.sums.blocks[:, channel], view.mode(channel)
     rest = sums - (sums.sum(axis=(1, 2)) / mode.sum())[:, None, None] * mode
-    chi2 = (rest**2 / np.diff(view.edges)[:, None, None]).sum(axis=0) / view.remaining(channel)
-    chi2 = chi2[view.pixels.usable]
+    lengths = np.diff(view.edges)[:, None]
+    u = rest[:, view.pixels.usable] / np.sqrt(lengths * view.remaining(channel)[view.pixels.usable])
+    chi2 = np.sum(u**2, axis=0)
     return {
-        f"time.block.{name}.chi": float(laws.chi_square(chi2.sum(), chi2.size * view.freedom)),
+        f"time.block.{name}.chi": view.slow(u, chi2.size),
         f"time.block.{name}.cnt": outliers(laws.chi_square(chi2, view.freedom), two_sided=False),
     }
