@@ -81,7 +81,7 @@ def codes(
     top.stairs(observed, edges, fill=True, color=GRAY, label="observed")
     top.stairs(expected, edges, color=BLACK, linewidth=0.9, label="expected from the fitted PCDs")
     top.set_yscale("log")
-    top.set_ylim(0.5, 4.0 * max(observed.max(), 1.0))
+    top.set_ylim(0.5, (4.0 if width_mm > 1.5 * COLUMN_MM else 200.0) * max(observed.max(), 1.0))
     top.set_ylabel("samples per DN")
     top.legend(loc="upper right")
     even = dn % 2 == 0
@@ -165,7 +165,7 @@ def frame_strip(
         marked: places whose frames are shaded.
         width_mm: width of the figure.
     """
-    figure = new_figure(width_mm, 92.0)
+    figure = new_figure(width_mm, 96.0)
     both = figure.subplots(2, 1, sharex=True)
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     sds = np.asarray(arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
@@ -183,7 +183,9 @@ def frame_strip(
             if place.channel in (channel, "cross", "") or not place.channel:
                 _mark_frames(axes, place.frames, number)
     both[1].set_xlabel("frame")
-    both[0].legend(loc="upper right", ncols=3)
+    handles, labels = both[0].get_legend_handles_labels()
+    columns = 5 if width_mm > 1.5 * COLUMN_MM else 2
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, markerscale=2.0)
     return figure
 
 
@@ -216,7 +218,7 @@ def _strip(axes: Axes, number: FloatArray, values: FloatArray, sd: float, path: 
         *((path.min(), path.max()) if path is not None else ()),
     ]
     spread = max(float(max(extremes) - min(extremes)), 1e-12)
-    axes.set_ylim(min(extremes) - 0.08 * spread, max(extremes) + 0.35 * spread)
+    axes.set_ylim(min(extremes) - 0.08 * spread, max(extremes) + 0.08 * spread)
     axes.yaxis.set_major_locator(MaxNLocator(5))
     outside = int(((values < axes.get_ylim()[0]) | (values > axes.get_ylim()[1])).sum())
     if outside:

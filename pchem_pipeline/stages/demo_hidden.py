@@ -77,8 +77,9 @@ def run_hidden_demo(
     _check_folder(output, asked)
     if not (output / SEALED_KEY).exists():
         root = seed if seed is not None else _new_seed() if hidden == RANDOM else 1
-        _hide(output, hidden, size, n_frames, root)
+        # first, so that a demonstration stopped here can start again; the key comes last
         write_json(output / _ASKED, asked)
+        _hide(output, hidden, size, n_frames, root)
     command = Command(quiet=quiet)
     if not (output / _PLAIN_MAPS).exists():
         _run_plain(output, command)
