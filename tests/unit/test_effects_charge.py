@@ -391,7 +391,8 @@ def test_the_law_of_the_electron_number_and_what_leaves_it_alone():
     assert (law.law, law.dispersion) == ("borel", 0.2)
     law = OpticalCrosstalk(probability=0.2).marginal(plain, None)
     assert law.exposure_factors.tolist() == [1.2]
-    for cls in (Persistence, DarkCurrentRts, CosmicRays, ChargeLag, ChargeDiffusion, SpuriousCharge):
+    assert 0 < CosmicRays(tracks_per_frame=0.1).marginal(plain, None).outlier_share < 1e-5
+    for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion, SpuriousCharge):
         assert cls.typical()[0].marginal(plain, None) is plain
 
 

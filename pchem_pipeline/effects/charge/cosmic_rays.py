@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["CosmicRays"]
 
@@ -28,6 +29,8 @@ __all__ = ["CosmicRays"]
 _POINTS = 8
 # the evidence lists no more hits than this
 _MOST_HITS = 20_000
+# of a pixel's samples: enough for the fit to disregard those far off, too little to matter for the others
+_SHARE_OF_SAMPLES = 1e-6
 
 
 @register_effect
@@ -126,6 +129,10 @@ class CosmicRays(Effect):
         if not per_um > 0:
             return ()
         return (cls(tracks_per_frame=float(tracks / n_seen), length_um=length, electrons_per_um=per_um),)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law in which a sample may, very rarely, be anything: how rarely does not matter."""
+        return model.with_outliers(_SHARE_OF_SAMPLES) if self.tracks_per_frame > 0 else model
 
 
 def _poisson_upper(u: float, mean: float) -> int:
