@@ -35,10 +35,11 @@ from pchem_pipeline.model.grown_types_numba import (
     Room,
 )
 
-_NEAR = 8.5  # standard deviations within which a component is added where no sample is an outlier
-_NEAR_CUT = 1e-17  # probability below which an electron number is left out then
-_CUT = 1e-305
-_OUTLIER = 1e-9  # an occupied cell of smaller mass calls for everything to be added
+# how far out components are added, in three stages: standard deviations, probability below which an electron
+# number is left out, and the mass of an occupied cell below which the next stage is called for
+_REACH = (8.5, 15.0, FARTHEST)
+_CUT = (1e-17, 1e-50, 1e-305)
+_OUTLIER = (1e-9, 1e-40, 0.0)
 _LEAST_MASS = 1e-300
 _LEAST_VARIANCE = 1e-6  # DN^2
 
@@ -171,6 +172,12 @@ def _add_masses(
                 slopes[BIAS, i] += by_mean * d1
                 slopes[LOG_VARIANCE, i] += log1 * d1 + log2 * d2
                 slopes[LOBE, i] += w_lobe * d0
+    if law.outlier_share > 0.0:
+        rest = 1.0 - law.outlier_share
+        for i in range(cells.n_bins):
+            mass[i] = rest * mass[i] + law.outlier_mass
+            for j in range(N_THETA):
+                slopes[j, i] *= rest
     return count
 
 
@@ -181,17 +188,29 @@ def masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> tu
     Returns:
         Number of electron numbers in use, and how many standard deviations a component reaches.
     """
-    count = _add_masses(theta, cells, law, _NEAR, _NEAR_CUT, room)
-    for i in range(cells.n_bins):
-        if cells.weights[i] > 0.0 and not room.mass[i] > _OUTLIER:
-            return _add_masses(theta, cells, law, FARTHEST, _CUT, room), FARTHEST
-    return count, _NEAR
+    count = stage = 0
+    while stage < len(_REACH):
+        count = _add_masses(theta, cells, law, _REACH[stage], _CUT[stage], room)
+        lowest = 1.0
+        for i in range(cells.n_bins):
+            if cells.weights[i] > 0.0:
+                lowest = min(lowest, room.mass[i])
+        if lowest >= _OUTLIER[stage]:
+            break
+        stage += 1
+    return count, _REACH[stage]
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def near_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> None:
+    """Fill mass and slopes of the cells, only as far out as most samples lie."""
+    _add_masses(theta, cells, law, _REACH[0], _CUT[0], room)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def all_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> None:
     """Fill mass and slopes of the cells, to the ends of the tails."""
-    _add_masses(theta, cells, law, FARTHEST, _CUT, room)
+    _add_masses(theta, cells, law, _REACH[2], _CUT[2], room)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -212,7 +231,7 @@ def evaluate(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> 
         elif weight > 0.0:
             loglik += weight * math.log(mass)
             ratio = weight / mass
-            room.ratio[cell] = ratio
+            room.ratio[cell] = ratio * (1.0 - law.outlier_share)
             for i in range(N_THETA):
                 score[i] += ratio * slopes[i, cell]
                 for j in range(i + 1):

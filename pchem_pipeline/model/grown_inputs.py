@@ -114,6 +114,8 @@ def pack(model: MarginalModel, n: int) -> Law:
         np.ascontiguousarray(model.edge_shift, np.float64),
         -_NO_LIMIT if model.clip_low is None else int(model.clip_low),
         _NO_LIMIT if model.clip_high is None else int(model.clip_high),
+        float(model.outlier_share),
+        float(model.outlier_share) / model.outlier_codes,
         np.array(model.free_lobe_pattern, np.float64).reshape(-1, 2),
         _normal_table(),
     )

@@ -8,8 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.grown_cells_numba import evaluate
-from pchem_pipeline.model.grown_newton_numba import climb, factor, find_held, newton_step, solve
+from pchem_pipeline.model.grown_newton_numba import climb, factor, find_held, solve
 from pchem_pipeline.model.grown_types_numba import (
     BIAS,
     LOBE,
@@ -44,7 +43,6 @@ N_WORDS = 3
 _ROUNDING = 1.0 / 12.0
 _LEAST_VARIANCE = 1e-6  # DN^2
 _LEAST_SHARE = 0.1  # of the variance that the plain fit found, left to the pixel itself at the start
-_SCREEN = 0.2  # of the rise asked of free lobes, seen from the fit without them
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -201,7 +199,13 @@ def from_theta(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def climb_neighbours(
-    theta: NDArray[np.float64], loglik: float, cells: Cells, law: Law, limits: NDArray[np.float64], room: Room
+    theta: NDArray[np.float64],
+    loglik: float,
+    cells: Cells,
+    law: Law,
+    limits: NDArray[np.float64],
+    lobe_free: bool,
+    room: Room,
 ) -> tuple[float, float, int]:
     """Move to a neighbour (H -+ 1, mu +- 1/g) while one is more likely.
 
@@ -228,7 +232,7 @@ def climb_neighbours(
                 limits[MIN_LOG_EXPOSURE],
                 limits[TOLERANCE],
                 int(limits[MAX_EVALUATIONS]),
-                False,
+                lobe_free,
                 loglik - limits[CLEAR_GAP],
                 room,
             )
@@ -244,59 +248,3 @@ def climb_neighbours(
                 theta[i] = trial[i]
             moves += 1
     return loglik, beside, used
-
-
-@nb.njit(nogil=True, cache=True, error_model="numpy")
-def lobe_weight(cells: Cells, room: Room) -> tuple[float, float]:
-    """Return the likeliest weight of the free lobes, all else as it is, and the rise of the log-likelihood.
-
-    The masses are linear in the weight, so the log-likelihood is concave: Newton steps, halved inside 0..1.
-    """
-    weight, low, high = 0.02, 0.0, 1.0
-    for _ in range(30):
-        slope = bend = 0.0
-        for i in range(cells.n_bins):
-            if cells.weights[i] > 0.0 and room.mass[i] > 0.0:
-                ratio = room.slopes[LOBE, i] / (room.mass[i] + weight * room.slopes[LOBE, i])
-                slope += cells.weights[i] * ratio
-                bend += cells.weights[i] * ratio * ratio
-        if slope > 0.0:
-            low = weight
-        else:
-            high = weight
-        following = weight + slope / bend if bend > 0.0 else 0.5 * (low + high)
-        if not low < following < high:
-            following = 0.5 * (low + high)
-        if abs(following - weight) < 1e-4 * weight + 1e-7:
-            break
-        weight = following
-    rise = 0.0
-    for i in range(cells.n_bins):
-        if cells.weights[i] > 0.0 and room.mass[i] > 0.0:
-            rise += cells.weights[i] * math.log1p(weight * room.slopes[LOBE, i] / room.mass[i])
-    return weight, rise
-
-
-@nb.njit(nogil=True, cache=True, error_model="numpy")
-def seek_lobe(
-    theta: NDArray[np.float64], cells: Cells, law: Law, limits: NDArray[np.float64], room: Room
-) -> tuple[float, int]:
-    """Fit the weight of the free lobes of ``cells`` too, from the fit without; ``theta`` is updated.
-
-    Returns:
-        The log-likelihood, -inf where nothing speaks for these lobes; evaluations.
-    """
-    held, step = np.zeros(N_THETA, np.bool_), np.empty(N_THETA)
-    bound = limits[MIN_LOG_EXPOSURE]
-    evaluate(theta, cells, law, room)
-    weight, rise = lobe_weight(cells, room)
-    find_held(theta, room.score, bound, True, held)
-    expected, _ = newton_step(room, held, 0.0, step)
-    least = _SCREEN * limits[LOBE_RISE]
-    if not (rise > least or expected > least):
-        return -math.inf, 1
-    theta[LOBE] = max(weight, 0.005)
-    fine, loglik, used = climb(
-        theta, cells, law, bound, limits[TOLERANCE], int(limits[MAX_EVALUATIONS]), True, -math.inf, room
-    )
-    return loglik if fine else -math.inf, used + 1

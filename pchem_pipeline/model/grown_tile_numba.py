@@ -8,8 +8,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.goodness_numba import pearson
+from pchem_pipeline.model.goodness_numba import normal_score, pearson
 from pchem_pipeline.model.grown_cells_numba import all_masses, evaluate, masses
+from pchem_pipeline.model.grown_lobes_numba import search_lobes
 from pchem_pipeline.model.grown_newton_numba import climb
 from pchem_pipeline.model.grown_numba import (
     AMPLITUDE,
@@ -19,7 +20,6 @@ from pchem_pipeline.model.grown_numba import (
     EVALUATIONS,
     FREEDOM,
     GAP,
-    LOBE_RISE,
     LOBE_WEIGHT,
     LOG_LIKELIHOOD,
     MAX_EVALUATIONS,
@@ -30,7 +30,6 @@ from pchem_pipeline.model.grown_numba import (
     from_theta,
     make_cells,
     make_lobes,
-    seek_lobe,
     to_theta,
 )
 from pchem_pipeline.model.grown_types_numba import (
@@ -41,57 +40,30 @@ from pchem_pipeline.model.grown_types_numba import (
     Room,
     make_room,
 )
-from pchem_pipeline.model.workspace_numba import load
+from pchem_pipeline.model.workspace_numba import Histogram, load
 
 _LEAST_MASS = 1e-300
+_SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for other starts of free lobes
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _search_lobes(
-    theta: NDArray[np.float64],
-    loglik: float,
-    cells: Cells,
-    law: Law,
-    place: tuple[int, int, int],
-    amplitudes: NDArray[np.float64],
-    limits: NDArray[np.float64],
-    room: Room,
-) -> tuple[float, float, int]:
-    """Try free lobes of each amplitude; keep the best in ``theta`` where the likelihood rises by enough.
-
-    Returns:
-        The amplitude kept, e-, 0 without one; its log-likelihood; evaluations.
-    """
-    trial, best = np.empty(N_THETA), np.empty(N_THETA)
-    kept, highest, used = 0.0, loglik + limits[LOBE_RISE], 0
-    pixel, first_code, centre = place
-    space = cells.weights, cells.edges, cells.lobes
-    for amplitude in amplitudes:
-        own = make_cells(law, pixel, amplitude, first_code, centre, cells.n_bins, space)
-        for i in range(N_THETA):
-            trial[i] = theta[i]
-        found, count = seek_lobe(trial, own, law, limits, room)
-        used += count
-        if found > highest:
-            kept, highest = amplitude, found
-            for i in range(N_THETA):
-                best[i] = trial[i]
-    if kept > 0.0:
-        for i in range(N_THETA):
-            theta[i] = best[i]
-        return kept, highest, used
-    return 0.0, loglik, used
+def _goodness(cells: Cells, n: float, room: Room) -> tuple[float, int]:
+    """Return chi-square and degrees of freedom of the masses in ``room``; its ratios are overwritten."""
+    for i in range(cells.n_bins):
+        room.ratio[i] = n * room.mass[i]
+    chi2, freedom = pearson(cells.weights, room.ratio, cells.n_bins, n)
+    return chi2, freedom
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def fit_pixel(
     theta: NDArray[np.float64],
+    histogram: Histogram,
     cells: Cells,
     law: Law,
     place: tuple[int, int, int],
     amplitudes: NDArray[np.float64],
     gap: float,
-    n: float,
     limits: NDArray[np.float64],
     room: Room,
     out: NDArray[np.float64],
@@ -100,12 +72,12 @@ def fit_pixel(
 
     Args:
         theta: start; out: the maximum.
+        histogram: of the pixel.
         cells: of the pixel, without free lobes.
         law: grown model.
         place: the pixel's place in the arrays of the law, the code of the first cell, the centre.
         amplitudes: of free lobes, e-.
         gap: nats between the plain fit and its runner-up; the neighbours are tried where it is small.
-        n: number of samples.
         limits: bounds and limits, see :mod:`.grown_numba`.
         room: scratch.
         out: out, a row of results.
@@ -119,24 +91,26 @@ def fit_pixel(
         return False, used, 0
     out[GAP] = gap
     if gap < limits[CLEAR_GAP]:
-        loglik, beside, count = climb_neighbours(theta, loglik, cells, law, limits, room)
+        loglik, beside, count = climb_neighbours(theta, loglik, cells, law, limits, False, room)
         if beside > -math.inf:
             out[GAP] = loglik - beside
         used += count
+    loglik = evaluate(theta, cells, law, room)
+    out[CHI2], freedom = _goodness(cells, histogram.n, room)
     amplitude = 0.0
     if amplitudes.size > 0:
-        amplitude, loglik, count = _search_lobes(theta, loglik, cells, law, place, amplitudes, limits, room)
+        poor = normal_score(out[CHI2], freedom) > _SUSPICIOUS
+        amplitude, count = search_lobes(
+            theta, loglik, histogram, cells, law, place, amplitudes, poor, limits, room
+        )
         used += count
-    own = make_cells(
-        law, place[0], amplitude, place[1], place[2], cells.n_bins, (cells.weights, cells.edges, cells.lobes)
-    )
-    out[LOG_LIKELIHOOD] = evaluate(theta, own, law, room)
+        space = cells.weights, cells.edges, cells.lobes
+        own = make_cells(law, place[0], amplitude, place[1], place[2], cells.n_bins, space)
+        loglik = evaluate(theta, own, law, room)
+        out[CHI2], freedom = _goodness(own, histogram.n, room)
+        freedom = max(freedom - 2, 0) if amplitude > 0.0 else freedom
+    out[LOG_LIKELIHOOD] = loglik
     out[AMPLITUDE], out[LOBE_WEIGHT] = amplitude, theta[LOBE]
-    for i in range(cells.n_bins):
-        room.ratio[i] = n * room.mass[i]
-    out[CHI2], freedom = pearson(cells.weights, room.ratio, cells.n_bins, n)
-    if amplitude > 0.0:
-        freedom = max(freedom - 2, 0)
     return True, used + 1, freedom
 
 
@@ -185,7 +159,7 @@ def fit_tile(
         to_theta(start[pixel], centre, cells, law, limits[WARM] > 0.0, theta)
         place = pixel, first_code, centre
         fine, words[pixel, EVALUATIONS], words[pixel, FREEDOM] = fit_pixel(
-            theta, cells, law, place, amplitudes, gaps[pixel], histogram.n, limits, room, out[pixel]
+            theta, histogram, cells, law, place, amplitudes, gaps[pixel], limits, room, out[pixel]
         )
         if fine:
             words[pixel, CONVERGED] = from_theta(

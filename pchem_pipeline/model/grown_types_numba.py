@@ -20,7 +20,8 @@ N_LOBE_ROWS = 6
 class Law(NamedTuple):
     """A :class:`~pchem_pipeline.model.marginal.MarginalModel` as the loops take it: see there.
 
-    Arrays with a row per pixel have 1 or n rows; ``table`` is that of the normal law.
+    Arrays with a row per pixel have 1 or n rows; ``outlier_mass`` is that of the outliers in each code,
+    ``pattern`` that of the free lobes, ``table`` that of the normal law.
     """
 
     law: int
@@ -43,6 +44,8 @@ class Law(NamedTuple):
     edge_shift: NDArray[np.float64]
     clip_low: int
     clip_high: int
+    outlier_share: float
+    outlier_mass: float
     pattern: NDArray[np.float64]
     table: NDArray[np.float64]
 

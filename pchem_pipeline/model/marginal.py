@@ -39,7 +39,8 @@ class MarginalModel:
     shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron
     k + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 = sigma^2 - 1/12 is the
     analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and code edges
-    ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there.
+    ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there. A share of
+    the samples may be outliers, anywhere.
 
     Attributes:
         law: law of the electron number; its mean is H whatever the law.
@@ -58,6 +59,8 @@ class MarginalModel:
         edge_first, edge_shift: shift of the lower edge of the codes from ``edge_first`` on, DN; 0 elsewhere.
             The shifts of neighbouring edges must differ by less than 1 DN.
         clip_low, clip_high: smallest and largest code that comes out, or None.
+        outlier_share, outlier_codes: share of the samples that can be anything, evenly over so many codes:
+            they then count for nothing in the fit (particle hits).
         free_lobes: amplitudes A, e-, of which one may be found in a pixel, with a weight q of its own; the
             fit tries each, and keeps the best where the likelihood rises by enough. Empty: none is tried.
         free_lobe_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps 1 - q;
@@ -86,6 +89,8 @@ class MarginalModel:
     edge_shift: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_low: int | None = None
     clip_high: int | None = None
+    outlier_share: float = 0.0
+    outlier_codes: int = 65536
     free_lobes: tuple[float, ...] = ()
     free_lobe_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
     free_lobe_alarm: float = 1e-4
@@ -211,6 +216,10 @@ class MarginalModel:
             clip_low=max(lows) if lows else None,
             clip_high=min(highs) if highs else None,
         )
+
+    def with_outliers(self, share: float, codes: int = 65536) -> MarginalModel:
+        """Return a copy in which a share of the samples may lie anywhere among so many codes."""
+        return replace(self, outlier_share=share, outlier_codes=codes)
 
     def with_free_lobes(
         self,
