@@ -136,6 +136,9 @@ def run(context: StageContext) -> None:
     )
     result = found.to_json()
     result["examined"] |= {"rows": list(window.rows), "columns": list(window.columns)}
+    for place in result["where"]:
+        # the search counts pixels from the corner of its window, people from that of the sensor
+        place["pixels"] = [[y + window.rows[0], x + window.columns[0]] for y, x in place["pixels"]]
     _write(context, found, result, before)
 
 
