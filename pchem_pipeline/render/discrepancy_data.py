@@ -27,7 +27,6 @@ class DiscrepancyData:
         statistics: name of each statistic, in the order of ``z_before``, to its channel and sentence.
         titles: tag of an effect to its name in the literature.
         sources: tag of an effect to where it is described.
-        names: names of the channels of ready-made histograms.
     """
 
     result: Mapping[str, Any]
@@ -35,7 +34,6 @@ class DiscrepancyData:
     statistics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     titles: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
-    names: tuple[str, ...] = ()
 
     @cached_property
     def found(self) -> Findings:
