@@ -45,8 +45,8 @@ PARTS: tuple[tuple[str, str, str], ...] = (
         "Where data and model disagree",
         "Every sample is split into a charge channel (the expected electron number) and a readout channel "
         "(what is left). Effects of light and charge show in the first, effects of the electronics in the "
-        "second. All is in standard deviations of what the plain model would show by chance. The pictures are "
-        "of the frames in which effects were looked for; the table is of these and of others that confirm it.",
+        "second. All is in standard deviations of what the plain model would show by chance. The pictures "
+        "are of the frames in which effects were looked for; the table is of these and others to confirm it.",
     ),
     (
         "evidence",
