@@ -65,7 +65,7 @@ def typical_pixels(maps: PixelMaps, n: int = 8) -> tuple[NDArray[np.intp], list[
 class PixelLaw:
     """The PCD of one pixel over the codes that its samples reach, and how another law differs from it.
 
-    What lies beyond the codes counts at the first and at the last of them.
+    What lies beyond the codes does not count: the tails of a sample are looked at by themselves.
 
     Attributes:
         maps: of that pixel, shape (1,) each.
@@ -101,10 +101,11 @@ class PixelLaw:
         self._nuisance = np.stack([np.ones(self.codes.size), *(self._scores[order] for order in _PARAMETERS)])
 
     def on_codes(self, codes: FloatArray, mass: FloatArray) -> FloatArray:
-        """Return a mass over other successive codes as one over those of this law, shape (n,)."""
-        at = np.clip(codes - self.codes[0], 0, self.codes.size - 1).astype(np.intp)
-        found: FloatArray = np.bincount(at, mass, self.codes.size).astype(np.float64)
-        return found
+        """Return a mass over other codes as one over those of this law, whose sum is 1, shape (n,)."""
+        at = (codes - self.codes[0]).astype(np.intp)
+        here = (at >= 0) & (at < self.codes.size)
+        found: FloatArray = np.bincount(at[here], mass[here], self.codes.size).astype(np.float64)
+        return found / max(float(found.sum()), _SMALLEST_MASS)
 
     def below(self, law: MarginalModel) -> float:
         """Return the probability of a sample below the codes under a law."""

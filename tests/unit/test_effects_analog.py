@@ -1,0 +1,428 @@
+"""Effects of the pixel's analog chain: what their forward models do to samples, and what they refuse."""
+
+from __future__ import annotations
+
+import itertools
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
+from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
+from pchem_pipeline.effects.analog.gain_drift import GainDrift
+from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
+from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
+from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
+from pchem_pipeline.effects.analog.rts_noise import RtsNoise
+from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.context import EffectContext
+from pchem_pipeline.effects.evidence import PixelMaps
+from pchem_pipeline.effects.plane import Plane
+from pchem_pipeline.effects.registry import effect_classes
+from pchem_pipeline.model.grown import marginal_mass
+from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.simulate import chain
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.streams import KeyedStreams
+from pchem_pipeline.simulate.truth import TruthMaps
+
+CLASSES: tuple[type[Effect], ...] = (
+    AnalogMemory, FlickerNoise, GainDrift, HeavyTailedNoise, InterpixelCapacitance, NoiseSkew,
+    Nonlinearity, RtsNoise, SignalDependentNoise,
+)  # fmt: skip
+BOW = (-0.5, 0.5, -0.5)
+STRONG: list[Effect] = [
+    AnalogMemory(memory=0.4),
+    FlickerNoise(share=0.9, correlation_frames=7.0),
+    FlickerNoise(share=0.9, correlation_frames=0.4),
+    FlickerNoise(share=0.9, correlation_frames=90.0, spectrum="one_over_f"),
+    GainDrift(drift=0.4),
+    GainDrift(drift=0.4, shape="path", path=BOW),
+    HeavyTailedNoise(share=0.3, factor=4.0),
+    InterpixelCapacitance(coupling=0.1, anisotropy=0.3),
+    NoiseSkew(share=-0.9),
+    Nonlinearity(step_change=0.1),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7, samples=4, spread="exponential"),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.6, sampling="single", correlation_frames=11.0),
+    SignalDependentNoise(noise_e=0.5),
+    SignalDependentNoise(noise_e=0.5, growth="linear"),
+]
+SHAPE, N_FRAMES = (7, 5), 40
+
+
+def names(effect: Effect) -> str:
+    return effect.tag
+
+
+def make_truth(shape: tuple[int, int], seed: int | None = 5) -> TruthMaps:
+    """Maps of a sensor; all pixels alike without a seed."""
+    spread = 0.0 if seed is None else 1.0
+    rng = np.random.default_rng(seed)
+    return TruthMaps(
+        quanta_exposure=1.5 + spread * rng.uniform(-1.0, 1.0, shape),
+        conversion_gain=0.1 + spread * rng.uniform(-0.02, 0.02, shape),
+        bias=100.0 + spread * rng.uniform(-3.0, 3.0, shape),
+        analog_read_noise_e=0.3 + spread * rng.uniform(-0.05, 0.05, shape),
+        defect=np.zeros(shape, np.uint8),
+    )
+
+
+TRUTH = make_truth(SHAPE)
+
+
+def simulated(*effects: Effect, frames=(0, N_FRAMES), rows=None) -> np.ndarray[Any, Any]:
+    settings = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=3, bit_depth=12, effects=effects)
+    return simulate_block(TRUTH, settings, frames, rows)[0]
+
+
+def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=None, noise=0.3, seed=1):
+    """Return the signal with the effect, that without, and its parts K and R, all (frame, y, x)."""
+    rng = np.random.default_rng(seed)
+    k = rng.poisson(1.5, shape) if charge is None else np.broadcast_to(charge, shape)
+    r = noise * rng.standard_normal(shape)
+    frames, rows = np.arange(first, first + shape[0]), np.arange(shape[1])
+    context = EffectContext(
+        frames=frames,
+        n_frames=n_run or shape[0],
+        rows=rows,
+        shape=shape[1:],
+        integration_time=1.0,
+        bit_depth=12,
+        truth=MappingProxyType({"analog_read_noise_e": np.full(shape[1:], noise)}),
+        random=KeyedStreams(seed, effect.tag, frames, rows, np.arange(shape[2])),
+        charge=k,
+        read_noise=r,
+    )
+    return effect.apply(k + r, context), k + r, k, r
+
+
+def within(seen, expected, stderr, widths: float = 5.0) -> None:
+    assert abs(seen - expected) <= widths * stderr, (seen, expected, stderr)
+
+
+# -- what every effect owes ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
+def test_the_class_says_what_it_is(effect):
+    tag = effect.model_fields["tag"].default
+    assert effect_classes()[tag] is effect
+    assert effect.plane is Plane.ANALOG
+    assert effect.title
+    assert effect.source
+    assert effect.signature
+    assert set(effect.signature) <= set(STATISTICS)
+    assert effect.strength in effect.model_fields
+    assert effect.power > 0
+    assert tag not in effect.separate
+    assert all(text for text in effect.separate.values())
+    assert set(effect.separate) <= set(effect_classes())
+    assert effect.typical()
+    assert all(isinstance(e, effect) and getattr(e, effect.strength) for e in effect.typical())
+
+
+@pytest.mark.parametrize("effect", STRONG, ids=names)
+def test_no_strength_changes_no_bit_and_strength_does(effect):
+    plain = simulated()
+    np.testing.assert_array_equal(simulated(effect.scaled(0.0)), plain)
+    assert (simulated(effect) != plain).mean() > 0.05
+
+
+@pytest.mark.parametrize("effect", STRONG, ids=names)
+def test_frames_do_not_depend_on_how_the_work_is_divided(effect, monkeypatch):
+    whole = simulated(effect)
+    monkeypatch.setattr(chain, "_SAMPLES_AT_ONCE", 1)
+    for frames, rows in itertools.product([(0, 1), (1, 18), (18, 40)], [(0, 3), (3, 4), (4, 7)]):
+        part = simulated(effect, frames=frames, rows=rows)
+        np.testing.assert_array_equal(part, whole[slice(*frames), slice(*rows)])
+
+
+@pytest.mark.parametrize("effect", [e for e in STRONG if e.halo() or e.history()], ids=names)
+def test_without_halo_or_history_the_division_would_show(effect, monkeypatch):
+    whole = simulated(effect)
+    monkeypatch.setattr(type(effect), "halo", lambda self: 0)
+    monkeypatch.setattr(type(effect), "history", lambda self: 0)
+    part = simulated(effect, frames=(18, 40), rows=(3, 5))
+    assert (part != whole[18:40, 3:5]).any()
+
+
+@pytest.mark.parametrize("effect", STRONG, ids=names)
+def test_only_what_is_needed_is_read_and_nothing_is_overwritten(effect):
+    after, before, k, r = analog(effect, (12, 4, 5))
+    assert after.dtype == np.float64
+    assert after.shape == before.shape
+    assert not np.shares_memory(after, before)
+    np.testing.assert_array_equal(before, k + r)
+
+
+@pytest.mark.parametrize(
+    ("effect", "values"),
+    [
+        (AnalogMemory, {"memory": 0.6}),
+        (AnalogMemory, {}),
+        (FlickerNoise, {"share": 1.1}),
+        (FlickerNoise, {"share": 0.1, "correlation_frames": 0.0}),
+        (FlickerNoise, {"share": 0.1, "spectrum": "white"}),
+        (GainDrift, {"drift": 0.6}),
+        (GainDrift, {"drift": 0.1, "shape": "path"}),
+        (GainDrift, {"drift": 0.1, "path": (0.0, 1.0)}),
+        (GainDrift, {"drift": 0.5, "shape": "path", "path": (0.0, 0.0, 10.0)}),
+        (HeavyTailedNoise, {"share": -0.1}),
+        (HeavyTailedNoise, {"share": 0.1, "factor": 0.5}),
+        (InterpixelCapacitance, {"coupling": -0.01}),
+        (InterpixelCapacitance, {"coupling": 0.3}),
+        (InterpixelCapacitance, {"coupling": 0.1, "anisotropy": 2.0}),
+        (NoiseSkew, {"share": 1.5}),
+        (NoiseSkew, {"share": float("nan")}),
+        (Nonlinearity, {"step_change": 1.0}),
+        (RtsNoise, {"fraction": 1.5, "amplitude_e": 1.0}),
+        (RtsNoise, {"fraction": 0.5, "amplitude_e": -1.0}),
+        (RtsNoise, {"fraction": 0.5, "amplitude_e": 1.0, "samples": 0}),
+        (RtsNoise, {"fraction": 0.5, "amplitude_e": 1.0, "probability": 2.0}),
+        (SignalDependentNoise, {"noise_e": -0.1}),
+        (SignalDependentNoise, {"noise_e": 0.1, "growth": "square"}),
+    ],
+)
+def test_impossible_parameters_are_refused_by_name(effect, values):
+    with pytest.raises(ValidationError) as error:
+        effect(**values)
+    assert any(name in str(error.value) for name in effect.model_fields)
+
+
+# -- moments ------------------------------------------------------------------------------------------------
+
+
+def test_heavy_tails_have_the_variance_and_the_fourth_moment_of_the_mixture():
+    after, before, k, _ = analog(HeavyTailedNoise(share=0.05, factor=3.0))
+    z = (after - k) / 0.3
+    n = z.size
+    within((after != before).mean(), 0.05, np.sqrt(0.05 * 0.95 / n))
+    fourth, eighth = 3 * (0.95 + 0.05 * 81), 105 * (0.95 + 0.05 * 6561)
+    within((z**2).mean(), 1.4, np.sqrt((fourth - 1.4**2) / n))
+    within((z**4).mean(), fourth, np.sqrt((eighth - fourth**2) / n))
+    assert abs((z**2).mean() - 1.0) > 20 * np.sqrt(2 / n)
+
+
+@pytest.mark.parametrize("share", [0.8, -0.5])
+def test_skewed_noise_keeps_mean_and_variance(share):
+    after, _, k, _ = analog(NoiseSkew(share=share))
+    z = (after - k) / 0.3
+    n = z.size
+    fourth = 3 + 6 * share**4
+    within(z.mean(), 0.0, 1 / np.sqrt(n))
+    within((z**2).mean(), 1.0, np.sqrt((fourth - 1) / n))
+    # sixth cumulant of the exponential: 120; the sixth moment follows from the cumulants
+    sixth = 15 + 15 * 6 * share**4 + 10 * (2 * share**3) ** 2 + 120 * share**6
+    within((z**3).mean(), 2 * share**3, np.sqrt(sixth / n))
+    assert abs((z**3).mean()) > 20 * np.sqrt(15 / n)
+
+
+@pytest.mark.parametrize("growth", ["root", "linear"])
+def test_noise_of_electrons_grows_as_stated(growth):
+    after, before, k, r = analog(SignalDependentNoise(noise_e=0.2, growth=growth))
+    added = after - before
+    for number in range(5):
+        of = added[k == number]
+        variance = 0.04 * (number if growth == "root" else number**2)
+        within((of**2).mean(), variance, variance * np.sqrt(2 / of.size))
+        within((of * r[k == number]).mean(), 0.0, 0.3 * np.sqrt(variance / of.size))
+
+
+def test_the_comb_bends():
+    after, before, k, _ = analog(Nonlinearity(step_change=-0.02), (4, 3, 5), charge=np.arange(5))
+    levels = (after - before + k)[0, 0]
+    np.testing.assert_allclose(np.diff(levels), 1 - 0.02 * np.arange(4), atol=1e-12)
+
+
+def test_capacitance_moves_charge_without_losing_any():
+    charge = np.zeros((3, 4, 5), int)
+    charge[0, 1, 2] = charge[1, 0, 0] = 10
+    effect = InterpixelCapacitance(coupling=0.02, anisotropy=0.5)
+    after, _, _, r = analog(effect, charge.shape, charge=charge)
+    seen = after - r
+    assert seen[0, 1, 1] == pytest.approx(0.3)
+    assert seen[0, 1, 3] == pytest.approx(0.3)
+    assert seen[0, 0, 2] == pytest.approx(0.1)
+    assert seen[0, 2, 2] == pytest.approx(0.1)
+    assert seen[0, 1, 2] == pytest.approx(9.2)
+    assert seen[1, 0, 0] == pytest.approx(9.6)  # a corner has two neighbours
+    np.testing.assert_allclose(seen.sum(axis=(1, 2)), charge.sum(axis=(1, 2)), atol=1e-12)
+    assert effect.halo() == 1
+
+
+def test_memory_is_of_the_frame_before():
+    effect = AnalogMemory(memory=-0.1)
+    after, before, k, _ = analog(effect, (6, 3, 4))
+    np.testing.assert_allclose(after[1:] - before[1:], -0.1 * k[:-1], atol=1e-12)
+    assert effect.history() == 1
+
+
+@pytest.mark.parametrize(
+    ("effect", "course"),
+    [
+        (GainDrift(drift=0.2), np.linspace(-0.5, 0.5, 101)),
+        (GainDrift(drift=0.2, shape="path", path=BOW), 0.5 - np.abs(np.linspace(-1, 1, 101))),
+    ],
+)
+def test_the_gain_follows_its_course(effect, course):
+    after, before, _, _ = analog(effect, (101, 2, 3))
+    np.testing.assert_allclose(after, before * (1 + 0.2 * course)[:, None, None], rtol=1e-12)
+    early, before, _, _ = analog(effect, (5, 2, 3), first=-9, n_run=101)
+    np.testing.assert_allclose(early, before * (1 + 0.2 * course[0]), rtol=1e-12)
+
+
+# -- long memory --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect", "times"),
+    [
+        (FlickerNoise(share=1.0, correlation_frames=5.0), [5.0]),
+        (FlickerNoise(share=1.0, correlation_frames=0.5), [0.5]),
+        (FlickerNoise(share=1.0, correlation_frames=64.0, spectrum="one_over_f"), [64.0, 8.0, 1.0]),
+    ],
+)
+@pytest.mark.parametrize("first", [0, -20, 1_000_003])
+def test_flicker_has_its_covariance_anywhere(effect, times, first):
+    after, _, k, r = analog(effect, (60, 60, 60), first=first)
+    u = (after - k) / 0.3
+    for lag in (0, 1, 2, 7, 30):
+        expected = np.mean([np.exp(-lag / tau) for tau in times])
+        # independent pixels; their time means of products of Gaussians: variance below 1 + expected^2
+        of_pixel = (u[lag:] * u[: 60 - lag]).mean(axis=0)
+        within(of_pixel.mean(), expected, of_pixel.std() / 60)
+    within((u[:, :, 1:] * u[:, :, :-1]).mean(), 0.0, (u[:, :, 1:] * u[:, :, :-1]).mean(axis=0).std() / 60)
+    within((u * r).mean(), 0.0, 0.3 / np.sqrt(u.size))
+
+
+def test_flicker_exchanges_noise_and_adds_none():
+    after, _, k, _ = analog(FlickerNoise(share=0.3, correlation_frames=3.0))
+    z = (after - k) / 0.3
+    power = (z**2).mean(axis=0)
+    within(power.mean(), 1.0, power.std() / np.sqrt(power.size))
+    lagged = (z[1:] * z[:-1]).mean(axis=0)
+    expected = 0.3 * np.exp(-1 / 3)
+    within(lagged.mean(), expected, lagged.std() / np.sqrt(lagged.size))
+    assert lagged.mean() > 20 * lagged.std() / np.sqrt(lagged.size)
+
+
+# -- telegraph noise ----------------------------------------------------------------------------------------
+
+
+def test_traps_are_in_a_share_of_the_pixels():
+    after, before, _, _ = analog(RtsNoise(fraction=0.1, amplitude_e=1.0, probability=0.5))
+    touched = (after != before).any(axis=0)
+    within(touched.mean(), 0.1, np.sqrt(0.09 / touched.size))
+    assert (after != before)[:, touched].mean() > 0.4
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4])
+def test_the_levels_of_a_jump_are_those_of_its_place(samples):
+    effect = RtsNoise(fraction=1.0, amplitude_e=2.0, probability=0.3, samples=samples)
+    after, before, _, _ = analog(effect)
+    step = (after - before) / 2.0 * samples
+    np.testing.assert_allclose(step, np.rint(step), atol=1e-9)
+    levels = np.rint(step)
+    n = levels.size
+    for level in range(-samples, samples + 1):
+        # a jump behind sample m of the 2 N, m = 1 .. 2 N - 1, moves the difference by min(m, 2 N - m) / N
+        ways = sum(min(m, 2 * samples - m) == abs(level) for m in range(1, 2 * samples))
+        share = 0.7 if level == 0 else 0.15 * ways / (2 * samples - 1)
+        within((levels == level).mean(), share, np.sqrt(share * (1 - share) / n))
+    within((step[1:] * step[:-1]).mean(), 0.0, (step**2).mean() / np.sqrt(n))
+    pattern = dict(effect._pattern())
+    assert sum(pattern.values()) == pytest.approx(1.0)
+    assert pattern[1.0] == pytest.approx(0.5 / (2 * samples - 1))
+
+
+@pytest.mark.parametrize("tau", [0.7, 6.0])
+def test_a_slow_trap_is_a_markov_chain_of_two_levels(tau):
+    effect = RtsNoise(
+        fraction=1.0, amplitude_e=2.0, probability=0.3, sampling="single", correlation_frames=tau
+    )
+    after, before, _, _ = analog(effect, (60, 60, 60))
+    full = (after - before) / 2.0 + 0.3
+    np.testing.assert_allclose(full, np.rint(full), atol=1e-9)
+    full = np.rint(full)
+    of_pixel = full.mean(axis=0)
+    within(of_pixel.mean(), 0.3, of_pixel.std() / 60)
+    for lag in (1, 2, 9):
+        both = (full[lag:] * full[:-lag]).mean(axis=0)
+        within(both.mean(), 0.09 + 0.21 * np.exp(-lag / tau), both.std() / 60)
+    # Markov: given the state now, the next does not depend on the one before
+    now = full[1:-1] == 1
+    stay = 0.3 + 0.7 * np.exp(-1 / tau)
+    for before_now in (0, 1):
+        of = full[2:][now & (full[:-2] == before_now)]
+        within(of.mean(), stay, np.sqrt(stay * (1 - stay) / of.size))
+
+
+def test_exponential_steps_have_the_mean_that_is_stated():
+    effect = RtsNoise(fraction=1.0, amplitude_e=2.0, probability=1.0, spread="exponential")
+    after, before, _, _ = analog(effect, (2, 60, 60))
+    steps = np.abs(after - before)
+    np.testing.assert_allclose(steps[0], steps[1])
+    within(steps[0].mean(), 2.0, 2.0 / 60)
+    within(steps[0].std(), 2.0, 2.0 * np.sqrt(2) / 60 * 1.5)
+
+
+# -- the law of a pixel -------------------------------------------------------------------------------------
+
+ALIKE = make_truth((32, 32), seed=None)
+MAPS = PixelMaps(
+    np.array([1.5]), np.array([0.1]), np.array([100.0]), np.array([np.sqrt(9 + 1 / 12)]), np.array([True])
+)
+CODES = np.arange(60, 240)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        AnalogMemory(memory=0.05),
+        FlickerNoise(share=0.5, correlation_frames=1.0),
+        HeavyTailedNoise(share=0.05, factor=3.0),
+        NoiseSkew(share=0.5),
+        NoiseSkew(share=-0.7),
+        Nonlinearity(step_change=0.02),
+        SignalDependentNoise(noise_e=0.1),
+        SignalDependentNoise(noise_e=0.05, growth="linear"),
+        InterpixelCapacitance(coupling=0.01, anisotropy=0.5),
+        GainDrift(drift=0.12, shape="path", path=(0.5, -0.5, 0.5)),
+    ],
+    ids=names,
+)
+def test_the_marginal_is_the_law_of_the_samples(effect):
+    n_frames = 400
+    settings = SimulateSettings(shape=(32, 32), n_frames=n_frames, seed=8, bit_depth=12, effects=(effect,))
+    dn = simulate_block(ALIKE, settings, (0, n_frames))[0]
+    inside = dn[:, 1:-1, 1:-1]  # pixels at the edge have fewer neighbours
+    seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
+    assert seen.sum() == inside.size
+
+    def misfit(model: MarginalModel) -> float:
+        expected = marginal_mass(model, MAPS, CODES)[0] * inside.size
+        some = expected > 10
+        chi = ((seen - expected)[some] ** 2 / expected[some]).sum()
+        return float((chi - some.sum()) / np.sqrt(2 * some.sum()))
+
+    model = effect.marginal(MarginalModel(), MAPS)
+    assert abs(misfit(model)) < 5
+    if not model.neutral:
+        assert misfit(MarginalModel()) > 20
+
+
+def test_telegraph_noise_leaves_the_levels_to_the_pixels():
+    model = RtsNoise(fraction=0.01, amplitude_e=1.5, samples=2).marginal(MarginalModel(), MAPS)
+    assert 1.5 in model.free_lobes
+    assert dict(model.free_lobe_pattern) == pytest.approx({-0.5: 1 / 3, 0.5: 1 / 3, -1: 1 / 6, 1: 1 / 6})
+    spread = RtsNoise(fraction=0.01, amplitude_e=1.5, spread="exponential").marginal(MarginalModel(), MAPS)
+    assert min(spread.free_lobes) < min(model.free_lobes)
+    assert RtsNoise(fraction=0.01, amplitude_e=0.0).marginal(MarginalModel(), MAPS).free_lobes == ()
