@@ -66,6 +66,7 @@ class Replicate:
             n_run=taken.n_run,
             block_frames=taken.block_frames,
             exclude=~self.maps.usable,
+            start=self.maps,
         )
 
     def __call__(self) -> dict[str, float]:

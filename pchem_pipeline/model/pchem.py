@@ -80,6 +80,7 @@ def fit_histograms(
     *,
     settings: FitSettings | None = None,
     adc_limits: tuple[int, int] | None = None,
+    start: NDArray[np.float64] | None = None,
 ) -> FitResult:
     """Estimate (H, g, mu, sigma) of every pixel from its histogram by maximum likelihood.
 
@@ -98,6 +99,9 @@ def fit_histograms(
         over: frames above the last bin, shape (n,).
         settings: how to fit; the defaults if None.
         adc_limits: first and last code of the ADC, DN; pixels that reach them are flagged.
+        start: (H, g, mu, sigma) known to be near the answer, shape (n, 4), NaN where nothing is known. The
+            maximum next to it is taken where it fits well, without a look at its neighbours: the bias is not
+            tested for ambiguity, and the likelihood gap is that to one Gaussian.
 
     Returns:
         Estimates, covariances and a status word per pixel.
@@ -113,6 +117,7 @@ def fit_histograms(
         np.ascontiguousarray(origin, np.int64),
         regression_basis(),
         _limits(settings),
+        np.empty((0, 4)) if start is None else np.ascontiguousarray(start, np.float64),
         parameters,
         covariance,
         out,

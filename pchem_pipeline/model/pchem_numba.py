@@ -151,11 +151,14 @@ def fit_pixel(
     basis: NDArray[np.float64],
     limits: NDArray[np.float64],
     space: Workspace,
+    near: NDArray[np.float64],
     best: NDArray[np.float64],
     at_best: Workspace,
     out: NDArray[np.float64],
 ) -> tuple[int, int, int]:
     """Find the most likely parameters of one pixel.
+
+    Where an answer is known to be near, the maximum next to it is taken as long as it fits well.
 
     The first start is polished and its neighbours are climbed. Where the goodness of fit or a side lobe in
     the noise raises suspicion, the other starts follow; the likeliest maximum is kept.
@@ -165,6 +168,7 @@ def fit_pixel(
         basis: of the regression on the ECF.
         limits: bounds and limits.
         space: scratch.
+        near: theta near the maximum; its step is 0 where nothing is known.
         best: out, theta at the maximum; its step is 0 where there is none.
         at_best: out, score and information there; may share its rows with ``space``.
         out: out, a row of results; the columns are named at the top of this module.
@@ -178,6 +182,16 @@ def fit_pixel(
     used = freedom = 0
     degenerate = False
     best[1] = 0.0
+    if near[1] > 0.0:
+        copy(near, trial)
+        outcome, loglik, used = polish(histogram, trial, limits, -math.inf, trial, math.inf, space)
+        if outcome == CONVERGED:
+            evaluate(histogram, trial, at_best, histogram.n)
+            out[CHI2], freedom = pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
+            if normal_score(out[CHI2], freedom) < _SUSPICIOUS:
+                copy(trial, best)
+                out[LOG_LIKELIHOOD], out[GAP] = loglik, loglik - gaussian
+                return _judge(best, loglik, -math.inf, gaussian, limits), used + 1, freedom
     for attempt in range(-1, N_OTHERS):
         if attempt < 0:
             usable = first_start(histogram, basis, space, trial)
@@ -217,6 +231,7 @@ def fit_tile(
     origin: NDArray[np.int64],
     basis: NDArray[np.float64],
     limits: NDArray[np.float64],
+    start: NDArray[np.float64],
     parameters: NDArray[np.float64],
     covariance: NDArray[np.float64],
     out: NDArray[np.float64],
@@ -229,6 +244,7 @@ def fit_tile(
         origin: DN of bin 0, shape (n,).
         basis: of the regression on the ECF.
         limits: bounds and limits, shape (N_LIMITS,).
+        start: (H, g, mu, sigma) near the answer, shape (n, 4), NaN where not known; or shape (0, 4).
         parameters: out, (H, g, mu, sigma), shape (n, 4); comes as NaN.
         covariance: out, shape (n, 4, 4); comes as NaN.
         out: out, shape (n, N_OUT); comes as NaN.
@@ -238,7 +254,7 @@ def fit_tile(
     weights, cumulative = np.empty(n_most), np.empty(n_most + 1)
     space = make_workspace(make_rows(n_most))
     at_best = share_workspace(space)
-    theta = np.empty(4)
+    theta, near = np.empty(4), np.empty(4)
     held = np.zeros(4, np.bool_)
     own_limits = limits.copy()
     for pixel in range(counts.shape[0]):
@@ -249,9 +265,14 @@ def fit_tile(
         words[pixel, LOWEST_DN], words[pixel, HIGHEST_DN] = dn, dn + histogram.n_bins - 1
         if occupied < 3:
             continue
+        near[1] = 0.0
+        if start.shape[0] > 0 and np.isfinite(start[pixel]).all():
+            near[0], near[1] = math.log(start[pixel, 0]), 1.0 / start[pixel, 1]
+            near[2] = start[pixel, 2] - float(origin[pixel] + centre)
+            near[3] = 2.0 * math.log(start[pixel, 3])
         own_limits[MAX_STEP] = 4.0 * histogram.n_bins + 10.0
         status, words[pixel, EVALUATIONS], words[pixel, FREEDOM] = fit_pixel(
-            histogram, basis, own_limits, space, theta, at_best, out[pixel]
+            histogram, basis, own_limits, space, near, theta, at_best, out[pixel]
         )
         if theta[1] > 0.0:
             held[0] = status & EXPOSURE_AT_BOUND != 0
