@@ -68,11 +68,9 @@ def component(
     n = float(cells.n_bins)
     low = int(min(max(place - reach * sd - cells.margin, 0.0), n))
     high = int(min(max(place + reach * sd + cells.margin + 1.0, 0.0), n))
-    # what lies beyond an infinite edge belongs to the first or last cell all the same
-    if high == 0 and cells.edges[0] == -math.inf:
-        high = 1
-    if low == cells.n_bins and cells.edges[cells.n_bins] == math.inf:
-        low = cells.n_bins - 1
+    # what lies beyond the limits belongs to the first or last code that comes out
+    high = min(max(high, cells.bottom + 1), cells.n_bins)
+    low = max(min(low, cells.top - 1), 0)
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
 
@@ -87,8 +85,7 @@ def _list_numbers(
         widest = max(widest, cells.lobes[WIDTH, lobe])
         shift = a * abs(cells.lobes[SHIFT_E, lobe]) + abs(cells.lobes[SHIFT_DN, lobe])
         farthest = max(farthest, shift + abs(cells.lobes[SHIFT_SIGMA, lobe]) * math.sqrt(analog2))
-    from_below = cells.edges[0] == -math.inf
-    to_above = cells.edges[cells.n_bins] == math.inf
+    from_below, to_above = cells.bottom >= 0, cells.top <= cells.n_bins
     last = cells.first + cells.n_bins + cells.margin
     most = exposure * np.max(law.exposure_factors)
     count, previous = 0, -math.inf

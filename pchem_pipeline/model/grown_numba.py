@@ -103,6 +103,7 @@ def make_cells(
     """
     weights, edges, lobes = room
     margin = 0.0
+    bottom, top = -1, n_bins + 1
     n_shifts = law.edge_shift.shape[0]
     for i in range(n_bins + 1):
         place = first_code + i - law.edge_first
@@ -110,14 +111,16 @@ def make_cells(
         margin = max(margin, abs(shift))
         edges[i] = float(first_code + i - centre) - 0.5 + shift
         if first_code + i <= law.clip_low:
-            edges[i] = -math.inf
-        if first_code + i > law.clip_high:
-            edges[i] = math.inf
+            edges[i], bottom = -math.inf, i
+        elif first_code + i > law.clip_high:
+            edges[i], top = math.inf, min(top, i)
     count = set_lobes(law, pixel, amplitude, lobes)
     return Cells(
         weights,
         edges,
         n_bins,
+        bottom,
+        top,
         margin,
         float(first_code - centre) - 0.5,
         lobes,

@@ -58,6 +58,8 @@ class Cells(NamedTuple):
         edges: lower edges of the cells and the upper edge of the last one, less the centre; infinite where
             everything beyond is counted in the cell.
         n_bins: cells in use.
+        bottom: last edge at minus infinity, -1 without one.
+        top: first edge at infinity, n_bins + 1 without one.
         margin: largest distance of a finite edge from its place ``i`` after ``first``, DN.
         first: place of the first edge, less the centre, without any shift.
         lobes: resolved lobes, shape (N_LOBE_ROWS, at least n_lobes).
@@ -69,6 +71,8 @@ class Cells(NamedTuple):
     weights: NDArray[np.float64]
     edges: NDArray[np.float64]
     n_bins: int
+    bottom: int
+    top: int
     margin: float
     first: float
     lobes: NDArray[np.float64]
