@@ -199,7 +199,12 @@ class RtsNoise(Effect):
             # those too weak to stand out count too
             power = max(float(_survival(_OUTLYING - max(profiles[at, :2]))), 0.3)
             best.append((misfit[at], kinds[at].model_copy(update={"fraction": min(count / n / power, 1.0)})))
-        return [effect for _, effect in sorted(best, key=lambda item: float(item[0]))]
+        ranked = [effect for _, effect in sorted(best, key=lambda item: float(item[0]))]
+        # real traps differ; the mean of those that stand out is well above that of all
+        spread = ranked[0].model_copy(
+            update={"spread": "exponential", "amplitude_e": 0.7 * ranked[0].amplitude_e}
+        )
+        return [ranked[0], spread, *ranked[1:]]
 
     @classmethod
     def _single(cls, evidence: Evidence) -> list[Self]:
