@@ -70,6 +70,7 @@ STRONG = [
     BiasDrift(drift_dn=9, shape="walk"),
     BiasJumps(amplitude_dn=9, rate=0.2, levels=4),
     BiasJumps(amplitude_dn=9, path=JUMPS),
+    BiasJumps(amplitude_dn=9, rate=0.2, parts="left_right"),
     FrameNoise(frame_noise_dn=9),
     RowNoise(row_noise_dn=9),
     ColumnNoise(column_noise_dn=9),
@@ -236,6 +237,16 @@ def test_a_path_of_jumps_holds_each_level_from_its_frame_on():
     assert np.ptp(added[:, 2, 2]) == pytest.approx(7.0)
 
 
+def test_halves_jump_together():
+    tops = offsets(BiasJumps(amplitude_dn=2.0, rate=0.3, parts="top_bottom"), context_of((4, 6), 50))
+    sides = offsets(BiasJumps(amplitude_dn=2.0, parts="left_right", path=JUMPS[:2]), context_of((4, 6)))
+    assert np.ptp(tops, axis=2).max() == 0
+    assert (tops[:, 0] != tops[:, 3]).any()
+    np.testing.assert_array_equal(tops[:, 0], tops[:, 1])
+    assert np.ptp(sides, axis=1).max() == 0
+    np.testing.assert_allclose(sides[9, 0] - sides[8, 0], [4.0] * 3 + [0.0] * 3)
+
+
 def test_pickup_is_the_sine_that_it_says():
     effect = PeriodicPickup(
         amplitude_dn=0.4, cycles_per_row=0.11, cycles_per_frame=-0.27, cycles_per_column=0.07, phase=0.6
@@ -350,6 +361,7 @@ def test_random_repeats_come_as_often_as_they_should():
         (BiasJumps, {"amplitude_dn": 1, "rate": 0.9}, "less than or equal to 0.5"),
         (BiasJumps, {"amplitude_dn": 1, "path": [[[0, 1]]]}, "each of 4 quadrants, got 1"),
         (BiasJumps, {"amplitude_dn": 1, "path": [[[5, 1], [2, 0]], [], [], []]}, "must increase"),
+        (BiasJumps, {"amplitude_dn": 1, "parts": "top_bottom", "path": [[]] * 4}, "of 2 top_bottom, got 4"),
         (FrameNoise, {}, "frame_noise_dn"),
         (RowNoise, {"row_noise_dn": -0.1}, "greater than or equal to 0"),
         (ColumnNoise, {"column_noise_dn": "much"}, "valid number"),

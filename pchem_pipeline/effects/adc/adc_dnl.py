@@ -139,8 +139,8 @@ class AdcDnl(Effect):
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
-        """Return it at 0.006 LSB: random by code, and wrong weights of the bits that show in few codes."""
-        bits = [cls(dnl_lsb=0.006, pattern="bit", bit=bit) for bit in (0, 1, 2, 3)]
+        """Return it at 0.006 LSB: random by code, and wrong weights of bits, as visible in fewer codes."""
+        bits = [cls(dnl_lsb=round(0.006 * 2 ** (bit / 2), 4), pattern="bit", bit=bit) for bit in range(4)]
         return cls(dnl_lsb=0.006), *bits
 
     @classmethod

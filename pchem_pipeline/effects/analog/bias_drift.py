@@ -35,6 +35,7 @@ __all__ = ["BiasDrift"]
 _NODES = (3, 5, 9, 17, 33)
 _FRAMES_PER_NODE = 12
 _LOBES = 7
+_SIGNIFICANT = 2.5
 
 
 @register_effect
@@ -116,10 +117,12 @@ class BiasDrift(Effect):
         time, alpha = evidence.time, responsivity(evidence)
         position = run_position(time.frames, time.n_run)
         slope, error = _slope(position, time.frame_readout)
-        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > 3.0 * error else []
+        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > _SIGNIFICANT * error else []
         path = _best_path(position, time)
         if path is None:
-            return linear
+            if linear or evidence.strongest("frame.readout.slow") <= 3.0:
+                return linear
+            return [cls(drift_dn=max(_wander(time), 1e-9) / alpha, shape="walk")]
         size = float(np.ptp(path)) or 1.0
         bent = cls(drift_dn=size / alpha, shape="path", path=tuple(np.round(path / size, 6).tolist()))
         # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
@@ -153,10 +156,21 @@ def _slope(position: NDArray[np.float64], means: NDArray[np.float64]) -> tuple[f
     return slope, float(np.sqrt((left**2).sum() / max(means.size - 2, 1) / square))
 
 
+def _wander(time: TimeSeries) -> float:
+    """Return the end's standard deviation, DN, of a walk that makes block means scatter as they do."""
+    edges = np.searchsorted(time.frames, time.block_start)
+    lengths = np.diff([*edges, time.frames.size])
+    whole = lengths == lengths.max()
+    blocks = (np.add.reduceat(time.frame_readout, edges) / lengths)[whole]
+    inside = np.diff(time.frame_readout)[np.diff(time.frames) == 1].var() / 2.0
+    excess = float(blocks.var() - inside / lengths.max()) if blocks.size > 1 else 0.0
+    return float(np.sqrt(6.0 * max(excess, 0.0)))
+
+
 def _best_path(position: NDArray[np.float64], time: TimeSeries) -> NDArray[np.float64] | None:
     """Return the values of the piecewise linear path at its nodes, DN; None if a line does as well."""
     means = time.frame_readout
-    best, least = None, _criterion(means, np.stack([np.ones_like(position), position], 1))[0] - 10.0
+    best, least = None, _criterion(means, np.stack([np.ones_like(position), position], 1))[0] - 4.0
     for count in _NODES:
         if position.size < _FRAMES_PER_NODE * count:
             break

@@ -1,6 +1,6 @@
 """Jumps of the bias: the level of an output changes suddenly, at random times.
 
-Each of the four quadrants, as if it had an amplifier of its own, sits on one of several levels and jumps to
+Each quadrant or half, as if it had an amplifier of its own, sits on one of several levels and jumps to
 another. The bias jumps of the CCDs of HST/WFPC2 (a tenth of a DN and more; WFPC2 Data Handbook) and the
 "popcorn mesa" noise of HgCdTe arrays are of this kind.
 """
@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.change_points import Steps, find_steps, noise_variance
@@ -29,17 +29,23 @@ __all__ = ["BiasJumps"]
 
 Path = tuple[tuple[int, float], ...]
 
-_QUADRANTS = 4
+# how the quadrants' means add up to those of the parts that jump together
+Parts = Literal["quadrants", "top_bottom", "left_right"]
+_PARTS: dict[Parts, NDArray[np.float64]] = {
+    "quadrants": np.eye(4),
+    "top_bottom": np.array([[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]]),
+    "left_right": np.array([[0.5, 0.0, 0.5, 0.0], [0.0, 0.5, 0.0, 0.5]]),
+}
 _LOBES = 7
 _LAGS = 40
+_SIGNIFICANT = 3.0
 
 
 @register_effect
 class BiasJumps(Effect):
-    """Piecewise constant offset of each quadrant, independent of the others.
+    """Piecewise constant offset of each quadrant or half of the sensor, independent of the others.
 
-    Quadrants are top left, top right, bottom left, bottom right; an odd middle row or column belongs to the
-    bottom or right.
+    An odd middle row or column belongs to the bottom or right.
 
     Signature: means of the readout residual wander in one quadrant and not in the others, in sudden steps;
     the charge does not. A pixel's own histogram becomes copies of itself at the levels.
@@ -65,47 +71,52 @@ class BiasJumps(Effect):
     amplitude_dn: float = Field(
         ge=0, le=1e6, description="distance between neighbouring levels, DN; the scale of `path` if given"
     )
-    rate: float = Field(default=1e-3, ge=0, le=0.5, description="jumps per frame of each quadrant")
+    rate: float = Field(default=1e-3, ge=0, le=0.5, description="jumps per frame of each part")
     levels: int = Field(default=2, ge=2, le=64, description="number of evenly spaced levels")
+    parts: Parts = Field(default="quadrants", description="parts of the sensor with an output of their own")
     path: tuple[Path, ...] = Field(
         default=(),
-        description="the jumps as they were, instead of random ones: for each quadrant (top left, top right, "
-        "bottom left, bottom right) a list of [frame, level from that frame on in units of amplitude_dn]",
+        description="the jumps as they were, instead of random ones: for each part (top left, top right, "
+        "bottom left, bottom right; top, bottom; left, right) a list of [frame, level from that frame on "
+        "in units of amplitude_dn]",
     )
 
-    @field_validator("path")
-    @classmethod
-    def _four_in_order(cls, path: tuple[Path, ...]) -> tuple[Path, ...]:
-        if len(path) not in (0, _QUADRANTS):
-            raise ValueError(f"bias_jumps: path needs one list for each of 4 quadrants, got {len(path)}")
-        for quadrant in path:
-            if any(a[0] >= b[0] for a, b in pairwise(quadrant)):
+    @model_validator(mode="after")
+    def _path_for_each_part(self) -> Self:
+        wanted = len(_PARTS[self.parts])
+        if len(self.path) not in (0, wanted):
+            raise ValueError(
+                f"bias_jumps: path needs one list for each of {wanted} {self.parts}, got {len(self.path)}"
+            )
+        for part in self.path:
+            if any(a[0] >= b[0] for a, b in pairwise(part)):
                 raise ValueError("bias_jumps: frames of a path must increase; sort them")
-        return path
+        return self
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        levels = self._levels(context)
-        half_y, half_x = context.shape[0] // 2, context.shape[1] // 2
-        quadrant = 2 * (context.rows >= half_y)[:, None] + (np.arange(context.shape[1]) >= half_x)
-        return add_offset(values, self.amplitude_dn * levels[:, quadrant], context)
+        below = (context.rows >= context.shape[0] // 2)[:, None]
+        right = np.arange(context.shape[1]) >= context.shape[1] // 2
+        factors = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
+        levels = self._levels(context)[:, factors[0] * below + factors[1] * right]
+        return add_offset(values, self.amplitude_dn * levels, context)
 
     def _levels(self, context: EffectContext) -> NDArray[np.float64]:
-        """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, quadrant)."""
+        """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
         frames = context.frames.clip(0, context.n_frames - 1)
-        found = np.zeros((frames.size, _QUADRANTS))
-        for quadrant in range(_QUADRANTS):
+        found = np.zeros((frames.size, len(_PARTS[self.parts])))
+        for part in range(found.shape[1]):
             if self.path:
-                starts, levels = _steps(self.path[quadrant], context.n_frames)
+                starts, levels = _steps(self.path[part], context.n_frames)
             else:
-                starts, levels = self._drawn(context, quadrant)
+                starts, levels = self._drawn(context, part)
             if levels.size:
-                found[:, quadrant] = levels[np.searchsorted(starts[1:], frames, side="right")]
+                found[:, part] = levels[np.searchsorted(starts[1:], frames, side="right")]
         return found
 
-    def _drawn(self, context: EffectContext, quadrant: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _drawn(self, context: EffectContext, part: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the frames at which random levels begin, the first being 0, and the levels."""
-        generator = context.random.generator(draw=quadrant)
+        generator = context.random.generator(draw=part)
         starts, first = [np.zeros(1, np.int64)], generator.integers(self.levels)
         size = int(self.rate * context.n_frames * 1.2) + 16
         while self.rate > 0 and starts[-1][-1] < context.n_frames:
@@ -131,14 +142,16 @@ class BiasJumps(Effect):
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
         time, alpha = evidence.time, responsivity(evidence)
-        drawn = _correlated(time)
-        random = [cls(amplitude_dn=drawn[0] / alpha, rate=drawn[1])] if drawn else []
-        found = find_steps(time.quadrant_readout.astype(np.float64), np.diff(time.frames, prepend=-1))
+        means = time.quadrant_readout.astype(np.float64)
+        drawn = [(*_correlated(time.frames, means @ mix.T), name) for name, mix in _PARTS.items()]
+        drawn = sorted((d for d in drawn if d[0] > _SIGNIFICANT), reverse=True)
+        random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
+        found = find_steps(means, np.diff(time.frames, prepend=-1))
         jumps = np.concatenate([np.diff(steps.levels) for steps in found])
         if not jumps.size:
             return random
         size = float(np.sqrt((jumps**2).mean()))
-        covered = _QUADRANTS * (int(time.frames[-1]) - int(time.frames[0]) + 1)
+        covered = len(found) * (int(time.frames[-1]) - int(time.frames[0]) + 1)
         rate = min(max(jumps.size / covered, 1e-6), 0.5)
         path = tuple(_as_path(time, steps, size) for steps in found)
         size /= alpha
@@ -183,33 +196,36 @@ def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
     return np.concatenate(found)
 
 
-def _correlated(time: TimeSeries) -> tuple[float, float] | None:
-    """Return amplitude, DN, and rate of two-level jumps of the autocovariance seen, None if there is none.
+def _correlated(frames: NDArray[np.int64], means: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return significance, amplitude (DN) and rate of two-level jumps that best explain the correlation.
 
-    Of a level that jumps at rate q between ``-a/2`` and ``a/2`` it is ``a^2 / 4 (1 - 2 q)^l`` at lag l; the
-    deviation from the mean of four such quadrants has three quarters of that.
+    The autocovariance of a level that jumps at rate q between ``-a/2`` and ``a/2`` is ``a^2 / 4 (1 - 2 q)^l``
+    at lag l; the deviation from the mean of m such parts has ``1 - 1 / m`` of that.
     """
-    contrast = time.quadrant_readout - time.quadrant_readout.mean(axis=1, keepdims=True)
+    n_parts = means.shape[1]
+    contrast = means - means.mean(axis=1, keepdims=True)
     contrast = contrast - contrast.mean(axis=0)
     terms: list[tuple[float, float, float]] = []
-    for lag in range(1, min(_LAGS, time.frames.size // 4) + 1):
-        together = time.frames[lag:] - time.frames[:-lag] == lag
+    for lag in range(1, min(_LAGS, frames.size // 4) + 1):
+        together = frames[lag:] - frames[:-lag] == lag
         if together.sum() >= 8:
             products = (contrast[lag:] * contrast[:-lag])[together]
             terms.append((lag, float(products.mean()), float(products.shape[0])))
     if not terms:
-        return None
+        return 0.0, 0.0, 0.0
     lags, covariance, weight = np.array(terms).T
-    error = np.array([noise_variance(one) for one in contrast.T]).mean() / np.sqrt(3.0)
-    best: tuple[float, float, float] | None = None
+    variance = float(np.mean([noise_variance(one) for one in contrast.T]))
+    # of the contrasts of m parts only m - 1 are independent
+    error = variance / np.sqrt(n_parts - 1.0)
+    best = (0.0, 0.0, 0.0)
     for rate in np.geomspace(1e-3, 0.25, 12):
         shape = (1.0 - 2.0 * rate) ** lags
         square = float((weight * shape**2).sum())
         size = float((weight * shape * covariance).sum()) / square
-        significance = size * np.sqrt(square) / error
-        if size > 0 and significance > 4.0 and (best is None or significance > best[0]):
-            best = (significance, 2.0 * np.sqrt(size / 0.75), float(rate))
-    return None if best is None else best[1:]
+        if size > 0:
+            amplitude = 2.0 * float(np.sqrt(size / (1.0 - 1.0 / n_parts)))
+            best = max(best, (size * float(np.sqrt(square)) / error, amplitude, float(rate)))
+    return best
 
 
 def _as_path(time: TimeSeries, steps: Steps, scale: float) -> Path:

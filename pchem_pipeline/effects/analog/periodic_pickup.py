@@ -130,7 +130,7 @@ def _without_doubles(found: Sequence[tuple[float, Pickup]]) -> list[Pickup]:
     """Return the hypotheses, the strongest first; rows and columns both see a line along frames alone."""
     kept: list[Pickup] = []
     for _, pickup in sorted(found, key=lambda pair: -pair[0]):
-        along = pickup.cycles_per_row or pickup.cycles_per_column
-        if along or not any(other.cycles_per_frame == pickup.cycles_per_frame for other in kept):
+        places = [(p.cycles_per_row, p.cycles_per_column, p.cycles_per_frame) for p in (pickup, *kept)]
+        if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):
             kept.append(pickup)
     return kept[:4]
