@@ -76,7 +76,7 @@ def block_charge(evidence: Evidence) -> BlockCharge | None:
     time = evidence.time
     if time is None or time.block_start.size < 4:
         return None
-    good = evidence.maps.usable & (evidence.charge_std > 0)
+    good = evidence.maps.usable & (evidence.charge_std > 0) & (evidence.maps.quanta_exposure > 0)
     if not good.any():
         return None
     last = np.append(np.searchsorted(time.frames, time.block_start[1:]), time.frames.size)

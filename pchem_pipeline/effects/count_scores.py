@@ -43,7 +43,7 @@ def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
     maps, score = evidence.maps, evidence.scores.get("C2")
     if score is None:
         return 0.0, np.inf
-    good = maps.usable & np.isfinite(score)
+    good = maps.usable & np.isfinite(score) & (maps.quanta_exposure > 0)
     exposure = maps.quanta_exposure[good]
     noise = maps.read_noise_dn[good] * maps.conversion_gain[good]
     slope = np.sqrt(evidence.n_frames * charlier_information(exposure, noise)) * exposure**power

@@ -11,8 +11,11 @@ from pchem_pipeline.effects.charge_sums import BlockCharge
 
 __all__ = ["Fading", "FadingCells", "fading_of"]
 
-# a cell of the image must explain this chi-square
+# a cell must explain this chi-square to tell the time constant, and the differences of four cells that one
 _PRICE_OF_CELL = 6.0
+_PRICE_OF_DETAIL = 9.0
+# of the brightest cell: less than this is dark
+_DARK = 0.05
 # standard errors beyond which a pixel's amplitude is cut, around its cell's, and how often
 _CUT = 4.0
 _CUTS = 4
@@ -40,12 +43,15 @@ class FadingCells:
 
     @classmethod
     def of(cls, blocks: BlockCharge, exposure: NDArray[np.float64], decay: float, grid: int) -> FadingCells:
-        """Return the least squares amplitudes at a time constant, on a grid of so many rows and columns."""
+        """Return the least squares amplitudes at a time constant, on a grid of so many rows and columns.
+
+        Each is a power of two, smaller where the sensor is.
+        """
         shape = _exponential(blocks, decay)
         weight = blocks.length * shape
         found = weight @ blocks.deviation / (weight @ shape)
         stderr = np.sqrt(blocks.variance / (weight @ shape))
-        rows, columns = (min(grid, n) for n in exposure.shape)
+        rows, columns = (min(grid, 2 ** int(np.log2(n))) for n in exposure.shape)
         cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
         n = rows * columns
 
@@ -72,15 +78,32 @@ class FadingCells:
         background = float(np.median(self.amplitude[held] / self.exposure[held]))
         return np.where(held, self.amplitude - background * self.exposure, 0.0)
 
-    def bright(self) -> NDArray[np.float64]:
-        """Return the amplitudes that stand out, 0 elsewhere."""
-        amplitude = self.above_background()
-        return np.where(amplitude > np.sqrt(_PRICE_OF_CELL) * self.noise, amplitude, 0.0)
+    def image(self) -> NDArray[np.float64]:
+        """Return the amplitudes above the background without their noise, >= 0.
 
-    def worth(self) -> float:
-        """Return the chi-square that the cells that stand out explain, less their price."""
-        bright = self.bright()
-        return float(np.sum(((bright / self.noise) ** 2 - _PRICE_OF_CELL)[bright > 0]))
+        A group of two by two cells keeps its differences where they stand out, and has its mean otherwise; so
+        on with the means, up to the whole sensor (Donoho and Johnstone 1994, with Haar's wavelets by groups).
+        """
+        weight = np.where(np.isfinite(self.noise), self.noise, np.inf) ** -2.0
+        image = np.maximum(_denoised(self.above_background(), weight), 0.0)
+        return np.where(image > _DARK * image.max(), image, 0.0)
+
+
+def _denoised(values: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values on a grid of powers of two, of given inverse variances, coarse where they may be."""
+    rows, columns = values.shape
+    if values.size == 1:
+        return values
+    size = (max(rows // 2, 1), min(rows, 2), max(columns // 2, 1), min(columns, 2))
+    groups, held = values.reshape(size), weight.reshape(size)
+    whole = held.sum(axis=(1, 3))
+    mean = (held * groups).sum(axis=(1, 3)) / np.maximum(whole, 1e-300)
+    details = groups - mean[:, None, :, None]
+    stands_out = (held * details**2).sum(axis=(1, 3)) > _PRICE_OF_DETAIL
+    kept: NDArray[np.float64] = _denoised(mean, whole)[:, None, :, None] + np.where(
+        stands_out[:, None, :, None], details, 0.0
+    )
+    return kept.reshape(rows, columns)
 
 
 def _exponential(blocks: BlockCharge, decay: float) -> NDArray[np.float64]:

@@ -104,6 +104,7 @@ def _response(evidence: Evidence, axis: int) -> float:
     exposure, std = evidence.maps.quanta_exposure, evidence.charge_std
     first = tuple(slice(None, -1) if a == axis else slice(None) for a in range(2))
     second = tuple(slice(1, None) if a == axis else slice(None) for a in range(2))
-    good = evidence.maps.usable[first] & evidence.maps.usable[second]
+    seen = evidence.maps.usable & (exposure > 0)
+    good = seen[first] & seen[second]
     h, s = (exposure[first][good], exposure[second][good]), (std[first][good], std[second][good])
     return float(np.mean(0.25 * (h[0] + h[1]) * s[0] * s[1] / (h[0] * h[1]))) if good.any() else float("nan")

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Persistence"]
 
-# rows and columns of the grids tried for the image
-_GRIDS = (8, 16, 32)
+# rows and columns of the grids: to find something, and to describe it
+_GRIDS = (8, 16)
 # time constants tried, in lengths of the run
 _DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
 
@@ -143,8 +143,7 @@ class Persistence(Effect):
         best = max(tried, key=lambda cells: cells.score)
         if best.score < 4.0:
             return ()
-        finer = [best, *(FadingCells.of(blocks, exposure, best.decay, grid) for grid in _GRIDS[1:])]
-        image = max(finer, key=lambda cells: cells.worth())
+        finer = FadingCells.of(blocks, exposure, best.decay, _GRIDS[1])
         fading = fading_of(blocks, best, evidence.time.n_run)
         fields: dict[str, Any] = {
             "decay_frames": fading.decay,
@@ -152,12 +151,12 @@ class Persistence(Effect):
             "slow_share": fading.slow_share,
         }
         found: list[Self] = []
-        if image.worth() > 0:
-            bright = image.bright()
-            peak = float(bright.max())
+        bright = finer.image()
+        peak = float(bright.max())
+        if peak > 0:
             rows = tuple(tuple(float(round(v / peak, 3)) for v in row) for row in bright)
             found.append(cls(peak_e=peak * fading.scale, image=rows, **fields))
-        spot = _spot(finer[1], exposure.shape)
+        spot = _spot(finer, exposure.shape)
         if spot.pop("worth") > 0:
             peak = spot.pop("peak_e")
             found.append(cls(peak_e=peak * fading.scale, **spot, **fields))
