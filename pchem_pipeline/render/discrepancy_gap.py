@@ -208,7 +208,7 @@ def pulls(rows: Sequence[Pull], *, width_mm: float = PAGE_MM) -> Figure:
     wide = width_mm > 1.5 * COLUMN_MM
     labels = [textwrap.fill(row.sentence or row.statistic, 62 if wide else 26) for row in rows]
     lines = sum(label.count("\n") + 1 for label in labels)
-    figure = new_figure(width_mm, 20.0 + (5.4 * len(rows) if wide else 3.2 * lines + 3.0 * len(rows)))
+    figure = new_figure(width_mm, 20.0 + (6.6 * len(rows) if wide else 3.2 * lines + 3.0 * len(rows)))
     axes = figure.add_subplot()
     axes.axvspan(-2, 2, color=GRAY, alpha=0.45, linewidth=0)
     axes.axvline(0.0, color=BLACK, linewidth=0.6)
