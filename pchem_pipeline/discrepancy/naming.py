@@ -8,6 +8,7 @@ hold it have nearly all of it, and what could as well stand in its place is name
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -157,10 +158,10 @@ def _rivals(
                     old.hypothesis, old.score, old.stderr, old.probability + float(weight)
                 )
             else:
-                apart = np.hypot(*(a.distance(b, noise) for a, b in zip(best.fits, scored.fits, strict=True)))
-                found[candidate.tag] = Rival(
-                    candidate, scored.worth - best.worth, float(apart), float(weight)
+                apart = math.hypot(
+                    *(a.distance(b, noise) for a, b in zip(best.fits, scored.fits, strict=True))
                 )
+                found[candidate.tag] = Rival(candidate, scored.worth - best.worth, apart, float(weight))
     return tuple(sorted(found.values(), key=lambda r: (-r.probability, -r.score)))
 
 

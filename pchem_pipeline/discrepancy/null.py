@@ -58,7 +58,8 @@ class NullModel:
 
     def pulls(self, z: FloatArray, splits: int = 1) -> FloatArray:
         """Return (z - mean) / std for the mean of ``splits`` vectors, with the error of the mean."""
-        return (z - self.mean) / (self.std * np.sqrt(1.0 / splits + 1.0 / self.n_replicates))
+        scale = np.sqrt(1.0 / splits + 1.0 / self.n_replicates)
+        return np.asarray((z - self.mean) / (self.std * scale))
 
     def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
         """Return two-sided p-values (Student's t: the standard deviation comes from few replicates)."""

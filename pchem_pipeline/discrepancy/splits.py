@@ -74,5 +74,7 @@ def split_frames(numbers: NDArray[np.int64], block_frames: int) -> Splits:
     for group in range(len(starts) // 3):
         for part, start in zip(_ORDERS[group % 6], starts[3 * group : 3 * group + 3], strict=True):
             parts[part].append(start)
-    positions = [(np.asarray(part, np.int64)[:, None] + np.arange(block_frames)).ravel() for part in parts]
-    return Splits(*positions, block_frames=block_frames)
+    train, test, final = (
+        (np.asarray(part, np.int64)[:, None] + np.arange(block_frames)).ravel() for part in parts
+    )
+    return Splits(train, test, final, block_frames)

@@ -17,7 +17,7 @@ from pchem_pipeline.discrepancy.result import Candidate, Discrepancy, Pull, Step
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.where import Place
 from pchem_pipeline.effects.base import Effect
-from pchem_pipeline.effects.evidence import Evidence
+from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.registry import effect_classes
 
 __all__ = ["Round", "tell"]
@@ -40,6 +40,7 @@ class Round:
         hypotheses: all candidates of the round.
         null: of the model before it.
         grown: of the model after it.
+        moved: change of the parameter maps by their refit with the effects.
     """
 
     choice: Choice
@@ -47,6 +48,7 @@ class Round:
     hypotheses: tuple[Hypothesis, ...]
     null: NullModel
     grown: NullModel
+    moved: Mapping[str, Mapping[str, Any]]
 
 
 def tell(
@@ -57,6 +59,7 @@ def tell(
     z: Mapping[str, FloatArray],
     places: Sequence[Place],
     train: Evidence,
+    maps: PixelMaps,
     model: tuple[Effect, ...],
     settings: DiscrepancySettings,
     still: bool,
@@ -93,7 +96,7 @@ def tell(
         global_p=(first.global_p(both, 2), last.global_p(both, 2)),
         examined=dict(examined),
         n_replicates=n_replicates,
-        maps=train.maps,
+        maps=maps,
         evidence=train,
         statistics=(first.names, pulls[0], pulls[1]),
     )
@@ -184,6 +187,7 @@ def _step(
         runner_up=None if runner_up is None else gap_with(runner_up),
         placebo=None if placebo is None else gap_with(placebo),
         pulls=tuple(Pull(this.null.names[i], float(pull_before[i]), float(pull_after[i])) for i in telling),
+        moved=this.moved,
     )
 
 

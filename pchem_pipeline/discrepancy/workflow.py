@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix, two_sided
 from pchem_pipeline.discrepancy.observe import observe
+from pchem_pipeline.discrepancy.refit import refit_maps
 from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.result import Discrepancy
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -116,6 +117,8 @@ class _Search:
         train, test, final = (self._observe(part) for part in self._parts())
         self._check(train)
         maps = train.maps
+        if self.model:
+            maps = refit_maps(self.stack[self.splits.train], maps, self.model).maps
         null, names = self._null(maps, "r0", self.settings.replicates, (train, test, final))
         z = {k: self._row(e, names) for k, e in (("train", train), ("test", test), ("final", final))}
         both = (z["train"] + z["test"]) / 2.0
@@ -133,12 +136,14 @@ class _Search:
                 break
             added = self._added(laboratory, choice, shifts, null)
             self.model = (*self.model, *(h.effect for h in added.hypotheses))
+            refit = refit_maps(self.stack[self.splits.train], train.maps, self.model)
+            maps = refit.maps
             grown, _ = self._null(
                 maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), names
             )
-            rounds.append(Round(choice, added, tuple(hypotheses), null, grown))
+            rounds.append(Round(choice, added, tuple(hypotheses), null, grown, refit.moved))
             null = grown
-        return self._result(rounds, first, null, names, z, places, train)
+        return self._result(rounds, first, null, names, z, places, train, maps)
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -200,7 +205,7 @@ class _Search:
         return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
 
     def _row(self, evidence: Evidence, names: tuple[str, ...]) -> FloatArray:
-        return as_matrix(names, [evidence.z])[0]
+        return np.asarray(as_matrix(names, [evidence.z])[0])
 
     def _disagrees(self, null: NullModel, z: Mapping[str, FloatArray], names: tuple[str, ...]) -> bool:
         """Tell whether some statistic deviates more than chance allows, and does so in both splits."""
@@ -283,6 +288,7 @@ class _Search:
         z: Mapping[str, FloatArray],
         places: list[Place],
         train: Evidence,
+        maps: PixelMaps,
     ) -> Discrepancy:
         return tell(
             rounds,
@@ -291,6 +297,7 @@ class _Search:
             z=z,
             places=places,
             train=train,
+            maps=maps,
             model=self.model,
             settings=self.settings,
             still=self._disagrees(last, z, names),

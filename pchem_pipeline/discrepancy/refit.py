@@ -1,0 +1,78 @@
+"""The parameter maps under a grown model, and how far the effects had moved them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.evidence import PixelMaps
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.model.grown import fit_grown
+from pchem_pipeline.model.histogram import histogram_frames
+
+__all__ = ["Refit", "refit_maps"]
+
+_UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
+
+
+@dataclass(frozen=True)
+class Refit:
+    """Maps fitted with effects.
+
+    Attributes:
+        maps: H, g, mu, sigma of the pixels themselves.
+        moved: by parameter: median change against the maps before, the same in standard errors of a pixel,
+            and the unit.
+    """
+
+    maps: PixelMaps
+    moved: Mapping[str, Mapping[str, Any]]
+
+
+def refit_maps(frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]) -> Refit:
+    """Fit the pixels of some frames with effects in their law.
+
+    Args:
+        frames: (frame, y, x), DN.
+        maps: plain fit of the same frames; pixels that are not usable stay so.
+        effects: of the grown model.
+
+    Returns:
+        New maps; the old ones where the effects cannot be fitted with.
+    """
+    shape = maps.usable.shape
+    old = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    flat = tuple(values.ravel() for values in old)
+    try:
+        law = marginal_model(effects, pixel_maps(flat, maps.usable))
+    except ConfigError:
+        return Refit(maps, {})
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
+    fit = fit_grown(counts, histograms.origin.ravel(), flat, law, warm=True)
+    new = (fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn)
+    good = maps.usable.ravel() & np.isfinite(np.stack(new)).all(axis=0)
+    exposure, gain, bias, noise = (np.where(good, values, np.nan).reshape(shape) for values in new)
+    stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
+    moved = {
+        name: _change(after[good] - before[good], error[good], unit)
+        for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
+    }
+    return Refit(PixelMaps(exposure, gain, bias, noise, good.reshape(shape)), moved)
+
+
+def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = difference / stderr
+    finite = ratio[np.isfinite(ratio)]
+    return {
+        "median": float(np.median(difference)) if difference.size else 0.0,
+        "in_stderr": float(np.median(finite)) if finite.size else 0.0,
+        "unit": unit,
+    }
