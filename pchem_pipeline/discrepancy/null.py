@@ -56,6 +56,11 @@ class NullModel:
         """Number of replicates."""
         return int(self.replicates.shape[0])
 
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the standard deviations."""
+        return self.n_replicates - 1 + _PRIOR_WEIGHT
+
     def pulls(self, z: FloatArray, splits: int = 1) -> FloatArray:
         """Return (z - mean) / std for the mean of ``splits`` vectors, with the error of the mean."""
         scale = np.sqrt(1.0 / splits + 1.0 / self.n_replicates)
@@ -63,7 +68,7 @@ class NullModel:
 
     def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
         """Return two-sided p-values (Student's t: the standard deviation comes from few replicates)."""
-        return two_sided(self.pulls(z, splits), self.n_replicates - 1 + _PRIOR_WEIGHT)
+        return two_sided(self.pulls(z, splits), self.freedom)
 
     def global_p(self, z: FloatArray, splits: int = 1) -> float:
         """Return the probability that any statistic deviates as much as the most deviating one."""

@@ -68,13 +68,14 @@ class Step:
     """One effect added to the model, or one that could not be told from others.
 
     Attributes:
-        effect: the named effect; None where it is ambiguous.
+        effect: the named effect; None where it is ambiguous or does not fit.
         candidates: those compared, the likeliest first.
         strength_stderr: standard error of its strength.
         before, after: gap on the final frames without and with it.
         runner_up, placebo: (tag, gap) of the next best candidate and of one that has nothing to do with it,
             fitted the same way; None where there is none.
         pulls: the statistics that moved most.
+        fits: whether it explains what it moves itself; where not, the candidates are the nearest known.
         moved: change of each parameter map by its refit with the effect: median, and in standard errors.
     """
 
@@ -86,7 +87,15 @@ class Step:
     runner_up: tuple[str, float] | None
     placebo: tuple[str, float] | None
     pulls: tuple[Pull, ...]
+    fits: bool = True
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict of this step alone."""
+        if not self.fits:
+            return "unexplained"
+        return "ambiguous" if self.effect is None else "named"
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON data."""
@@ -95,7 +104,7 @@ class Step:
         rivals = {c.effect.tag for c in self.candidates}
         return {
             "effect": None if self.effect is None else self.effect.tag,
-            "verdict": "ambiguous" if self.effect is None else "named",
+            "verdict": self.verdict,
             "candidates": [c.to_json() for c in self.candidates],
             "parameters": _parameters(shown, self.strength_stderr),
             "gap_before": self.before.value,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.disagreement import Measured, misfits
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
 from pchem_pipeline.discrepancy.gap import Gap, GapMetric
 from pchem_pipeline.discrepancy.naming import Choice, Rival
@@ -56,7 +57,7 @@ def tell(
     *,
     first: NullModel,
     last: NullModel,
-    z: Mapping[str, FloatArray],
+    z: Measured,
     places: Sequence[Place],
     train: Evidence,
     maps: PixelMaps,
@@ -70,16 +71,14 @@ def tell(
     """Put the verdict together; see :class:`~pchem_pipeline.discrepancy.result.Discrepancy`."""
     n_samples = int(examined["final"]) * int(train.maps.usable.sum())
     metric = GapMetric(first, n_samples)
-    before = metric.gap(z["final"], first.mean, first.replicates)
-    after = metric.gap(z["final"], last.mean, last.replicates)
+    before = metric.gap(z.final, first.mean, first.replicates)
+    after = metric.gap(z.final, last.mean, last.replicates)
     steps = _steps(rounds, metric, z, settings, before, after)
-    both = (z["train"] + z["test"]) / 2.0
+    both = z.both
     pulls = first.pulls(both, splits=2), last.pulls(both, splits=2)
     rest = [(name, float(pull)) for name, pull in zip(first.names, pulls[1], strict=True)]
     rest.sort(key=lambda item: -abs(item[1]))
-    verdict = _verdict(steps, bool(places), still, before, after)
-    if verdict == "unexplained":
-        steps = tuple(_demoted(step) for step in steps)
+    verdict = _verdict(steps, still, before, after)
     named = {s.effect.tag for s in steps if s.effect is not None}
     tentative = {h.tag for r in rounds for h in r.added.hypotheses} - named
     return Discrepancy(
@@ -105,7 +104,7 @@ def tell(
 def _steps(
     rounds: Sequence[Round],
     metric: GapMetric,
-    z: Mapping[str, FloatArray],
+    z: Measured,
     settings: DiscrepancySettings,
     before: Gap,
     after: Gap,
@@ -115,7 +114,7 @@ def _steps(
     mean = metric.null.mean
     gap = before
     for index, this in enumerate(rounds):
-        shift = (z["train"] + z["test"]) / 2.0 - this.null.mean
+        shift = z.both - this.null.mean
         parts = this.added.parts
         order = np.argsort([-_weight(part, this.null) for part in parts])
         mean = this.null.mean
@@ -126,10 +125,10 @@ def _steps(
             if last_of_all:
                 now = after
             elif last_of_round:
-                now = metric.gap(z["final"], this.grown.mean, this.grown.replicates)
+                now = metric.gap(z.final, this.grown.mean, this.grown.replicates)
             else:
-                now = metric.gap(z["final"], mean, this.null.replicates)
-            steps.append(_step(this, int(member), metric, z["final"], shift, gap, now, settings))
+                now = metric.gap(z.final, mean, this.null.replicates)
+            steps.append(_step(this, int(member), metric, z, shift, gap, now, settings))
             gap = now
     return tuple(steps)
 
@@ -142,7 +141,7 @@ def _step(
     this: Round,
     member: int,
     metric: GapMetric,
-    z_final: FloatArray,
+    z: Measured,
     shift: FloatArray,
     before: Gap,
     after: Gap,
@@ -153,7 +152,10 @@ def _step(
     rivals = this.choice.rivals[member]
     others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
     kept = _ambiguous_set(rivals, settings.certainty)
-    named = len(kept) == 1
+    parts = this.added.parts
+    tolerance = settings.model_error * np.sqrt(np.sum(parts**2, axis=0))
+    fits = not misfits(this.grown, z, parts[member], settings.significance, tolerance)
+    named = len(kept) == 1 and fits
     candidates = tuple(
         Candidate(
             added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect,
@@ -168,11 +170,11 @@ def _step(
         noise = Noise(this.null.covariance / 2.0, settings.model_error)
         fit = fit_set([*others, hypothesis], shift, noise)
         mean = this.null.mean + fit.parts.sum(axis=0)
-        return hypothesis.tag, metric.gap(z_final, mean, this.null.replicates).value
+        return hypothesis.tag, metric.gap(z.final, mean, this.null.replicates).value
 
     runner_up, placebo = _comparisons(this, added, rivals)
-    pull_before = (z_final - this.null.mean) / this.null.std
-    pull_after = (z_final - this.null.mean - this.added.parts.sum(axis=0)) / this.null.std
+    pull_before = (z.final - this.null.mean) / this.null.std
+    pull_after = (z.final - this.null.mean - this.added.parts.sum(axis=0)) / this.null.std
     telling = np.argsort(-np.abs(added.fingerprint / this.null.std))[:_MOST_PULLS]
     factor_error = float(this.added.stderr[member])
     value = (
@@ -187,6 +189,7 @@ def _step(
         runner_up=None if runner_up is None else gap_with(runner_up),
         placebo=None if placebo is None else gap_with(placebo),
         pulls=tuple(Pull(this.null.names[i], float(pull_before[i]), float(pull_after[i])) for i in telling),
+        fits=fits,
         moved=this.moved,
     )
 
@@ -220,18 +223,14 @@ def _comparisons(
     return runner_up, placebo
 
 
-def _verdict(steps: Sequence[Step], disagrees: bool, still: bool, before: Gap, after: Gap) -> Verdict:
+def _verdict(steps: Sequence[Step], still: bool, before: Gap, after: Gap) -> Verdict:
     if not steps:
         return "unexplained" if still else "consistent"
+    if any(not step.fits for step in steps):
+        return "unexplained"
     if still and after.value > after.floor and after.value > _LARGEST_REST * before.value:
         return "unexplained"
     return "ambiguous" if any(s.effect is None for s in steps) else "named"
-
-
-def _demoted(step: Step) -> Step:
-    from dataclasses import replace
-
-    return replace(step, effect=None)
 
 
 def _sentence(
@@ -249,8 +248,10 @@ def _sentence(
         also = f"{_and(titles)} is missing, and " if titles else ""
         return f"The model lacks something that these frames cannot tell apart: {also}{_and(sets)}."
     lead = f" (largest in {places[0].statistic})" if places else ""
-    nearest = f"; nearest known: {steps[0].candidates[0].effect.tag}" if steps else ""
-    return f"The frames disagree with the model{lead}, and no known effect explains it{nearest}."
+    doubtful = [s.candidates[0].effect.tag for s in steps if not s.fits]
+    nearest = f"; nearest known: {_and(doubtful)}" if doubtful else ""
+    besides = f" besides {_and(titles)}" if titles else ""
+    return f"The frames disagree with the model{lead}, and no known effect explains it{besides}{nearest}."
 
 
 def _and(items: Sequence[str]) -> str:

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
 from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.disagreement import Measured, disagrees
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
 from pchem_pipeline.discrepancy.naming import Choice, choose
-from pchem_pipeline.discrepancy.null import NullModel, as_matrix, two_sided
+from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
 from pchem_pipeline.discrepancy.refit import refit_maps
 from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
@@ -36,8 +37,6 @@ __all__ = ["find_discrepancies"]
 
 FloatArray = NDArray[np.float64]
 
-_REPLICATION = 0.02  # in each split by itself, and in the same direction
-_EXACT = ("frame.repeated",)  # tests without false positives: one split is enough
 _FEWEST_PIXELS = 32
 _REFINEMENTS = 4
 _CLOSE = 0.02  # relative: strengths known so well are not simulated again
@@ -120,15 +119,16 @@ class _Search:
         if self.model:
             maps = refit_maps(self.stack[self.splits.train], maps, self.model).maps
         null, names = self._null(maps, "r0", self.settings.replicates, (train, test, final))
-        z = {k: self._row(e, names) for k, e in (("train", train), ("test", test), ("final", final))}
-        both = (z["train"] + z["test"]) / 2.0
+        z = Measured(*(self._row(evidence, names) for evidence in (train, test, final)))
         first = null
         rounds: list[Round] = []
-        places = locate(train, null, both, self.settings.significance)
-        while len(rounds) < self.settings.max_rounds and self._disagrees(null, z, names):
+        limit = self.settings.significance
+        places = locate(train, null, z.both, limit)
+        still = disagrees(null, z, limit)
+        while still and len(rounds) < self.settings.max_rounds:
             number = len(rounds)
             laboratory = self._laboratory(maps, names, number)
-            shifts = (z["train"] - null.mean, z["test"] - null.mean)
+            shifts = (z.train - null.mean, z.test - null.mean)
             hypotheses = self._hypotheses(laboratory, classes, train, shifts, null)
             choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
             self.left_out |= laboratory.left_out
@@ -143,7 +143,8 @@ class _Search:
             )
             rounds.append(Round(choice, added, tuple(hypotheses), null, grown, refit.moved))
             null = grown
-        return self._result(rounds, first, null, names, z, places, train, maps)
+            still = disagrees(null, z, limit, self._tolerance(rounds))
+        return self._result(rounds, first, null, z, places, train, maps, still)
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -207,18 +208,12 @@ class _Search:
     def _row(self, evidence: Evidence, names: tuple[str, ...]) -> FloatArray:
         return np.asarray(as_matrix(names, [evidence.z])[0])
 
-    def _disagrees(self, null: NullModel, z: Mapping[str, FloatArray], names: tuple[str, ...]) -> bool:
-        """Tell whether some statistic deviates more than chance allows, and does so in both splits."""
-        both = (z["train"] + z["test"]) / 2.0
-        if null.global_p(both, splits=2) > self.settings.significance:
-            return False
-        p = null.p_values(both, splits=2)
-        pulls = (null.pulls(z["train"]), null.pulls(z["test"]))
-        alone = [two_sided(pull, null.n_replicates) for pull in pulls]
-        same = (alone[0] < _REPLICATION) & (alone[1] < _REPLICATION) & (pulls[0] * pulls[1] > 0)
-        same |= np.isin(names, _EXACT)
-        limit = 1.0 - (1.0 - self.settings.significance) ** (1.0 / null.effective_tests)
-        return bool(np.any(same & (p < limit)))
+    def _tolerance(self, rounds: Sequence[Round]) -> FloatArray | float:
+        """Return what is not held against effects that were added: a fraction of what they do."""
+        if not rounds:
+            return 0.0
+        parts = np.concatenate([this.added.parts for this in rounds])
+        return np.asarray(self.settings.model_error * np.sqrt(np.sum(parts**2, axis=0)))
 
     def _noise(self, null: NullModel, splits: int) -> Noise:
         scale = 1.0 / splits + 1.0 / null.n_replicates
@@ -284,11 +279,11 @@ class _Search:
         rounds: list[Round],
         first: NullModel,
         last: NullModel,
-        names: tuple[str, ...],
-        z: Mapping[str, FloatArray],
+        z: Measured,
         places: list[Place],
         train: Evidence,
         maps: PixelMaps,
+        still: bool,
     ) -> Discrepancy:
         return tell(
             rounds,
@@ -300,7 +295,7 @@ class _Search:
             maps=maps,
             model=self.model,
             settings=self.settings,
-            still=self._disagrees(last, z, names),
+            still=still,
             left_out=self.left_out,
             n_replicates=self.n_replicates,
             examined={
