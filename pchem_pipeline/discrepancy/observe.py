@@ -42,8 +42,10 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MINIMUM_BLOCKS = 4
-#: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for.
-UNTRUSTWORTHY = FAILED | FitStatus.BIAS_AMBIGUOUS | FitStatus.NOT_INFORMATIVE
+#: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for. Nor is a
+#: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
+#: with an unambiguous sample would bias the statistics of the rest.
+UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 
 

@@ -109,7 +109,7 @@ def pixel_laws(
     )
     kernel.summarise_pixels(
         counts, origin, outside, natural, electrons, window, start, axis, coarse, ALLOWED_BEYOND,
-        ALLOWED_FAR_BEYOND / good.sum(),
+        ALLOWED_FAR_BEYOND / max(int(good.sum()), 1),
         laws.moments, laws.scores, laws.good, laws.support, laws.tables, laws.codes,
         laws.fold, laws.fold_covariance, laws.bins, laws.bin_covariance,
     )  # fmt: skip

@@ -1,0 +1,83 @@
+"""Every statistic is about N(0, 1) for stacks without any effect."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_stacks import small_stack
+
+from pchem_pipeline.discrepancy import laws
+from pchem_pipeline.discrepancy import observe as observe_module
+from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe import observe
+from pchem_pipeline.discrepancy.vector_frames import FrameView
+
+N_STACKS, SHAPE, N_FRAMES, BLOCK = 60, (24, 24), 600, 50
+LIMIT = 5.0 / np.sqrt(N_STACKS)
+#: Statistics of events that all but never happen without an effect: always 0.
+SILENT = ("frame.repeated", "frame.repeated_rows", "tail.high.clusters")
+#: The fit of four parameters to so few frames takes a little more variance from the scores, and samples from
+#: the tails, than first-order theory says; counts of few pixels are coarse.
+BIAS = {"shape": 0.6, "tail": 0.6, "code": 0.3}
+SMALLEST_STD = {True: 0.2, False: 0.7}
+
+
+def _vector(seed: int) -> list[float]:
+    frames = small_stack(SHAPE, N_FRAMES, seed)
+    # blocks as they are dealt to a third of a run
+    numbers = np.concatenate([np.arange(a, a + BLOCK) for a in range(0, 3 * N_FRAMES, 3 * BLOCK)])
+    z = observe(frames, numbers, n_run=3 * N_FRAMES, block_frames=BLOCK).z
+    return [z[name] for name in STATISTICS]
+
+
+@pytest.fixture(scope="module")
+def vectors() -> dict[str, np.ndarray]:
+    found = np.array([_vector(1000 + seed) for seed in range(N_STACKS)])
+    return dict(zip(STATISTICS, found.T, strict=True))
+
+
+def _mean_is_zero(name: str, z: np.ndarray) -> bool:
+    return bool(abs(z.mean()) < BIAS.get(STATISTICS[name].family, 0.0) + LIMIT * max(z.std(), 1.0))
+
+
+@pytest.mark.parametrize("name", [name for name in STATISTICS if name not in SILENT])
+def test_a_statistic_is_standard_normal_without_effects(name: str, vectors: dict[str, np.ndarray]) -> None:
+    z = vectors[name]
+    assert _mean_is_zero(name, z), z.mean()
+    assert SMALLEST_STD[name.endswith(("cnt", "pixels", "count"))] < z.std(ddof=1) < 1.4, z.std()
+    assert np.abs(z).max() < 5.0
+
+
+@pytest.mark.parametrize("name", SILENT)
+def test_impossible_events_do_not_happen(name: str, vectors: dict[str, np.ndarray]) -> None:
+    assert np.abs(vectors[name]).max() < 0.01
+
+
+def _means(names: tuple[str, ...], count: int) -> dict[str, np.ndarray]:
+    found = np.array([_vector(1000 + seed) for seed in range(count)])
+    return {name: found[:, list(STATISTICS).index(name)] for name in names}
+
+
+def test_forgetting_that_series_are_centred_would_be_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    # a billion frames instead of 600: the correction 1 / (n - 1) all but vanishes
+    right = observe_module.pixel_lags
+
+    def wrong(view: FrameView) -> np.ndarray:
+        many = replace(view, numbers=np.broadcast_to(view.numbers[:1], 1_000_000_000))
+        return right(many)
+
+    monkeypatch.setattr(observe_module, "pixel_lags", wrong)
+    name = "time.lag1.charge.mean"
+    z = _means((name,), 12)[name]
+    assert not abs(z.mean()) < LIMIT
+
+
+def test_a_wrong_variance_would_be_caught(vectors: dict[str, np.ndarray]) -> None:
+    # had the rows' common mode not been counted as one degree of freedom of a frame
+    rows = SHAPE[0]
+    shift = laws.chi_square(N_FRAMES * (rows - 1.0), N_FRAMES * rows)
+    name = "space.row.readout.variance"
+    assert _mean_is_zero(name, vectors[name])
+    assert not _mean_is_zero(name, vectors[name] + float(shift))
