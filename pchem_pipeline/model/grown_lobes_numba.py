@@ -41,6 +41,7 @@ _SCREEN = 0.2  # of the rise asked of free lobes, seen from the fit without them
 _SCALES = (0.25, 0.33, 0.42, 0.5, 0.6, 0.7, 0.82, 0.9, 1.0, 1.1, 1.22, 1.4, 1.65, 2.0, 3.0)
 _WEIGHTS = (0.1,)
 _NOISE_E = 0.3
+_N_ATTEMPTS = 4  # from the fit, one electron more and less, other steps
 _LEAST_MASS = 1e-12  # of a sample that must not decide between starts
 
 
@@ -114,6 +115,23 @@ def _from_fit(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
+def _beside(direction: float, cells: Cells, law: Law, room: Room, theta: NDArray[np.float64]) -> bool:
+    """Move ``theta`` by one electron (H + direction, mu - direction/g); False where H would end.
+
+    A lobe below the peak of no electron is taken for that peak by a fit without lobes.
+    """
+    exposure = math.exp(theta[LOG_EXPOSURE]) + direction
+    if not exposure > 0.03:
+        return False
+    theta[LOG_EXPOSURE] = math.log(exposure)
+    theta[BIAS] -= direction * theta[STEP]
+    near_masses(theta, cells, law, room)
+    weight, _ = lobe_weight(cells, room)
+    theta[LOBE] = min(max(weight, 0.005), 0.5)
+    return True
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
 def _likeliest_start(
     a: float,
     amplitude: float,
@@ -178,6 +196,7 @@ def search_lobes(
     law: Law,
     place: tuple[int, int, int],
     amplitudes: NDArray[np.float64],
+    unsure: bool,
     thorough: bool,
     limits: NDArray[np.float64],
     room: Room,
@@ -192,7 +211,8 @@ def search_lobes(
         law: grown model.
         place: the pixel's place in the arrays of the law, the code of the first cell, the centre.
         amplitudes: e-.
-        thorough: other starts are tried too.
+        unsure: starts one electron beside the fit are tried too.
+        thorough: those are, and starts with other steps.
         limits: bounds and limits.
         room: scratch.
 
@@ -205,27 +225,29 @@ def search_lobes(
     space = cells.weights, cells.edges, cells.lobes
     for amplitude in amplitudes:
         own = make_cells(law, pixel, amplitude, first_code, centre, cells.n_bins, space)
-        for attempt in range(2 if thorough else 1):
+        for attempt in range(_N_ATTEMPTS if thorough else (_N_ATTEMPTS - 1 if unsure else 1)):
+            for i in range(N_THETA):
+                trial[i] = theta[i]
             if attempt == 0:
-                for i in range(N_THETA):
-                    trial[i] = theta[i]
                 found, count = _from_fit(trial, own, law, limits, room)
-            elif _likeliest_start(theta[STEP], amplitude, histogram, own, law, room, trial):
+            else:
+                if attempt < _N_ATTEMPTS - 1:
+                    usable = _beside(3.0 - 2.0 * attempt, own, law, room, trial)
+                else:
+                    usable = _likeliest_start(theta[STEP], amplitude, histogram, own, law, room, trial)
+                if not usable:
+                    continue
                 fine, found, count = _climb(trial, own, law, limits, highest, room)
                 found = found if fine else -math.inf
-                count += len(_SCALES) * len(_WEIGHTS)
-            else:
-                continue
             used += count
+            if thorough and found > -math.inf:
+                found, _, count = climb_neighbours(trial, found, own, law, limits, True, room)
+                used += count
             if found > highest:
                 kept, highest = amplitude, found
                 for i in range(N_THETA):
                     best[i] = trial[i]
     if kept > 0.0:
-        if thorough:
-            own = make_cells(law, pixel, kept, first_code, centre, cells.n_bins, space)
-            _, _, count = climb_neighbours(best, highest, own, law, limits, True, room)
-            used += count
         for i in range(N_THETA):
             theta[i] = best[i]
     return kept, used

@@ -100,8 +100,9 @@ def fit_pixel(
     amplitude = 0.0
     if amplitudes.size > 0:
         poor = normal_score(out[CHI2], freedom) > _SUSPICIOUS
+        unsure = out[GAP] < limits[CLEAR_GAP]
         amplitude, count = search_lobes(
-            theta, loglik, histogram, cells, law, place, amplitudes, poor, limits, room
+            theta, loglik, histogram, cells, law, place, amplitudes, unsure, poor, limits, room
         )
         used += count
         space = cells.weights, cells.edges, cells.lobes
