@@ -26,8 +26,8 @@ _PIXELS = 256
 _PERIODS = 48
 _MOST_CODES = 1500
 _SHORTEST = 8.0
-# fall of chi2 by two coefficients at one of some 20 independent periods: p about 1e-3
-_LEAST_GAIN = 20.0
+# fall of chi2 by two coefficients at one of some 20 independent periods: p about 0.02
+_LEAST_GAIN = 14.0
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ Residuals = tuple["NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float6
 # fewest expected counts at which a relative residual is about normal
 _FEWEST = 100.0
 # fall of chi2 that one edge must bring, and most edges
-_LEAST_GAIN = 20.0
+_LEAST_GAIN = 18.0
 _MOST_SHIFTS = 4
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = [
+    "WORTH_A_GUESS",
     "add_offset",
     "chebyshev_nodes",
     "is_narrow",
@@ -32,6 +33,10 @@ __all__ = [
 ]
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+
+#: Standard errors from which on an excess is worth a hypothesis. One split of the frames sees less than all
+#: of them together, and a wrong hypothesis is thrown out by the comparison that follows: so not too many.
+WORTH_A_GUESS = 2.0
 
 # below this ratio of the spread of an offset to the read noise its shape is lost: the fourth cumulant that
 # a Gaussian of the same variance misses is 2e-4 of the squared variance, for the worst (two-valued) law

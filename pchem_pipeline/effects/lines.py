@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Line", "coherent_line", "incoherent_line"]
 
 # probability of any line where there is none
-_FALSE_ALARM = 1e-3
+_FALSE_ALARM = 0.02
 # frames of a spectrum over frames and lines: enough to tell a line, and bounded memory
 _MOST_CELLS = 1 << 24
 # slow changes that are no lines: cosines of up to so many half periods per run

@@ -31,6 +31,8 @@ __all__ = ["AdcDnl"]
 _CHUNK = 1024
 # edges further away would change their order
 _FARTHEST = 0.499
+# fall of chi2 that one of 8 bits must bring
+_BIT_GAIN = 12.0
 
 
 @register_effect
@@ -153,7 +155,7 @@ class AdcDnl(Effect):
         found = [] if bit is None else [cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0])]
         if few is not None:
             found += cls._from_shifts(codes, few)
-        if significance > 3.0:
+        if significance > 2.5:
             found += cls._from_shifts(codes, edge_shifts(residuals, expected, variance))
         return found
 
@@ -201,6 +203,6 @@ def _best_bit(
         gain = error**2 * square
         # what is left must not be much rougher than the counts, or it is not one bit
         left = (total - gain) / rough.size
-        if gain > 25.0 and left < 1.5 and (best is None or gain > best[2]):
+        if gain > _BIT_GAIN and left < 1.5 and (best is None or gain > best[2]):
             best = (bit, max(-1.0, min(1.0, error)), gain)
     return None if best is None else best[:2]

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.common_modes import (
+    WORTH_A_GUESS,
     add_offset,
     quantile_means,
     responsivity,
@@ -35,7 +36,6 @@ __all__ = ["BiasDrift"]
 _NODES = (3, 5, 9, 17, 33)
 _FRAMES_PER_NODE = 12
 _LOBES = 7
-_SIGNIFICANT = 2.5
 
 
 @register_effect
@@ -117,7 +117,7 @@ class BiasDrift(Effect):
         time, alpha = evidence.time, responsivity(evidence)
         position = run_position(time.frames, time.n_run)
         slope, error = _slope(position, time.frame_readout)
-        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > _SIGNIFICANT * error else []
+        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []
         path = _best_path(position, time)
         if path is None:
             if linear or evidence.strongest("frame.readout.slow") <= 3.0:

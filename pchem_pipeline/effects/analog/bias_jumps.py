@@ -38,7 +38,8 @@ _PARTS: dict[Parts, NDArray[np.float64]] = {
 }
 _LOBES = 7
 _LAGS = 40
-_SIGNIFICANT = 3.0
+# of the best of some ten rates
+_SIGNIFICANT = 2.5
 
 
 @register_effect

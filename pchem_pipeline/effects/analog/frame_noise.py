@@ -15,7 +15,13 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.common_modes import add_offset, line_excess, mean_variance, responsivity
+from pchem_pipeline.effects.common_modes import (
+    WORTH_A_GUESS,
+    add_offset,
+    line_excess,
+    mean_variance,
+    responsivity,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,7 +86,7 @@ class FrameNoise(Effect):
         excess = float((steps**2).mean() / 2.0 - expected)
         # successive differences share a frame: their squares are correlated by 1/4
         error = expected * np.sqrt(3.0 / steps.size)
-        if excess < 3.0 * error:
+        if excess < WORTH_A_GUESS * error:
             return ()
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
 

@@ -14,7 +14,13 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.common_modes import add_offset, mean_variance, responsivity, with_offsets
+from pchem_pipeline.effects.common_modes import (
+    WORTH_A_GUESS,
+    add_offset,
+    mean_variance,
+    responsivity,
+    with_offsets,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -74,7 +80,9 @@ class ReadoutAlternation(Effect):
         size = float(means[even].mean() - means[~even].mean()) / 2.0
         scatter = float((means[even].var() * n_even + means[~even].var() * n_odd) / (n_even + n_odd))
         error = np.sqrt(max(scatter, float(mean_variance(evidence))) * (1.0 / n_even + 1.0 / n_odd)) / 2.0
-        return (cls(alternation_dn=size / responsivity(evidence)),) if abs(size) > 3.0 * error else ()
+        if abs(size) < WORTH_A_GUESS * error:
+            return ()
+        return (cls(alternation_dn=size / responsivity(evidence)),)
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law of two copies, equally likely (a variance where they are close together)."""

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.common_modes import add_offset, line_excess, mean_variance, responsivity
+from pchem_pipeline.effects.common_modes import (
+    WORTH_A_GUESS,
+    add_offset,
+    line_excess,
+    mean_variance,
+    responsivity,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,7 +69,9 @@ class RowNoise(Effect):
         if evidence.time is None:
             return ()
         excess, error = line_excess(evidence.time.row_readout, mean_variance(evidence, axis=1))
-        return (cls(row_noise_dn=excess**0.5 / responsivity(evidence)),) if excess > 3.0 * error else ()
+        if excess < WORTH_A_GUESS * error:
+            return ()
+        return (cls(row_noise_dn=excess**0.5 / responsivity(evidence)),)
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
