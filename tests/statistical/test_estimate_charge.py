@@ -222,8 +222,8 @@ def test_tracks():
 def test_a_sensor_of_few_pixels(shape):
     hidden = (
         ExposureDrift(drift=0.9),
-        DarkCurrentRts(fraction=0.5, step_e=2.0),
-        CosmicRays(tracks_per_frame=0.1),
+        DarkCurrentRts(fraction=0.5, step_e=0.5),
+        CosmicRays(tracks_per_frame=0.002),
     )
     evidence = evidence_of(a_sensor(shape), *hidden, n_frames=1000)
     found = {cls: cls.estimate(evidence) for cls in CLASSES}
