@@ -187,7 +187,7 @@ def _sine(cls: type[_T], course: ExposureCourse) -> list[_T]:
     cycles = (np.angle(line * 1j) / (2.0 * np.pi) - frequency * first) % 1.0
     if not 0 < frequency < 0.999:
         return []
-    return [cls(rms=float(rms), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
+    return [cls(rms=min(float(rms), 1.0), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
 
 
 def _slow(position: NDArray[np.float64], deviation: NDArray[np.float64]) -> NDArray[np.float64]:
