@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.change_points import Steps, find_steps, noise_variance
-from pchem_pipeline.effects.common_modes import add_offset, quantile_means, responsivity, with_offsets
+from pchem_pipeline.effects.common_modes import quantile_means, responsivity, with_offsets
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,11 +96,17 @@ class BiasJumps(Effect):
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        below = (context.rows >= context.shape[0] // 2)[:, None]
-        right = np.arange(context.shape[1]) >= context.shape[1] // 2
+        levels = self.amplitude_dn * self._levels(context)
         factors = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
-        levels = self._levels(context)[:, factors[0] * below + factors[1] * right]
-        return add_offset(values, self.amplitude_dn * levels, context)
+        # rows and columns are in order: each quadrant is a rectangle
+        row = int(np.searchsorted(context.rows, context.shape[0] // 2))
+        column = context.shape[1] // 2
+        result: NDArray[Any] = values.copy()
+        for below, ys in enumerate((slice(0, row), slice(row, None))):
+            for right, xs in enumerate((slice(0, column), slice(column, None))):
+                offset = levels[:, factors[0] * below + factors[1] * right, None, None]
+                result[:, ys, xs] += offset * context.truth["conversion_gain"][ys, xs]
+        return result
 
     def _levels(self, context: EffectContext) -> NDArray[np.float64]:
         """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
