@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import observe
 from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.context import EffectContext
 from pchem_pipeline.effects.evidence import Evidence
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.streams import KeyedStreams
 from pchem_pipeline.simulate.truth import TruthMaps
 
 BLOCK = 50
@@ -43,3 +47,25 @@ def seen(frames: NDArray[np.uint16], numbers: NDArray[np.int64] | None = None) -
     """Return the evidence of the numbered frames (all of them by default)."""
     numbers = np.arange(len(frames)) if numbers is None else numbers
     return observe(frames[numbers], numbers, n_run=len(frames), block_frames=BLOCK)
+
+
+def context_of(shape=(6, 5), n_frames=14, *, frames=None, gain=0.1, seed=3, rows=None) -> EffectContext:
+    """Return the surroundings of an effect: a sensor of equal pixels, all frames and rows by default."""
+    frames = np.arange(n_frames) if frames is None else np.asarray(frames)
+    rows = np.arange(shape[0]) if rows is None else rows
+    return EffectContext(
+        frames=frames,
+        n_frames=n_frames,
+        rows=rows,
+        shape=shape,
+        integration_time=1.0,
+        bit_depth=14,
+        truth={"conversion_gain": np.full((len(rows), shape[1]), gain)},
+        random=KeyedStreams(seed, "test", frames, rows, np.arange(shape[1])),
+    )
+
+
+def offsets(effect: Effect, context: EffectContext) -> Any:
+    """Return what an effect on the analog plane adds, DN, to a signal of zero."""
+    zero = np.zeros((context.frames.size, context.rows.size, context.shape[1]))
+    return effect.apply(zero, context) / context.truth["conversion_gain"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from sensor_of_modes import drawn_truth
+from sensor_of_modes import context_of, drawn_truth, offsets
 
 from pchem_pipeline.discrepancy.catalogue import STATISTICS
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
@@ -22,7 +22,6 @@ from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.base import Effect
-from pchem_pipeline.effects.context import EffectContext
 from pchem_pipeline.effects.plane import Plane
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
 from pchem_pipeline.effects.registry import effect_classes
@@ -30,7 +29,6 @@ from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.streams import KeyedStreams
 
 CLASSES: tuple[type[Effect], ...] = (
     AdcDnl,
@@ -86,27 +84,6 @@ STRONG = [
     RepeatedFrames(frames=(1, 2, 3, 7, 13), rows=(1, 4)),
 ]
 N_FRAMES, SHAPE = 14, (6, 5)
-
-
-def context_of(shape=(6, 5), n_frames=14, *, frames=None, gain=0.1, seed=3, rows=None) -> EffectContext:
-    frames = np.arange(n_frames) if frames is None else np.asarray(frames)
-    rows = np.arange(shape[0]) if rows is None else rows
-    return EffectContext(
-        frames=frames,
-        n_frames=n_frames,
-        rows=rows,
-        shape=shape,
-        integration_time=1.0,
-        bit_depth=14,
-        truth={"conversion_gain": np.full((len(rows), shape[1]), gain)},
-        random=KeyedStreams(seed, "test", frames, rows, np.arange(shape[1])),
-    )
-
-
-def offsets(effect: Effect, context: EffectContext) -> Any:
-    """Return what an effect on the analog plane adds, DN, to a signal of zero."""
-    zero = np.zeros((context.frames.size, context.rows.size, context.shape[1]))
-    return effect.apply(zero, context) / context.truth["conversion_gain"]
 
 
 def frames_of(*effects: Effect) -> Any:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from sensor_of_modes import taken
-from test_effects_modes import context_of, offsets
+from sensor_of_modes import context_of, offsets, taken
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
