@@ -22,6 +22,8 @@ __all__ = ["Hypothesis", "Noise", "SetFit", "fit_set", "log_density"]
 FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
+_SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
+_NEXT_TO_NOTHING = 1e-3
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,20 @@ class SetFit:
     def parts(self) -> FloatArray:
         """Predicted shift by effect, shape (e, m)."""
         return np.array([c * h.fingerprint for c, h in zip(self.factors, self.hypotheses, strict=True)])
+
+    def substantial(self) -> list[tuple[Hypothesis, float]]:
+        """Return the hypotheses of which there is more than their errors, with factors; at least one."""
+        kept = [
+            (h, float(c))
+            for h, c, error in zip(self.hypotheses, self.factors, self.stderr, strict=True)
+            if c > _SMALLEST_FACTOR * error
+        ]
+        largest = int(np.argmax(self.factors / self.stderr))
+        return kept or [(self.hypotheses[largest], max(float(self.factors[largest]), _NEXT_TO_NOTHING))]
+
+    def settled(self, close: float) -> bool:
+        """Tell whether all strengths are what the data ask for, to ``close`` or half a standard error."""
+        return bool(np.all(np.abs(self.factors - 1.0) < np.maximum(close, self.stderr / 2.0)))
 
     def log_score(self, shift: FloatArray, noise: Noise) -> float:
         """Return the Gaussian log density of a shift of statistics, up to a constant, nats."""

@@ -88,6 +88,11 @@ class Choice:
     probability: tuple[float, ...]
     tried: tuple[ScoredSet, ...]
 
+    def rivals_of(self, tag: str) -> tuple[Rival, ...]:
+        """Return who could stand in the place of an effect of the best set."""
+        tags = [h.tag for h in self.best.hypotheses]
+        return self.rivals[tags.index(tag)]
+
 
 def score_set(
     hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise

@@ -148,8 +148,7 @@ def _step(
     settings: DiscrepancySettings,
 ) -> Step:
     added = this.added.hypotheses[member]
-    # the choice and the refined set hold the same effects in the same order
-    rivals = this.choice.rivals[member]
+    rivals = this.choice.rivals_of(added.tag)
     others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
     kept = _ambiguous_set(rivals, settings.certainty)
     parts = this.added.parts

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
 from pchem_pipeline.discrepancy.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
@@ -255,23 +254,21 @@ class _Search:
         choice: Choice,
         shifts: tuple[FloatArray, FloatArray],
         null: NullModel,
-    ) -> Any:
-        """Refine the strengths of the chosen set together, on both splits."""
+    ) -> SetFit:
+        """Refine the strengths of the chosen set together; drop what comes to nothing."""
         noise = Noise(self._noise(null, 2).covariance, _FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
         fit = fit_set(choice.best.hypotheses, shift, noise)
         for _ in range(_REFINEMENTS):
-            if np.all(np.abs(fit.factors - 1.0) < np.maximum(_CLOSE, fit.stderr / 2.0)):
+            kept = fit.substantial()
+            if len(kept) == len(fit.hypotheses) and fit.settled(_CLOSE):
                 break
-            effects = [h.rescaled(max(c, 1e-3)) for h, c in zip(fit.hypotheses, fit.factors, strict=True)]
+            effects = [h.rescaled(c) for h, c in kept]
             renewed = laboratory.fingerprints(effects)
             if len(renewed) < len(effects):
                 break
             fit = fit_set(renewed, shift, noise)
-        final = [
-            Hypothesis(h.rescaled(max(c, 1e-3)), h.fingerprint * c)
-            for h, c in zip(fit.hypotheses, fit.factors, strict=True)
-        ]
+        final = [Hypothesis(h.rescaled(c), h.fingerprint * c) for h, c in fit.substantial()]
         return fit_set(final, shift, noise)
 
     def _result(

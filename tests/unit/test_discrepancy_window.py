@@ -1,0 +1,82 @@
+"""Which part of a stack is looked at, and how the model grows in a YAML text."""
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.config.grow import with_model_effects
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.stages.discrepancy import choose_window, read_window
+
+TEXT = """# mine
+input: {files: [a.npy]}  # here
+fit:
+  # careful
+  tolerance: 1.0e-7
+"""
+ROW = {"tag": "row_noise", "row_noise_dn": 0.1}
+
+
+class Frames:
+    """Frames in memory whose value tells where they come from."""
+
+    def __init__(self, shape):
+        t, y, x = np.ogrid[: shape[0], : shape[1], : shape[2]]
+        self.values = (t * 10_000 + y * 100 + x).astype(np.uint32)
+        self.shape, self.dtype, self.rows_per_read = shape, self.values.dtype, 1
+
+    def read_into(self, buffer, t0, t1, y0=0, y1=None):
+        buffer[...] = self.values[t0:t1, y0:y1]
+
+
+def test_a_small_stack_is_looked_at_whole():
+    window = choose_window((4000, 64, 64), 1 << 25, None)
+    assert window.numbers.size == 4000
+    assert (window.rows, window.columns) == ((0, 64), (0, 64))
+
+
+@pytest.mark.parametrize("shape", [(17750, 512, 512), (1000, 2048, 2048), (100_000, 8, 8), (7000, 3, 4000)])
+def test_of_a_large_stack_no_more_than_allowed(shape):
+    window = choose_window(shape, 1 << 25, None)
+    rows, columns = np.ptp(window.rows), np.ptp(window.columns)
+    assert window.numbers.size * rows * columns <= 1 << 25
+    assert window.numbers.size * rows * columns > 0.8 * min(1 << 25, np.prod(shape))
+    # slow effects must show: the frames span the run
+    assert window.numbers[0] < 0.02 * shape[0]
+    assert window.numbers[-1] > 0.98 * shape[0] - 1
+    assert np.all(np.diff(window.numbers) > 0)
+
+
+def test_the_region_asked_for_is_looked_at():
+    window = choose_window((1000, 64, 64), 1 << 25, None, (8, 24, 16, 48))
+    assert (window.rows, window.columns) == ((8, 24), (16, 48))
+
+
+def test_frames_of_the_window_are_those_of_the_stack():
+    source = Frames((300, 9, 11))
+    window = choose_window((300, 9, 11), 1 << 20, 20, (2, 6, 3, 8))
+    window = type(window)(np.r_[0:40, 100:160], window.rows, window.columns)
+    stack = read_window(source, window)
+    assert np.array_equal(stack, source.values[window.numbers][:, 2:6, 3:8])
+
+
+def test_the_model_is_added_and_every_other_line_stays():
+    grown = with_model_effects(TEXT, [ROW], "a.yaml")
+    assert grown.startswith(TEXT)
+    assert [e.tag for e in parse_config(grown).model.effects] == ["row_noise"]
+    assert parse_config(grown).fit == parse_config(TEXT).fit
+
+
+def test_an_older_model_is_replaced():
+    first = with_model_effects(TEXT, [ROW], "a.yaml") + "run:\n  tile: 32\n"
+    second = with_model_effects(first, [{"tag": "clipping", "high": 900}, ROW], "a.yaml")
+    config = parse_config(second)
+    assert [e.tag for e in config.model.effects] == ["clipping", "row_noise"]
+    assert config.run.tile == 32
+    assert second.count("model:") == 1
+    assert with_model_effects(second, [], "a.yaml").count("tag") == 0
+
+
+def test_a_text_that_would_break_is_refused():
+    with pytest.raises(ConfigError):
+        with_model_effects("input: [", [ROW], "a.yaml")
