@@ -128,7 +128,7 @@ class _Search:
             number = len(rounds)
             laboratory = self._laboratory(maps, names, number)
             shifts = (z.train - null.mean, z.test - null.mean)
-            hypotheses = self._hypotheses(laboratory, classes, train, shifts, null)
+            hypotheses = self._hypotheses(laboratory, classes, train, test, shifts, null)
             choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
             self.left_out |= laboratory.left_out
             if choice is None:
@@ -238,11 +238,12 @@ class _Search:
         self,
         laboratory: Laboratory,
         classes: Mapping[str, type[Effect]],
-        evidence: Evidence,
+        train: Evidence,
+        test: Evidence,
         shifts: tuple[FloatArray, FloatArray],
         null: NullModel,
     ) -> list[Hypothesis]:
-        guesses = laboratory.guesses(classes, evidence)
+        guesses = laboratory.guesses(classes, train, test)
         placebo = placebo_for(guesses, classes)
         hypotheses = laboratory.fingerprints([*guesses, *placebo])
         shift = (shifts[0] + shifts[1]) / 2.0
