@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
 from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.base import Effect
@@ -147,32 +147,45 @@ class Laboratory:
                 found.append(Hypothesis(effect, self._row(result) - self._base))
         return found
 
-    def refined(
-        self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise, rounds: int = 1
-    ) -> list[Hypothesis]:
+    def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
         """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself."""
-        for _ in range(rounds):
-            scored = []
-            for hypothesis in hypotheses:
-                fit = fit_set([hypothesis], shift, noise)
-                scored.append((fit.log_score(shift, noise), float(fit.factors[0]), hypothesis))
-            scored.sort(key=lambda item: item[0], reverse=True)
-            kept = [h for _, _, h in scored]
-            renewed = [
-                (h, h.rescaled(float(np.clip(factor, 1.0 / _LARGEST_STEP, _LARGEST_STEP))))
-                for _, factor, h in scored[:_REFINED]
-                if factor > 0.0 and h.effect.strength and abs(factor - 1.0) > _CLOSE
-            ]
-            fresh = {id(old): new for (old, _), new in self._renew(renewed)}
-            hypotheses = [fresh.get(id(h), h) for h in kept]
-        return list(hypotheses)
+        fits = [fit_set([h], shift, noise) for h in hypotheses]
+        order = np.argsort([-fit.log_score(shift, noise) for fit in fits], kind="stable")
+        chosen = [int(i) for i in order[:_REFINED] if fits[i].factors[0] > 0.0]
+        tuned = self.tuned([(hypotheses[i],) for i in chosen], shift, noise, steps=2, close=_CLOSE)
+        better = {i: one for i, (one,) in zip(chosen, tuned, strict=True)}
+        return [better.get(int(i), hypotheses[i]) for i in order]
 
-    def _renew(
-        self, pairs: Sequence[tuple[Hypothesis, Effect]]
-    ) -> list[tuple[tuple[Hypothesis, Effect], Hypothesis]]:
-        changed = [pair for pair in pairs if pair[1] != pair[0].effect]
-        by_effect = {id(h.effect): h for h in self.fingerprints([effect for _, effect in changed])}
-        return [(pair, by_effect[id(pair[1])]) for pair in changed if id(pair[1]) in by_effect]
+    def tuned(
+        self,
+        sets: Sequence[tuple[Hypothesis, ...]],
+        shift: FloatArray,
+        noise: Noise,
+        *,
+        steps: int,
+        close: float,
+    ) -> list[tuple[Hypothesis, ...]]:
+        """Tune the strengths within each set, by simulation; a step that predicts worse is halved.
+
+        Extrapolation alone is not enough: a line that drowns, or a clipped tail, is far from any power law.
+
+        Args:
+            sets: of hypotheses whose effects are in the data together.
+            shift: what they shall explain, shape (m,).
+            noise: of the shift.
+            steps: simulations of each hypothesis, at most.
+            close: relative change of a strength that is not worth a simulation.
+        """
+        states = [_Tuning(one, _as_simulated(one, shift, noise)) for one in sets]
+        for _ in range(steps):
+            proposals = [state.proposal(shift, noise, close) for state in states]
+            effects = [effect for proposal in proposals for effect in proposal]
+            simulated = {id(h.effect): h for h in self.fingerprints(effects)}
+            for state, proposal in zip(states, proposals, strict=True):
+                new = tuple(simulated[id(e)] for e in proposal if id(e) in simulated)
+                if new and len(new) == len(proposal):
+                    state.judge(new, _as_simulated(new, shift, noise))
+        return [state.best for state in states]
 
     def _replicate(self, effects: tuple[Effect, ...]) -> Replicate:
         text = json.dumps([e.model_dump(mode="json") for e in effects], sort_keys=True)
@@ -190,3 +203,39 @@ class Laboratory:
             f"{type(error).__name__}: {error}" if not isinstance(error, PchEmError) else str(error)
         )
         _log.warning("effect %s left out: %s", tag, self.left_out[tag])
+
+
+@dataclass
+class _Tuning:
+    """A set whose strengths are being tuned.
+
+    Attributes:
+        best: the set that predicts best so far, at simulated strengths.
+        score: its log score.
+        refused: steps from it that predicted worse.
+    """
+
+    best: tuple[Hypothesis, ...]
+    score: float
+    refused: int = 0
+
+    def proposal(self, shift: FloatArray, noise: Noise, close: float) -> tuple[Effect, ...]:
+        """Return the effects at the strengths to try next; none where they are what the data ask for."""
+        fit = fit_set(self.best, shift, noise)
+        if fit.settled(close) or not any(h.effect.strength for h in self.best):
+            return ()
+        factors = np.clip(fit.factors, 1.0 / _LARGEST_STEP, _LARGEST_STEP) ** (0.5**self.refused)
+        effects = tuple(h.rescaled(float(c)) for h, c in zip(self.best, factors, strict=True))
+        return () if all(e == h.effect for e, h in zip(effects, self.best, strict=True)) else effects
+
+    def judge(self, new: tuple[Hypothesis, ...], score: float) -> None:
+        """Keep the better one."""
+        if score > self.score:
+            self.best, self.score, self.refused = new, score, 0
+        else:
+            self.refused += 1
+
+
+def _as_simulated(hypotheses: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise) -> float:
+    """Return the log score of a set at the very strengths that were simulated."""
+    return SetFit(hypotheses, np.ones(len(hypotheses)), np.zeros(len(hypotheses))).log_score(shift, noise)

@@ -21,10 +21,13 @@ __all__ = ["Choice", "Rival", "ScoredSet", "choose", "score_set"]
 
 FloatArray = NDArray[np.float64]
 
-_PRICE = 3.0  # nats for every effect in a set: an effect is not there unless something speaks for it
+_PRICE = 3.0  # nats for the first effect of a set: none is there unless something speaks for it
+_PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
 _SHORTLIST = 9
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
+_SEEN = 3.0  # standard deviations by which an effect moves some statistic, beside others
+_BLUR = 2.0  # model errors of the others that are added to chance there
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class ScoredSet:
     @property
     def worth(self) -> float:
         """Score less the price of its effects, nats."""
-        return self.score - _PRICE * len(self.hypotheses)
+        return self.score - _PRICE - _PRICE_OF_MORE * (len(self.hypotheses) - 1)
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ def choose(
         for members in itertools.combinations(shortlist, size):
             if len({h.tag for h in members}) == size:
                 scored = score_set(members, shifts, noise)
-                if _all_needed(scored):
+                if _all_needed(scored, noise):
                     sets.append(scored)
     base = sum(log_density(shift, noise.covariance) for shift in shifts)
     sets = [s for s in sets if s.worth > base]
@@ -199,9 +202,17 @@ def _shortlist(
     return chosen
 
 
-def _all_needed(scored: ScoredSet) -> bool:
-    """Tell whether every effect of the set is there in both splits together by more than its error."""
+def _all_needed(scored: ScoredSet, noise: Noise) -> bool:
+    """Tell whether every effect of the set is there by more than its error, and seen beside the others.
+
+    Where a strong effect moves a statistic, a weak one there is not told from the details of the strong one.
+    """
     first, second = scored.fits
     factor = (first.factors + second.factors) / 2.0
     error = np.hypot(first.stderr, second.stderr) / 2.0
-    return bool(np.all(factor > _SMALLEST_FACTOR * error))
+    parts = (first.parts + second.parts) / 2.0
+    total = np.abs(parts).sum(axis=0)
+    chance = np.diag(noise.covariance) / 2.0
+    blurred = np.sqrt(chance + (_BLUR * noise.model_error * (total - np.abs(parts))) ** 2)
+    seen = np.max(np.abs(parts) / blurred, axis=1)
+    return bool(np.all(factor > _SMALLEST_FACTOR * error) and (len(factor) == 1 or seen.min() > _SEEN))

@@ -39,6 +39,7 @@ FloatArray = NDArray[np.float64]
 _FEWEST_PIXELS = 32
 _REFINEMENTS = 4
 _CLOSE = 0.02  # relative: strengths known so well are not simulated again
+_NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
@@ -259,18 +260,19 @@ class _Search:
         """Refine the strengths of the chosen set together; drop what comes to nothing."""
         noise = Noise(self._noise(null, 2).covariance, _FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
-        fit = fit_set(choice.best.hypotheses, shift, noise)
-        for _ in range(_REFINEMENTS):
-            kept = fit.substantial()
-            if len(kept) == len(fit.hypotheses) and fit.settled(_CLOSE):
+        chosen = choice.best.hypotheses
+        for _ in range(len(chosen)):
+            [chosen] = laboratory.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
+            kept = tuple(h for h, _ in fit_set(chosen, shift, noise).substantial())
+            if len(kept) == len(chosen):
                 break
-            effects = [h.rescaled(c) for h, c in kept]
-            renewed = laboratory.fingerprints(effects)
-            if len(renewed) < len(effects):
-                break
-            fit = fit_set(renewed, shift, noise)
-        final = [Hypothesis(h.rescaled(c), h.fingerprint * c) for h, c in fit.substantial()]
-        return fit_set(final, shift, noise)
+            chosen = kept
+        fit = fit_set(chosen, shift, noise)
+        near = np.where(np.abs(fit.factors - 1.0) < _NEAR, fit.factors, 1.0)
+        last = [
+            Hypothesis(h.rescaled(float(c)), h.fingerprint * c) for h, c in zip(chosen, near, strict=True)
+        ]
+        return SetFit(tuple(last), np.ones(len(last)), fit.stderr / near)
 
     def _result(
         self,

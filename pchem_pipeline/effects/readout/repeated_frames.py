@@ -120,9 +120,9 @@ class RepeatedFrames(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the fraction of frames that equal the one before, and the list of them.
+        """Return the fraction of frames that equal the one before.
 
-        Where only rows are equal, a quarter of the rows stands for those that are: evidence has their number
+        The list of them would be that of one split only, and say nothing of the others. Where only rows are equal, a quarter of the rows stands for those that are: evidence has their number
         and not their place.
         """
         if evidence.time is None:
@@ -130,8 +130,7 @@ class RepeatedFrames(Effect):
         time, found = evidence.time, []
         pairs = max(int((np.diff(time.frames) == 1).sum()), 1)
         if time.repeated.size:
-            listed = tuple(time.repeated.tolist())
-            found = [cls(probability=min(len(listed) / pairs, 0.5)), cls(frames=listed)]
+            found = [cls(probability=min(time.repeated.size / pairs, 0.5))]
         if time.repeated_rows:
             part = max(time.row_readout.shape[1] // 4, 1)
             found.append(cls(probability=min(time.repeated_rows / part / pairs, 0.5), rows=(0, part)))
