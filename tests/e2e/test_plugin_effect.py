@@ -15,8 +15,9 @@ TESTS = Path(__file__).resolve().parents[1]
 RUN = """
 run: {store: run.zarr}
 input: {files: [stack/frames.npy], integration_time: 1.0}
-discrepancy: {replicates: 30, grown_replicates: 12}
+discrepancy: {replicates: 24, grown_replicates: 12, candidates: [CANDIDATES]}
 """
+RIVALS = "frame_noise, row_noise, readout_alternation"
 BROKEN = {
     "hasty_offset": "nobody divided the offsets",
     "careless_offset": "offsets were left on the desk",
@@ -52,7 +53,7 @@ def stack(tmp_path_factory):
     """A folder ``stack`` whose frames hide the effect, made by a process that knows neither package."""
     folder = tmp_path_factory.mktemp("hidden")
     command = [sys.executable, TESTS / "hidden" / "make.py", "--effect", "checkerboard_offset"]
-    command += ["--level", 4, "--seed", 11, "--shape", 16, 16, "--frames", 1500, "--out", folder / "stack"]
+    command += ["--level", 3, "--seed", 11, "--shape", 16, 16, "--frames", 1500, "--out", folder / "stack"]
     subprocess.run(list(map(str, command)), check=True)
     return folder
 
@@ -61,7 +62,8 @@ def stack(tmp_path_factory):
 def with_plugin(shell, site, stack):
     """Commands of an environment that has the plug-in, in a folder with the hidden stack and a YAML."""
     shutil.copytree(stack / "stack", shell.folder / "stack")
-    (shell.folder / "run.yaml").write_text(RUN)
+    candidates = ", ".join([RIVALS, "chessboard_offset", *BROKEN])
+    (shell.folder / "run.yaml").write_text(RUN.replace("CANDIDATES", candidates))
     path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
     return Shell(shell.folder, {**shell.environment, "PYTHONPATH": path})
 
@@ -75,19 +77,20 @@ def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_pl
     assert found["gap"]["after"] < 0.2 * found["gap"]["before"]
     (key,) = json.loads((stack / "sealed" / "stack.json").read_text())["effects"]
     offset = found["steps"][0]["parameters"]["offset_dn"]
-    assert abs(offset["value"] - key["strength"]) < 0.15 * key["strength"]
+    assert abs(offset["value"] - key["strength"]) < 0.25 * key["strength"]
     for tag, reason in BROKEN.items():
         assert reason in found["left_out"][tag]
         assert any(tag in line and reason in line for line in result.stderr.splitlines())
     assert any("lost_offset" in line for line in result.stderr.splitlines())
     assert "chessboard_offset" in (with_plugin.folder / "run.yaml").read_text()
-    # from now on the fit knows it, and nothing is added twice
+    # from now on the fit knows it
+    with_plugin.ok("histogram", "run.yaml")
     with_plugin.ok("fit", "run.yaml")
 
 
 def test_without_the_plug_in_nobody_else_is_blamed(shell, stack):
     shutil.copytree(stack / "stack", shell.folder / "stack")
-    (shell.folder / "run.yaml").write_text(RUN)
+    (shell.folder / "run.yaml").write_text(RUN.replace("CANDIDATES", RIVALS))
     shell.ok("ingest", "run.yaml")
     shell.ok("discrepancy", "run.yaml")
     found = json.loads((shell.folder / "run.zarr" / "discrepancy.json").read_text())
