@@ -240,6 +240,9 @@ def _sentence(
     titles = [type(s.effect).title or s.effect.tag for s in steps if s.effect is not None]
     if verdict == "consistent":
         return "The frames agree with the model in every statistic tested."
+    if verdict == "named" and before.at_floor:
+        limit = f"{1e6 * before.floor:.2g} micronats per sample"
+        return f"The model was missing {_and(titles)}; on the final frames alone its gap is below {limit}."
     if verdict == "named":
         return f"The model was missing {_and(titles)}; with it the gap on unseen frames went {closed}."
     if verdict == "ambiguous":
