@@ -17,11 +17,12 @@ from scipy import linalg, optimize
 
 from pchem_pipeline.effects.base import Effect
 
-__all__ = ["Hypothesis", "Noise", "SetFit", "fit_set", "log_density"]
+__all__ = ["Hypothesis", "Noise", "SetFit", "fit_set", "log_density", "tolerance"]
 
 FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
+_LEAK = 0.1
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
 _NEXT_TO_NOTHING = 1e-3
 
@@ -64,8 +65,7 @@ class Noise:
 
     def of(self, prediction: FloatArray) -> FloatArray:
         """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
-        extra = self.model_error**2 * np.sum(prediction**2, axis=0)
-        return self.covariance + np.diag(extra)
+        return self.covariance + np.diag(tolerance(prediction, self.model_error) ** 2)
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,21 @@ class SetFit:
         factor = linalg.cholesky(noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0)), lower=True)
         white = linalg.solve_triangular(factor, mine.sum(axis=0) - theirs.sum(axis=0), lower=True)
         return float(np.sqrt(white @ white))
+
+
+def tolerance(parts: FloatArray, model_error: float) -> FloatArray:
+    """Return the deviations that are not held against effects, shape (m,).
+
+    A fraction of what they do to each statistic, and a tenth of that of the largest that they do to any: the
+    details of a very strong effect show where the effect itself does not.
+
+    Args:
+        parts: shifts of the statistics by effect, shape (e, m).
+        model_error: the fraction.
+    """
+    own = np.sum(parts**2, axis=0)
+    leaked = np.sum((_LEAK * np.max(np.abs(parts), axis=1)) ** 2)
+    return np.asarray(model_error * np.sqrt(own + leaked))
 
 
 def log_density(residual: FloatArray, covariance: FloatArray) -> float:

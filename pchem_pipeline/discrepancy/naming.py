@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, log_density
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, log_density, tolerance
 
 __all__ = ["Choice", "Rival", "ScoredSet", "choose", "score_set"]
 
@@ -211,8 +211,13 @@ def _all_needed(scored: ScoredSet, noise: Noise) -> bool:
     factor = (first.factors + second.factors) / 2.0
     error = np.hypot(first.stderr, second.stderr) / 2.0
     parts = (first.parts + second.parts) / 2.0
-    total = np.abs(parts).sum(axis=0)
+    if not np.all(factor > _SMALLEST_FACTOR * error):
+        return False
     chance = np.diag(noise.covariance) / 2.0
-    blurred = np.sqrt(chance + (_BLUR * noise.model_error * (total - np.abs(parts))) ** 2)
-    seen = np.max(np.abs(parts) / blurred, axis=1)
-    return bool(np.all(factor > _SMALLEST_FACTOR * error) and (len(factor) == 1 or seen.min() > _SEEN))
+    for member, part in enumerate(parts):
+        others = np.delete(parts, member, axis=0)
+        if len(others):
+            blur = _BLUR * tolerance(others, noise.model_error)
+            if np.max(np.abs(part) / np.sqrt(chance + blur**2)) < _SEEN:
+                return False
+    return True

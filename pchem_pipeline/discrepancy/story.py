@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.disagreement import Measured, misfits
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, tolerance
 from pchem_pipeline.discrepancy.gap import Gap, GapMetric
 from pchem_pipeline.discrepancy.naming import Choice, Rival
 from pchem_pipeline.discrepancy.null import NullModel
@@ -152,8 +152,8 @@ def _step(
     others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
     kept = _ambiguous_set(rivals, settings.certainty)
     parts = this.added.parts
-    tolerance = settings.model_error * np.sqrt(np.sum(parts**2, axis=0))
-    fits = not misfits(this.grown, z, parts[member], settings.significance, tolerance)
+    allowed = tolerance(parts, settings.model_error)
+    fits = not misfits(this.grown, z, parts[member], settings.significance, allowed)
     named = len(kept) == 1 and fits
     candidates = tuple(
         Candidate(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
 from pchem_pipeline.discrepancy.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, tolerance
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
@@ -213,7 +213,7 @@ class _Search:
         if not rounds:
             return 0.0
         parts = np.concatenate([this.added.parts for this in rounds])
-        return np.asarray(self.settings.model_error * np.sqrt(np.sum(parts**2, axis=0)))
+        return tolerance(parts, self.settings.model_error)
 
     def _noise(self, null: NullModel, splits: int) -> Noise:
         scale = 1.0 / splits + 1.0 / null.n_replicates
