@@ -144,7 +144,7 @@ class Laboratory:
             if isinstance(result, Exception):
                 self._leave_out(effect.tag, result)
             else:
-                found.append(Hypothesis(effect, self._row(result) - self._base))
+                found.append(Hypothesis(effect, self._shift(effect, result)))
         return found
 
     def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
@@ -194,6 +194,16 @@ class Laboratory:
         return Replicate(
             f"{self.prefix}-{label}-{digest}", self.maps, (*self.model, *effects), self.seed, self.acquisition
         )
+
+    def _shift(self, effect: Effect, vector: Vector) -> FloatArray:
+        """Return what an effect does; for counts of rare events the mean instead of what happened to come."""
+        assert self._base is not None
+        shift = self._row(vector) - self._base
+        pairs = int(np.sum(np.diff(self.acquisition.numbers) == 1))
+        for name, mean in effect.counted(pairs).items():
+            if name in self.names:
+                shift[self.names.index(name)] = mean
+        return shift
 
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)

@@ -11,7 +11,7 @@ from typing import Literal
 
 from pchem_pipeline.effects.evidence import SCORES
 
-__all__ = ["FAMILIES", "STATISTICS", "VERSION", "Statistic"]
+__all__ = ["EXACT", "FAMILIES", "STATISTICS", "VERSION", "Statistic"]
 
 VERSION = 1
 
@@ -168,3 +168,6 @@ _TAIL = [
 STATISTICS: dict[str, Statistic] = {
     s.name: s for s in [*_scores(), *_GOODNESS, *_CODE, *_TAIL, *_time(), *_frame(), *_space()]
 }
+
+#: Statistics that are exact tests, never positive by chance, and by how much each event raises them.
+EXACT: dict[str, float] = {"frame.repeated": 10.0}

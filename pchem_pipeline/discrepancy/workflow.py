@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, tolerance
 from pchem_pipeline.discrepancy.naming import Choice, choose
@@ -129,12 +129,12 @@ class _Search:
             number = len(rounds)
             laboratory = self._laboratory(maps, names, number)
             shifts = (z.train - null.mean, z.test - null.mean)
-            hypotheses = self._hypotheses(laboratory, classes, train, test, shifts, null)
-            choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
+            hypotheses = self._hypotheses(laboratory, classes, (train, test), shifts, self._noise(null, 2, z))
+            choice = choose(hypotheses, shifts, self._noise(null, 1, z)) if hypotheses else None
             self.left_out |= laboratory.left_out
             if choice is None:
                 break
-            added = self._added(laboratory, choice, shifts, null)
+            added = self._added(laboratory, choice, shifts, self._noise(null, 2, z))
             self.model = (*self.model, *(h.effect for h in added.hypotheses))
             refit = refit_maps(self.stack[self.splits.train], train.maps, self.model)
             maps = refit.maps
@@ -215,9 +215,14 @@ class _Search:
         parts = np.concatenate([this.added.parts for this in rounds])
         return tolerance(parts, self.settings.model_error)
 
-    def _noise(self, null: NullModel, splits: int) -> Noise:
-        scale = 1.0 / splits + 1.0 / null.n_replicates
-        return Noise(null.covariance * scale, self.settings.model_error)
+    def _noise(self, null: NullModel, splits: int, z: Measured) -> Noise:
+        """Return the noise of a shift; exact counts, which no null has, scatter by their own number."""
+        covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
+        for name, step in EXACT.items():
+            if name in null.names:
+                index = null.names.index(name)
+                covariance[index, index] += step * abs(float(z.both[index])) / splits
+        return Noise(covariance, self.settings.model_error)
 
     def _laboratory(self, maps: PixelMaps, names: tuple[str, ...], number: int) -> Laboratory:
         return Laboratory(
@@ -239,26 +244,25 @@ class _Search:
         self,
         laboratory: Laboratory,
         classes: Mapping[str, type[Effect]],
-        train: Evidence,
-        test: Evidence,
+        evidence: tuple[Evidence, Evidence],
         shifts: tuple[FloatArray, FloatArray],
-        null: NullModel,
+        noise: Noise,
     ) -> list[Hypothesis]:
-        guesses = laboratory.guesses(classes, train, test)
+        guesses = laboratory.guesses(classes, *evidence)
         placebo = placebo_for(guesses, classes)
         hypotheses = laboratory.fingerprints([*guesses, *placebo])
         shift = (shifts[0] + shifts[1]) / 2.0
-        return laboratory.refined(hypotheses, shift, self._noise(null, 2))
+        return laboratory.refined(hypotheses, shift, noise)
 
     def _added(
         self,
         laboratory: Laboratory,
         choice: Choice,
         shifts: tuple[FloatArray, FloatArray],
-        null: NullModel,
+        noise: Noise,
     ) -> SetFit:
         """Refine the strengths of the chosen set together; drop what comes to nothing."""
-        noise = Noise(self._noise(null, 2).covariance, _FINE_ERROR)
+        noise = Noise(noise.covariance, _FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
         chosen = choice.best.hypotheses
         for _ in range(len(chosen)):

@@ -102,6 +102,16 @@ class Effect(Section):
         """
         return cls.typical() if evidence.strongest(*cls.signature[:2]) > 3.0 else ()
 
+    def counted(self, n_pairs: int) -> Mapping[str, float]:
+        """Return statistics that count rare events exactly, by name: their mean under the effect.
+
+        A simulated stack holds few such events or none, so its own count says little about the mean.
+
+        Args:
+            n_pairs: pairs of successive frames.
+        """
+        return {}
+
     def scaled(self, factor: float) -> Self:
         """Return a copy of ``factor`` times the strength, kept within the limits of its field.
 

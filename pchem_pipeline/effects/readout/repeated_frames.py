@@ -29,6 +29,10 @@ __all__ = ["RepeatedFrames"]
 _RARE = 1e-12
 
 
+# by how much a repeated frame raises the statistic that counts them
+_PER_REPEAT = 10.0
+
+
 @register_effect
 class RepeatedFrames(Effect):
     """Frame t is, sample by sample, frame t - 1 as it was delivered (which may itself be a repeat).
@@ -122,8 +126,9 @@ class RepeatedFrames(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the fraction of frames that equal the one before.
 
-        The list of them would be that of one split only, and say nothing of the others. Where only rows are equal, a quarter of the rows stands for those that are: evidence has their number
-        and not their place.
+        The list of them would be that of one split only, and say nothing of the others. Where only
+        rows are equal, a quarter of the rows stands for those that are: evidence has their number and not their
+        place.
         """
         if evidence.time is None:
             return ()
@@ -135,6 +140,12 @@ class RepeatedFrames(Effect):
             part = max(time.row_readout.shape[1] // 4, 1)
             found.append(cls(probability=min(time.repeated_rows / part / pairs, 0.5), rows=(0, part)))
         return found
+
+    def counted(self, n_pairs: int) -> Mapping[str, float]:
+        """Return the mean of the exact count of repeated frames."""
+        if self.rows is not None or self.frames:
+            return {}
+        return {"frame.repeated": _PER_REPEAT * self.probability * n_pairs}
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the same law: a repeat is one more sample of it, though not a new one."""
