@@ -126,9 +126,8 @@ class RepeatedFrames(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the fraction of frames that equal the one before.
 
-        The list of them would be that of one split only, and say nothing of the others. Where only
-        rows are equal, a quarter of the rows stands for those that are: evidence has their number and not their
-        place.
+        The list of them would be that of one split only, and say nothing of the others. Where only rows are
+        equal, a quarter of the rows stands for those that are: evidence has their number and not their place.
         """
         if evidence.time is None:
             return ()
