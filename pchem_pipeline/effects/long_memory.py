@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["between_grid_points", "frame_key"]
+__all__ = ["between_grid_points", "frame_key", "two_states"]
 
 # frames apart by that many correlation times are independent but for 1e-7
 _FAR = 16.0
@@ -65,3 +65,39 @@ def between_grid_points(
         known = {at: state for at, state in known.items() if first - half < at < last + half}
         step = half
     return [known[int(frame)] for frame in frames]
+
+
+def two_states(
+    frames: NDArray[np.int64],
+    correlation_frames: float,
+    occupied: float,
+    uniform: Callable[[int], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Return a Markov chain of two states for each of n traps: 1 where it is full and 0 where it is empty.
+
+    Args:
+        frames: frame numbers, shape (m,), at least one.
+        correlation_frames: tau > 0: the correlation of states h frames apart is exp(-h / tau).
+        occupied: probability that a trap is full.
+        uniform: gives the uniform numbers of a frame, shape (n,).
+
+    Returns:
+        Shape (m, n).
+    """
+
+    def full_after(state: NDArray[np.float64] | float, rho: float) -> NDArray[np.float64]:
+        return np.asarray(occupied + (state - occupied) * rho, np.float64)
+
+    def independent(frame: int) -> NDArray[np.float64]:
+        return (uniform(frame) < occupied).astype(np.float64)
+
+    def midpoint(
+        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], rho: float
+    ) -> NDArray[np.float64]:
+        # Bayes: the way there by way of "full" and by way of "empty"
+        up, from_full, from_empty = full_after(before, rho), full_after(1.0, rho), full_after(0.0, rho)
+        by_full = up * np.where(after > 0, from_full, 1.0 - from_full)
+        by_empty = (1.0 - up) * np.where(after > 0, from_empty, 1.0 - from_empty)
+        return (uniform(frame) * (by_full + by_empty) < by_full).astype(np.float64)
+
+    return np.stack(between_grid_points(frames, correlation_frames, independent, midpoint))

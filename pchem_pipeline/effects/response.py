@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.base import Effect
     from pchem_pipeline.effects.evidence import Evidence
 
-__all__ = ["strength_of"]
+__all__ = ["first_order", "strength_of"]
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 EffectType = TypeVar("EffectType", bound="Effect")
@@ -31,7 +31,7 @@ def strength_of(
     effect: EffectType,
     name: str,
     *,
-    sigmas: float = 3.0,
+    sigmas: float = 2.5,
     signed: bool = False,
     cut: float = 4.0,
 ) -> list[EffectType]:
@@ -48,30 +48,50 @@ def strength_of(
         signed: whether the strength may have either sign.
         cut: a pixel's score counts up to that many standard deviations away from the others.
     """
+    factor, error = first_order(evidence, effect, name, cut)
+    if not (abs(factor) if signed else factor) >= sigmas * error:
+        return []
+    first = _times(effect, factor)
     chosen, groups = typical_pixels(evidence.maps)
     laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
     seen, number = _mean_scores(evidence, name, groups, cut)
-    root = np.sqrt(evidence.n_frames)
-    shift = root * np.array([law.score_shift(name, law.change(_law(effect, law))) for law in laws])
-    information = float((number * shift**2).sum())
-    if not information > 0:
-        return []
-    factor = float((number * shift * seen).sum()) / information
-    if (abs(factor) if signed else factor) * np.sqrt(information) < sigmas:
-        return []
-    first = _times(effect, factor)
     masses = [law.mass_of(_law(first, law)) for law in laws]
     fits = refitted(laws, masses, evidence.n_frames)
-    shift = root * np.array(
+    shift = np.sqrt(evidence.n_frames) * np.array(
         [
             fit.score_shift(name, fit.on_codes(*mass) - fit.mass)
             for fit, mass in zip(fits, masses, strict=True)
         ]
     )
-    information = float((number * shift**2).sum())
-    again = float((number * shift * seen).sum()) / information if information > 0 else 1.0
+    again, error = _regression(seen, shift, number)
     # a fit that goes astray at this strength must not take the estimate along
-    return [_times(first, float(np.clip(again, 0.1, 10.0)))]
+    return [_times(first, float(np.clip(again, 0.1, 10.0)) if np.isfinite(error) else 1.0)]
+
+
+def first_order(evidence: Evidence, effect: Effect, name: str, cut: float = 4.0) -> tuple[float, float]:
+    """Return how many times an effect's influence on the mean of a score is seen, and the standard error.
+
+    Args:
+        evidence: of one split.
+        effect: the effect at some small strength.
+        name: the score, such as "He2C1".
+        cut: a pixel's score counts up to that many standard deviations away from the others.
+
+    Returns:
+        0 and infinity where it has no influence.
+    """
+    chosen, groups = typical_pixels(evidence.maps)
+    laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
+    shift = np.array([law.score_shift(name, law.change(_law(effect, law))) for law in laws])
+    seen, number = _mean_scores(evidence, name, groups, cut)
+    return _regression(seen, np.sqrt(evidence.n_frames) * shift, number)
+
+
+def _regression(seen: FloatArray, shift: FloatArray, number: FloatArray) -> tuple[float, float]:
+    information = float((number * shift**2).sum())
+    if not information > 0:
+        return 0.0, np.inf
+    return float((number * shift * seen).sum()) / information, information**-0.5
 
 
 def _law(effect: Effect, law: PixelLaw) -> MarginalModel:

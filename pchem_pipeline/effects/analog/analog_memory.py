@@ -87,7 +87,7 @@ class AnalogMemory(Effect):
         good = maps.usable & np.isfinite(seen) & np.isfinite(response)
         below = float((response[good] ** 2).sum()) * pairs
         above = float((response[good] * seen[good]).sum()) * pairs
-        if below <= 0 or abs(above) < 3.0 * np.sqrt(below):
+        if below <= 0 or abs(above) < 2.5 * np.sqrt(below):
             return ()
         return (cls(memory=float(np.clip(above / below, -0.5, 0.5))),)
 

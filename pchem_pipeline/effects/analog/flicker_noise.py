@@ -114,7 +114,7 @@ class FlickerNoise(Effect):
                     share = float((shape * seen / error**2).sum()) / information
                     best.append((share * np.sqrt(information), unit.scaled(share)))
         best.sort(key=lambda item: item[0], reverse=True)
-        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > 3.0 else ()
+        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > 2.5 else ()
 
 
 def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flicker]]:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 __all__ = ["GainDrift"]
 
 _NODES = (3, 5, 9, 17)
+_SIGMAS = 2.5
+_LEAST_RESPONSE = 0.15
+_SMALL = 1e-4  # relative change of the gain
 
 
 @register_effect
@@ -104,7 +107,7 @@ class GainDrift(Effect):
             return ()
         flat = _chi_square(gain, error, np.ones((gain.size, 1)))[0]
         line, (_, slope) = _chi_square(gain, error, np.stack([np.ones_like(position), position - 0.5], 1))
-        linear = [cls(drift=float(np.clip(slope, -0.5, 0.5)))] if flat - line > 9.0 else []
+        linear = [cls(drift=float(np.clip(slope, -0.5, 0.5)))] if flat - line > _SIGMAS**2 else []
         best, least = None, line + 2.0 * np.log(gain.size)
         for count in _NODES:
             if 3 * count > gain.size:
@@ -112,7 +115,7 @@ class GainDrift(Effect):
             knots = np.linspace(0.0, 1.0, count)
             hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
             left, values = _chi_square(gain, error, hats)
-            if flat - left > 9.0 + 3.0 * count and left + count * np.log(gain.size) < least - 6.0:
+            if flat - left > _improvement(count) and left + count * np.log(gain.size) < least:
                 best, least = values, left + count * np.log(gain.size)
         if best is None:
             return linear
@@ -135,6 +138,12 @@ class GainDrift(Effect):
         return np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes) - _path_mean(nodes)
 
 
+def _improvement(nodes: int) -> float:
+    """Return by how much chi squared falls by chance, plus three standard deviations of that."""
+    free = nodes - 1
+    return free + 3.0 * float(np.sqrt(2.0 * free))
+
+
 def _path_mean(nodes: NDArray[np.float64]) -> float:
     """Return the mean of the piecewise linear path through equally spaced nodes."""
     return float((nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1))
@@ -151,42 +160,69 @@ def _chi_square(
 def _block_gains(
     evidence: Evidence, time: TimeSeries
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return relative gain, standard error and position in the run of each block."""
+    """Return relative gain, standard error and position in the run of each block; empty if not of the gain.
+
+    Where the gain alone drifts, the common mean of the residuals moves too, by the mean of ``H / g`` (in part
+    taken for charge). Both say what the gain does, unless they contradict each other.
+    """
+    nothing = np.zeros(0), np.zeros(0), np.zeros(0)
     owner = np.searchsorted(time.block_start, time.frames, side="right") - 1
     blocks = [np.flatnonzero(owner == b) for b in np.unique(owner[owner >= 0])]
-    scatter = np.sqrt(np.mean([time.frame_gain[b].var() for b in blocks]))
-    response = _response(evidence)
-    if not (scatter > 0 and np.isfinite(scatter) and response > 1e-3):
-        return np.zeros(0), np.zeros(0), np.zeros(0)
-    gain = np.array([time.frame_gain[b].mean() for b in blocks]) / response
+    response, common = _response(evidence)
+    if not common > 0:
+        return nothing
+    # where the peaks overlap a change of the gain is taken for charge, and little is seen of it
+    known = response > _LEAST_RESPONSE
+    gain, error = _block_means(time.frame_gain / max(response, _LEAST_RESPONSE), blocks)
+    error = error if known else np.full(error.size, 1e6)
+    other, other_error = _block_means(time.frame_readout / common, blocks)
+    if not (error.min() > 0 and other_error.min() > 0):
+        return nothing
+    weight = error**-2 + other_error**-2
+    both = (gain * error**-2 + other * other_error**-2) / weight
+    # what the gain itself follows of the common movement: all of it, or the bias moves
+    information = float(((other / error) ** 2).sum())
+    followed = float((other * gain * error**-2).sum()) / information
+    if known and followed < 1.0 - 3.0 / np.sqrt(information):
+        both, weight = gain, error**-2
     position = np.array([run_position(time.frames[b], time.n_run).mean() for b in blocks])
-    return gain, scatter / response / np.sqrt([b.size for b in blocks]), position
+    return both, weight**-0.5, position
 
 
-def _response(evidence: Evidence) -> float:
-    """Return by how much the gain of a frame, as it is seen, rises with the true one.
+def _block_means(
+    series: NDArray[np.float64], blocks: Sequence[NDArray[np.intp]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the means of a series of frames in blocks, less that of all, and their standard errors."""
+    means = np.array([series[b].mean() for b in blocks]) - series.mean()
+    scatter = float(np.sqrt(np.mean([series[b].var() for b in blocks])))
+    return means, scatter / np.sqrt([b.size for b in blocks])
 
-    It is the regression of r on k / g, among the samples of a pixel and among the means of the pixels. A
-    gain 1 + c shifts r by ``c H / g`` times ``Var(r) / sigma^2`` on average, and the mean of r k by what the
-    law of the codes says, since a part of the change is taken for charge.
+
+def _response(evidence: Evidence) -> tuple[float, float]:
+    """Return how the gain of a frame, as it is seen, and its mean residual (DN) rise with the relative gain.
+
+    The former is the regression of r on k / g, among the samples of a pixel and among the means of the
+    pixels. The exact law of typical pixels says how much of a change of the gain is taken for charge.
     """
     maps = evidence.maps
     good = maps.usable & np.isfinite(evidence.readout_std) & (evidence.readout_std > 0)
     if not good.any():
-        return 0.0
-    signal = maps.quanta_exposure[good] / maps.conversion_gain[good]
-    weight = evidence.readout_std[good] ** -2.0
+        return 0.0, 0.0
+    exposure = maps.quanta_exposure[good]
+    weight, signal = evidence.readout_std[good] ** -2.0, exposure / maps.conversion_gain[good]
     pattern = signal - (weight * signal).sum() / weight.sum()
-    taken = (evidence.readout_std[good] / maps.read_noise_dn[good]) ** 2
-    above = float((weight * pattern * taken * signal).sum())
-    below = float((weight * pattern * signal).sum())
-    small = 1e-4
-    for pixel, group in zip(*typical_pixels(maps), strict=True):
+    chosen, groups = typical_pixels(maps)
+    taken, above, below = np.zeros(chosen.size), 0.0, float((weight * pattern * signal).sum())
+    for i, (pixel, group) in enumerate(zip(chosen, groups, strict=True)):
         law = PixelLaw(maps, int(pixel), evidence.n_frames)
         step = 1.0 / float(law.maps.conversion_gain[0])
         charge, readout = law.charge - law.charge @ law.mass, law.readout - law.readout @ law.mass
-        change = law.change(law.scaled(1.0 + small)) / small
+        change = law.change(law.scaled(1.0 + _SMALL)) / _SMALL
+        taken[i] = float(readout @ change) / (float(law.maps.quanta_exposure[0]) * step)
         scale = group.size * step / float(readout**2 @ law.mass)
         above += scale * float((charge * readout) @ change)
         below += scale * step * float(charge**2 @ law.mass)
-    return above / below if below > 0 else 0.0
+    # the groups are in the order of the exposure
+    shift = signal * np.interp(exposure, maps.quanta_exposure.reshape(-1)[chosen], taken)
+    above += float((weight * pattern * shift).sum())
+    return (above / below if below > 0 else 0.0), float(shift.mean())

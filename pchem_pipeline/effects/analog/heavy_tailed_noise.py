@@ -10,14 +10,14 @@ imagers with such tails are attributed to random telegraph noise of the source f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.response import strength_of
+from pchem_pipeline.effects.response import first_order
 from pchem_pipeline.model.marginal import MarginalModel
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HeavyTailedNoise"]
 
-_Heavy = TypeVar("_Heavy", bound="HeavyTailedNoise")
+_TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
 
 
 @register_effect
@@ -81,50 +81,49 @@ class HeavyTailedNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return mixtures with the number of samples below the codes, or else the He4, that are seen."""
-        below = _tail_below(evidence)
-        found: list[Self] = []
+        """Return mixtures with the samples below the codes and the He4 that are seen.
+
+        The share is the weighted mean of what either says; the factor for which they agree best is the first.
+        """
+        tail = _TailBelow(evidence)
+        found: list[tuple[float, Self]] = []
         for effect in cls.typical():
-            found += _of_tail(effect, evidence, *below)
-        if found:
-            return found
-        for effect in cls.typical():
-            found += strength_of(evidence, effect, "He4")
-        return found
+            factor, error = first_order(evidence, effect, "He4", cut=8.0)
+            other, other_error = tail.first_order(effect)
+            weight = error**-2.0 + other_error**-2.0
+            mean = (factor * error**-2.0 + other * other_error**-2.0) / weight if weight > 0 else 0.0
+            if mean * np.sqrt(weight) > 2.5:
+                disagreement = (factor - other) ** 2 / (error**2 + other_error**2)
+                found.append((disagreement, effect.scaled(mean)))
+        return [effect for _, effect in sorted(found, key=lambda item: item[0])]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with noise of two widths."""
         return model.with_noise(np.array([1.0 - self.share, self.share]), width=np.array([1.0, self.factor]))
 
 
-def _tail_below(evidence: Evidence) -> tuple[float, list[PixelLaw], list[int]]:
-    """Return the samples seen below the codes of the pixels, typical pixels, and how many each stands for.
+class _TailBelow:
+    """The samples below the codes of the pixels: how many are seen, and how many there should be."""
 
-    Single pixels with very many are another effect's: a pixel counts for at most a few more than the others.
-    """
-    usable = evidence.maps.usable
-    seen = evidence.tail_low[usable].astype(np.float64)
-    if not seen.size:
-        return 0.0, [], []
-    limit = 3.0 + 5.0 * float(seen.mean())
-    chosen, groups = typical_pixels(evidence.maps)
-    laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
-    return float(np.minimum(seen, limit).sum()), laws, [group.size for group in groups]
+    def __init__(self, evidence: Evidence):
+        self.n_frames = evidence.n_frames
+        seen = evidence.tail_low[evidence.maps.usable].astype(np.float64)
+        # single pixels with very many are another effect's: they count for a few more than the others
+        self.seen = float(np.minimum(seen, 3.0 + 5.0 * float(seen.mean())).sum()) if seen.size else 0.0
+        # what is expected differs much between pixels, since codes are whole
+        chosen, groups = typical_pixels(evidence.maps, _TAIL_PIXELS)
+        self.numbers = np.array([group.size for group in groups])
+        self.laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
+        self.expected = self._number(MarginalModel())
 
+    def _number(self, law: MarginalModel) -> float:
+        below = np.array([pixel.below(law) for pixel in self.laws])
+        return float((self.numbers * below).sum()) * self.n_frames
 
-def _of_tail(
-    effect: _Heavy,
-    evidence: Evidence,
-    seen: float,
-    laws: Sequence[PixelLaw],
-    numbers: Sequence[int],
-) -> list[_Heavy]:
-    """Return the effect with the share that explains the samples below the codes; empty if there are few."""
-    expected = more = 0.0
-    for law, number in zip(laws, numbers, strict=True):
-        wide = law.below(MarginalModel().with_noise([1.0], width=effect.factor))
-        expected += number * evidence.n_frames * law.below(MarginalModel())
-        more += number * evidence.n_frames * wide
-    if seen < 5 or more <= 0 or seen - expected < 4.0 * np.sqrt(expected + 1.0):
-        return []
-    return [effect.model_copy(update={"share": min((seen - expected) / more, 1.0)})]
+    def first_order(self, effect: HeavyTailedNoise) -> tuple[float, float]:
+        """Return how many times an effect's share explains the samples, and the standard error."""
+        more = self._number(MarginalModel().with_noise([1.0], width=effect.factor)) * effect.share
+        if not more > 0:
+            return 0.0, np.inf
+        variance = max(self.seen, self.expected) + 1.0 + (_TAIL_DOUBT * self.expected) ** 2
+        return (self.seen - self.expected) / more, float(np.sqrt(variance)) / more

@@ -98,7 +98,7 @@ class InterpixelCapacitance(Effect):
         if weight + other == 0:
             return ()
         mean = (x * weight + y * other) / (weight + other)
-        if mean * np.sqrt(weight + other) < 3.0:
+        if mean * np.sqrt(weight + other) < 2.5:
             return ()
         found = [cls(coupling=min(mean, 0.2))]
         if abs(x - y) > 3.0 * np.hypot(x_error, y_error):

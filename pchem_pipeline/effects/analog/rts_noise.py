@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.long_memory import between_grid_points, frame_key
+from pchem_pipeline.effects.long_memory import frame_key, two_states
 from pchem_pipeline.effects.pixel_law import PixelLaw, refitted, typical_pixels
 from pchem_pipeline.model.marginal import MarginalModel
 
@@ -34,9 +34,11 @@ _WHERE, _SIZE = 0xFFFFFFFE, 0xFFFFFFFF
 # steps, e-, and samples averaged that the estimator looks for, with probabilities
 _STEPS = ((0.5, 1), (0.7, 1), (1.0, 1), (1.5, 1), (2.5, 1), (4.0, 1), (1.5, 4), (3.0, 4))
 _PROBABILITIES = (0.01, 0.03, 0.08, 0.2, 0.4)
+# what outlying pixels are compared by, with goodness of fit before, and how far they must stand out
 _PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
-# a pixel stands out beyond that many standard deviations
-_OUTLYING = 5.0
+_LIMITS = np.array([4.2, 6.0, 4.2, 4.5, 4.5, 5.0])
+# standard deviations of a correlation in time beyond which a pixel has a slow trap
+_SLOW = 5.0
 _EQUAL, _EXPONENTIAL = (0.6, 0.8, 1.0, 1.25, 1.6), (0.3, 0.55, 1.0, 1.6, 2.5)
 
 
@@ -130,29 +132,12 @@ class RtsNoise(Effect):
         self, random: RandomSource, frames: NDArray[np.int64], y: NDArray[np.intp], x: NDArray[np.intp]
     ) -> NDArray[np.float64]:
         """Return 1 where the trap is full and 0 where it is empty, (frame, pixel)."""
-        full = self.probability
-
-        def after(state: NDArray[np.float64], rho: float) -> NDArray[np.float64]:
-            return full + (state - full) * rho
 
         def uniform(frame: int) -> NDArray[np.float64]:
             found: NDArray[np.float64] = random.uniform(("y", "x"), frame_key(frame))[0, y, x]
             return found
 
-        def independent(frame: int) -> NDArray[np.float64]:
-            return (uniform(frame) < full).astype(np.float64)
-
-        def midpoint(
-            frame: int, before: NDArray[np.float64], behind: NDArray[np.float64], rho: float
-        ) -> NDArray[np.float64]:
-            # Bayes: the way there by way of "full" and by way of "empty"
-            up, down = after(before, rho), 1.0 - after(before, rho)
-            to_full, to_empty = after(np.ones(1), rho), after(np.zeros(1), rho)
-            by_full = up * np.where(behind > 0, to_full, 1.0 - to_full)
-            by_empty = down * np.where(behind > 0, to_empty, 1.0 - to_empty)
-            return (uniform(frame) * (by_full + by_empty) < by_full).astype(np.float64)
-
-        return np.stack(between_grid_points(frames, self.correlation_frames, independent, midpoint))
+        return two_states(frames, self.correlation_frames, self.probability, uniform)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
@@ -181,7 +166,7 @@ class RtsNoise(Effect):
         outlying = _outlying(evidence)
         n, count = int(evidence.maps.usable.sum()), int(outlying.sum())
         # fewer are chance; where most pixels stand out something else is wrong
-        if count < 3 or count > 0.3 * n:
+        if count < 4 or count > 0.3 * n:
             return []
         seen = np.array([np.median(values[outlying]) for values in _profile(evidence)])
         chosen = typical_pixels(evidence.maps, 3)[0]
@@ -197,7 +182,7 @@ class RtsNoise(Effect):
         for step in np.split(np.arange(len(kinds)), len(_STEPS)):
             at = step[np.argmin(misfit[step])]
             # those too weak to stand out count too
-            power = max(float(_survival(_OUTLYING - max(profiles[at, :2]))), 0.3)
+            power = max(_survival(float((_LIMITS - _departure(profiles[at])).min())), 0.3)
             best.append((misfit[at], kinds[at].model_copy(update={"fraction": min(count / n / power, 1.0)})))
         ranked = [effect for _, effect in sorted(best, key=lambda item: float(item[0]))]
         # real traps differ; the mean of those that stand out is well above that of all
@@ -208,20 +193,23 @@ class RtsNoise(Effect):
 
     @classmethod
     def _single(cls, evidence: Evidence) -> list[Self]:
-        """Return a slow trap where the residuals of few pixels are strongly correlated in time."""
+        """Return a slow trap where the few pixels are strongly correlated in time."""
         time, maps = evidence.time, evidence.maps
         if time is None or time.n_pairs < 10:
             return []
-        lags = np.asarray(time.lag_readout, np.float64)[:, maps.usable]
-        outlying = lags[0] * np.sqrt(time.n_pairs) > _OUTLYING
+        charge, readout = (
+            np.asarray(lags, np.float64)[:, maps.usable] for lags in (time.lag_charge, time.lag_readout)
+        )
+        outlying = np.fmax(charge[0], readout[0]) * np.sqrt(time.n_pairs) > _SLOW
         if outlying.sum() < 3 or outlying.sum() > 0.3 * outlying.size:
             return []
-        near, far = float(lags[0, outlying].mean()), float(lags[2, outlying].mean())
-        rho = float(np.clip((far / near) ** 0.5, 0.05, 0.995)) if far > 0 else 0.05
-        # lag 1 of a pixel is Var(r) / sigma^2 times A^2 p (1 - p) rho / sigma^2
-        sigma = (maps.read_noise_dn * maps.conversion_gain)[maps.usable][outlying]
-        response = (evidence.readout_std / maps.read_noise_dn)[maps.usable][outlying] ** 2
-        amplitude = 2.0 * float(np.sqrt(np.mean(near / rho * sigma**2 / response)))
+        sd_k = evidence.charge_std[maps.usable][outlying]
+        sd_r = (evidence.readout_std * maps.conversion_gain)[maps.usable][outlying]
+        # k + r g is the sample itself, so its autocovariance is A^2 p (1 - p) rho
+        both = (time.lag_readout_charge + time.lag_charge_readout)[maps.usable][outlying]
+        near, _, far = (charge[:, outlying] * sd_k**2 + readout[:, outlying] * sd_r**2).mean(axis=1)
+        rho = float(np.clip(max(far / near, 0.0) ** 0.5, 0.05, 0.995))
+        amplitude = 2.0 * float(np.sqrt(max(near + float((both * sd_k * sd_r).mean()), 1e-6) / rho))
         return [
             cls(
                 fraction=float(outlying.mean()),
@@ -268,10 +256,14 @@ def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
     ]
 
 
+def _departure(profile: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far a profile departs from none: upwards in goodness and He4, either way in the others."""
+    return np.concatenate([profile[:2], np.abs(profile[2:])])
+
+
 def _outlying(evidence: Evidence) -> NDArray[np.bool_]:
-    """Return which usable pixels stand out, by goodness of fit or the first of the scores."""
-    found: NDArray[np.bool_] = np.fmax(*_profile(evidence)[:2]) > _OUTLYING
-    return found
+    """Return which usable pixels stand out in something."""
+    return np.asarray((_departure(np.array(_profile(evidence))) > _LIMITS[:, None]).any(axis=0))
 
 
 def _expected_profiles(

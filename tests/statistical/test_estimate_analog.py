@@ -1,0 +1,146 @@
+"""What the estimators of the analog effects make of simulated frames: near the truth, else silent."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sensor_of_modes import drawn_truth, seen, taken
+
+from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
+from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
+from pchem_pipeline.effects.analog.gain_drift import GainDrift
+from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
+from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
+from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
+from pchem_pipeline.effects.analog.rts_noise import RtsNoise
+from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
+from pchem_pipeline.effects.base import Effect
+from pchem_pipeline.effects.evidence import Evidence
+
+CLASSES: tuple[type[Effect], ...] = (
+    AnalogMemory, FlickerNoise, GainDrift, HeavyTailedNoise, InterpixelCapacitance, NoiseSkew,
+    Nonlinearity, RtsNoise, SignalDependentNoise,
+)  # fmt: skip
+TRUTH = drawn_truth((28, 28), exposure=(0.5, 3.0), noise_e=(0.22, 0.32))
+N_FRAMES = 2400
+
+
+@functools.cache
+def evidence_of(*effects: Effect, seed: int = 1) -> Evidence:
+    return seen(taken(TRUTH, *effects, n_frames=N_FRAMES, seed=seed))
+
+
+def test_nothing_is_guessed_where_nothing_is():
+    # each fires by chance in about one stack in 300
+    fired = [c.__name__ for seed in range(3) for c in CLASSES if c.estimate(evidence_of(seed=10 + seed))]
+    assert len(fired) <= 2, fired
+
+
+@pytest.mark.parametrize(
+    ("effect", "relative"),
+    [
+        # strengths of 10 standard errors or more; the rest is what the first order and a coarse grid leave
+        (AnalogMemory(memory=0.006), 0.3),
+        (AnalogMemory(memory=-0.006), 0.3),
+        (FlickerNoise(share=0.03, correlation_frames=3.0), 0.4),
+        (FlickerNoise(share=0.02, correlation_frames=40.0), 0.4),
+        (GainDrift(drift=0.03), 0.3),
+        (GainDrift(drift=-0.03), 0.3),
+        (HeavyTailedNoise(share=1e-3), 0.4),
+        (InterpixelCapacitance(coupling=0.005), 0.3),
+        (NoiseSkew(share=0.6), 0.25),
+        (NoiseSkew(share=-0.6), 0.25),
+        (Nonlinearity(step_change=0.01), 0.35),
+        (Nonlinearity(step_change=-0.01), 0.35),
+        (SignalDependentNoise(noise_e=0.08), 0.25),
+    ],
+    ids=lambda v: v.tag if isinstance(v, Effect) else "",
+)
+def test_the_strength_is_found(effect, relative):
+    first = next(iter(type(effect).estimate(evidence_of(effect))))
+    truth = getattr(effect, effect.strength)
+    assert getattr(first, effect.strength) == pytest.approx(truth, rel=relative)
+
+
+def test_a_linear_growth_is_among_the_guesses():
+    effect = SignalDependentNoise(noise_e=0.05, growth="linear")
+    found = {guess.growth: guess for guess in SignalDependentNoise.estimate(evidence_of(effect))}
+    assert found["linear"].noise_e == pytest.approx(0.05, rel=0.25)
+
+
+def test_the_correlation_time_is_found():
+    for tau in (3.0, 40.0):
+        effect = FlickerNoise(share=0.03 if tau < 10 else 0.02, correlation_frames=tau)
+        first = next(iter(FlickerNoise.estimate(evidence_of(effect))))
+        assert 0.3 < first.correlation_frames / tau < 3.5
+
+
+def test_anisotropy_is_found_where_it_is():
+    effect = InterpixelCapacitance(coupling=0.005, anisotropy=0.7)
+    first = next(iter(InterpixelCapacitance.estimate(evidence_of(effect))))
+    assert first.anisotropy == pytest.approx(0.7, abs=0.2)
+    [plain] = InterpixelCapacitance.estimate(evidence_of(InterpixelCapacitance(coupling=0.005)))
+    assert plain.anisotropy == 0.0
+
+
+def test_a_path_of_the_gain_is_found():
+    effect = GainDrift(drift=0.06, shape="path", path=(-0.5, 0.5, -0.5))
+    found = GainDrift.estimate(evidence_of(effect))
+    assert found[0].shape == "path"
+    position = np.linspace(0, 1, 50)
+    seen_course, true_course = found[0].drift * found[0]._course(position), 0.06 * effect._course(position)
+    assert np.abs(seen_course - true_course).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        RtsNoise(fraction=0.03, amplitude_e=1.0, probability=0.2),
+        RtsNoise(fraction=0.03, amplitude_e=2.0, probability=0.1),
+    ],
+    ids=lambda e: f"{e.amplitude_e}",
+)
+def test_telegraph_noise_is_found(effect):
+    found = RtsNoise.estimate(evidence_of(effect))
+    assert 1 <= len(found) <= 5
+    near = [g for g in found[:3] if g.samples == 1 and 0.6 < g.amplitude_e / effect.amplitude_e < 1.6]
+    assert near
+    # pixels whose fit it ruins are not looked at, so the share may be too small
+    assert any(0.25 < guess.fraction / 0.03 < 2.0 for guess in near)
+
+
+def test_slow_telegraph_noise_is_found():
+    effect = RtsNoise(
+        fraction=0.03, amplitude_e=0.5, probability=0.5, sampling="single", correlation_frames=15.0
+    )
+    slow = [g for g in RtsNoise.estimate(evidence_of(effect)) if g.sampling == "single"]
+    assert len(slow) == 1
+    assert slow[0].amplitude_e == pytest.approx(0.5, rel=0.4)
+    assert 0.3 < slow[0].correlation_frames / 15.0 < 3.5
+
+
+@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
+def test_the_opposite_direction_counts_for_nothing(effect):
+    plain = evidence_of(seed=10)
+    assert plain.time is not None
+    scores = {name: -20.0 * np.ones_like(values) for name, values in plain.scores.items()}
+    time = replace(
+        plain.time,
+        lag_readout=-np.abs(plain.time.lag_readout) - 0.2,
+        block_readout=0.1 * plain.time.block_readout,
+        neighbours=dict.fromkeys(plain.time.neighbours, -0.1),
+    )
+    against = replace(plain, scores=scores, time=time, goodness=-np.abs(plain.goodness))
+    signed = effect in (NoiseSkew, Nonlinearity)
+    assert bool(effect.estimate(against)) == signed
+
+
+@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
+def test_histograms_without_frames_are_enough_or_give_nothing(effect):
+    for truth in (HeavyTailedNoise(share=1e-3), Nonlinearity(step_change=0.01)):
+        for guess in effect.estimate(replace(evidence_of(truth), time=None)):
+            assert np.isfinite(getattr(guess, guess.strength))
