@@ -224,8 +224,10 @@ def _chance_of_repeats(
     counts: NDArray[Any], outside: FloatArray, shape: tuple[int, ...], consecutive: int
 ) -> tuple[float, float]:
     """Return how many frames and rows are expected to repeat the one before by chance."""
-    shares = counts / np.maximum(counts.sum(axis=1) + outside.sum(axis=1), 1.0)[:, None]
-    same = np.log(np.maximum((shares**2).sum(axis=1) + 1e-12, 1e-12)).reshape(shape[1:]).sum(axis=1)
+    real = counts.astype(np.float32)
+    total = np.maximum(real.sum(axis=1) + outside.sum(axis=1), 1.0)
+    alike = np.einsum("ib,ib->i", real, real) / total**2
+    same = np.log(np.maximum(alike, 1e-12)).reshape(shape[1:]).sum(axis=1)
     return consecutive * float(np.exp(min(same.sum(), 0.0))), consecutive * float(
         np.exp(np.minimum(same, 0)).sum()
     )

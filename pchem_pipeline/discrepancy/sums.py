@@ -134,18 +134,16 @@ def sum_frames(
     support = _packed_support(laws, pixels.usable)
     size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
     charge, readout = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
-    rows, columns, gain = np.zeros((4, n, ny)), np.zeros((2, n, nx), np.float32), np.zeros(n)
+    rows, columns, gain = np.zeros((4, n, ny)), np.zeros((n, 2, nx), np.float32), np.zeros(n)
     blocks = np.zeros((edges.size - 1, 2, ny, nx))
     lags, beside, below = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
-    maps = [
-        np.ascontiguousarray(m, np.float32)
-        for m in (pixels.exposure, pixels.usable, pixels.factor, pixels.shift)
-    ]
+    modes = np.stack([pixels.exposure, pixels.usable]).astype(np.float32)
+    weights = np.stack([pixels.factor, pixels.shift]).astype(np.float32)
     norms = np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64)
     for b, (first, last) in enumerate(pairwise(edges)):
         kernel.sum_block(
-            frames[first:last], support, laws.tables, *maps, norms, nx // 2, charge, readout,
-            rows[:, first:last], columns[:, first:last], gain[first:last], blocks[b], lags, beside, below,
+            frames[first:last], support, laws.tables, modes, weights, norms, charge, readout,
+            rows[:, first:last], columns[first:last], gain[first:last], blocks[b], lags, beside, below,
         )  # fmt: skip
     lengths = np.diff(edges)
     pairs = [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3)]
@@ -153,8 +151,9 @@ def sum_frames(
     consecutive = np.concatenate([[False], np.diff(numbers) == 1])
     repeated = np.zeros(n, np.bool_)
     repeated_rows = kernel.count_repeats(frames, consecutive, repeated)
+    gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
     return FrameSums(
-        rows, columns, (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300), blocks, lags,
+        rows, columns.transpose(1, 0, 2), gain, blocks, lags,
         (pairs[0], pairs[1], pairs[2]), beside / n, below / n, np.flatnonzero(repeated), int(repeated_rows),
         int(consecutive.sum()), _hits(frames, laws, pixels.usable),
     )  # fmt: skip

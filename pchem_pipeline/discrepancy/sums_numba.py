@@ -2,7 +2,8 @@
 
 The frames go through in chunks that stay in the cache. Every sample becomes (k, r) by its pixel's table; the
 common mode of each frame is subtracted before products of different pixels or frames are summed. The inner
-loops run over x without sums across x where possible, so that the compiler can use vector instructions.
+loops run over x with one sum each, over whole arrays by index, so that the compiler can use vector
+instructions; views of the rows would cost more than the work on a short row.
 """
 
 from __future__ import annotations
@@ -24,72 +25,125 @@ LAGS = 3
 
 @njit(nogil=True, cache=True)
 def _look_up(
-    row: NDArray[Any],
+    frames: NDArray[Any],
     support: NDArray[np.int32],
     tables: Float32Array,
+    y: int,
+    done: int,
+    size: int,
     charge: Float32Array,
     readout: Float32Array,
 ) -> None:
     """Turn the codes of a row into k and r; codes beyond the support count as its ends."""
-    first, last, start = support[0], support[1], support[2]
-    for x in range(row.size):
-        code = min(max(np.int32(row[x]), first[x]), last[x])
-        at = start[x] + (code - first[x])
-        charge[x] = tables[at, 0]
-        readout[x] = tables[at, 1]
+    for j in range(size):
+        for x in range(frames.shape[2]):
+            first = support[y, 0, x]
+            code = min(max(np.int32(frames[done + j, y, x]), first), support[y, 1, x])
+            at = support[y, 2, x] + (code - first)
+            charge[LAGS + j, y, x] = tables[at, 0]
+            readout[LAGS + j, y, x] = tables[at, 1]
 
 
 @njit(nogil=True, cache=True)
-def _sum_row(
-    charge: Float32Array,
-    readout: Float32Array,
-    factor: Float32Array,
-    shift: Float32Array,
-    begin: int,
-    end: int,
-) -> tuple[float, float, float]:
-    """Return the sums of k, r and r (factor k + shift) over part of a row."""
-    k0 = k1 = r0 = r1 = g0 = g1 = 0.0
+def _sum_half(
+    charge: Float32Array, readout: Float32Array, weights: Float32Array, j: int, y: int, begin: int, end: int
+) -> tuple[Any, Any, Any]:
+    """Return the sums of k, r and r (w_0 k + w_1) over part of a row.
+
+    In single precision: over a row that costs a millionth of the spread of the sum. Two sums at a time, since
+    each addition waits for the one before.
+    """
+    k0 = k1 = r0 = r1 = g0 = g1 = np.float32(0.0)
     x = begin
     while x < end - 1:
-        k0 += charge[x]
-        r0 += readout[x]
-        g0 += readout[x] * (factor[x] * charge[x] + shift[x])
-        k1 += charge[x + 1]
-        r1 += readout[x + 1]
-        g1 += readout[x + 1] * (factor[x + 1] * charge[x + 1] + shift[x + 1])
+        k, r = charge[j, y, x], readout[j, y, x]
+        k0 += k
+        r0 += r
+        g0 += r * (weights[0, y, x] * k + weights[1, y, x])
+        k, r = charge[j, y, x + 1], readout[j, y, x + 1]
+        k1 += k
+        r1 += r
+        g1 += r * (weights[0, y, x + 1] * k + weights[1, y, x + 1])
         x += 2
     if x < end:
-        k0 += charge[x]
-        r0 += readout[x]
-        g0 += readout[x] * (factor[x] * charge[x] + shift[x])
+        k, r = charge[j, y, x], readout[j, y, x]
+        k0 += k
+        r0 += r
+        g0 += r * (weights[0, y, x] * k + weights[1, y, x])
     return k0 + k1, r0 + r1, g0 + g1
 
 
 @njit(nogil=True, cache=True)
-def _add(total: NDArray[Any], values: Float32Array) -> None:
-    for x in range(values.size):
-        total[x] += values[x]
-
-
-@njit(nogil=True, cache=True)
-def _add_product(total: FloatArray, first: Float32Array, second: Float32Array) -> None:
-    for x in range(total.size):
-        total[x] += first[x] * second[x]
-
-
-@njit(nogil=True, cache=True)
-def _add_both(
-    total: FloatArray, r: Float32Array, k: Float32Array, other_r: Float32Array, other_k: Float32Array
+def _sum_rows(
+    charge: Float32Array,
+    readout: Float32Array,
+    weights: Float32Array,
+    y: int,
+    done: int,
+    size: int,
+    rows: FloatArray,
+    gain: FloatArray,
 ) -> None:
-    for x in range(total.size):
-        total[x] += r[x] * other_k[x] + other_r[x] * k[x]
+    half, nx = charge.shape[2] // 2, charge.shape[2]
+    for j in range(size):
+        t = done + j
+        left = _sum_half(charge, readout, weights, LAGS + j, y, 0, half)
+        right = _sum_half(charge, readout, weights, LAGS + j, y, half, nx)
+        rows[0, t, y], rows[1, t, y] = left[0], right[0]
+        rows[2, t, y], rows[3, t, y] = left[1], right[1]
+        gain[t] += left[2] + right[2]
 
 
 @njit(nogil=True, cache=True)
-def _subtract(values: Float32Array, pattern: Float32Array, amount: np.float32) -> None:
-    for x in range(values.size):
-        values[x] -= amount * pattern[x]
+def _add(
+    values: Float32Array, channel: int, y: int, done: int, size: int, columns: Float32Array, block: FloatArray
+) -> None:
+    """Add the rows of a chunk to the sums of columns, frame by frame, and of pixels."""
+    for j in range(size):
+        for x in range(values.shape[2]):
+            columns[done + j, channel, x] += values[LAGS + j, y, x]
+    for j in range(size):
+        for x in range(values.shape[2]):
+            block[channel, y, x] += values[LAGS + j, y, x]
+
+
+@njit(nogil=True, cache=True)
+def _subtract(values: Float32Array, pattern: Float32Array, amount: np.float32, j: int) -> None:
+    for y in range(pattern.shape[0]):
+        for x in range(pattern.shape[1]):
+            values[j, y, x] -= amount * pattern[y, x]
+
+
+@njit(nogil=True, cache=True)
+def _add_lagged(
+    now: Float32Array,
+    before: Float32Array,
+    lag: int,
+    y: int,
+    done: int,
+    size: int,
+    which: int,
+    total: FloatArray,
+) -> None:
+    """Add products of frames ``lag`` apart; those before the block's first frame do not exist."""
+    for j in range(max(0, lag - done), size):
+        for x in range(now.shape[2]):
+            total[which, y, x] += now[LAGS + j, y, x] * before[LAGS + j - lag, y, x]
+
+
+@njit(nogil=True, cache=True)
+def _add_neighbours(
+    charge: Float32Array, readout: Float32Array, y: int, dy: int, dx: int, size: int, total: FloatArray
+) -> None:
+    """Add the products kk, rr, r k + k r of a row with the pixels ``dy`` rows and ``dx`` columns on."""
+    for j in range(LAGS, LAGS + size):
+        for x in range(charge.shape[2] - dx):
+            total[0, y, x] += charge[j, y, x] * charge[j, y + dy, x + dx]
+        for x in range(charge.shape[2] - dx):
+            total[1, y, x] += readout[j, y, x] * readout[j, y + dy, x + dx]
+        for x in range(charge.shape[2] - dx):
+            one = readout[j, y, x] * charge[j, y + dy, x + dx]
+            total[2, y, x] += one + charge[j, y, x] * readout[j, y + dy, x + dx]
 
 
 @njit(nogil=True, cache=True)
@@ -97,12 +151,9 @@ def sum_block(
     frames: NDArray[Any],
     support: NDArray[np.int32],
     tables: Float32Array,
-    exposure: Float32Array,
-    mask: Float32Array,
-    factor: Float32Array,
-    shift: Float32Array,
+    modes: Float32Array,
+    weights: Float32Array,
     norms: FloatArray,
-    half: int,
     charge: Float32Array,
     readout: Float32Array,
     rows: FloatArray,
@@ -119,66 +170,45 @@ def sum_block(
         frames: codes (frame, y, x).
         support: first code, last code, row of the first one in ``tables``, (y, 3, x).
         tables: k and r, (rows, 2).
-        exposure: H, 0 in unusable pixels, (y, x).
-        mask: 1 in usable pixels, else 0, (y, x).
-        factor: weights of r k in the gain, (y, x).
-        shift: weights of r in the gain, (y, x).
+        modes: H, and 1, in usable pixels, else 0, (2, y, x).
+        weights: of r k and of r in the gain, (2, y, x).
         norms: sum of H, number of usable pixels.
-        half: first column of the right half.
         charge: workspace (LAGS + frames in a chunk, y, x).
         readout: the same.
         rows: k left, k right, r left, r right of each row, (4, frame, y); to fill.
-        columns: sums of k and r of each column, (2, frame, x); to add to.
-        gain: sums of r (factor k + shift), (frame,); to add to.
+        columns: sums of k and r of each column, (frame, 2, x); to add to.
+        gain: weighted sums of r k and r, (frame,); to add to.
         block: sums of k and r of each pixel, (2, y, x); to add to.
         lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x); to add to.
         beside: products kk, rr, rk + kr with the next column, (3, y, x); to add to.
         below: the same with the next row.
     """
-    n, ny, nx = frames.shape
+    n, ny, _ = frames.shape
     chunk = charge.shape[0] - LAGS
     done = 0
     while done < n:
         size = min(chunk, n - done)
         for y in range(ny):
-            for j in range(size):
-                t = done + j
-                k, r = charge[LAGS + j, y], readout[LAGS + j, y]
-                _look_up(frames[t, y], support[y], tables, k, r)
-                left = _sum_row(k, r, factor[y], shift[y], 0, half)
-                right = _sum_row(k, r, factor[y], shift[y], half, nx)
-                rows[0, t, y], rows[2, t, y] = left[0], left[1]
-                rows[1, t, y], rows[3, t, y] = right[0], right[1]
-                gain[t] += left[2] + right[2]
-                _add(columns[0, t], k)
-                _add(columns[1, t], r)
-                _add(block[0, y], k)
-                _add(block[1, y], r)
+            _look_up(frames, support, tables, y, done, size, charge, readout)
+            _sum_rows(charge, readout, weights, y, done, size, rows, gain)
+            _add(charge, 0, y, done, size, columns, block)
+            _add(readout, 1, y, done, size, columns, block)
         for j in range(size):
-            t = done + j
-            common_k = np.float32((rows[0, t].sum() + rows[1, t].sum()) / norms[0])
-            common_r = np.float32((rows[2, t].sum() + rows[3, t].sum()) / norms[1])
+            common_k = common_r = 0.0
             for y in range(ny):
-                _subtract(charge[LAGS + j, y], exposure[y], common_k)
-                _subtract(readout[LAGS + j, y], mask[y], common_r)
+                common_k += rows[0, done + j, y] + rows[1, done + j, y]
+                common_r += rows[2, done + j, y] + rows[3, done + j, y]
+            _subtract(charge, modes[0], np.float32(common_k / norms[0]), LAGS + j)
+            _subtract(readout, modes[1], np.float32(common_r / norms[1]), LAGS + j)
         for y in range(ny):
-            for j in range(size):
-                k, r = charge[LAGS + j, y], readout[LAGS + j, y]
-                for lag in range(1, min(done + j, LAGS) + 1):
-                    _add_product(lags[lag - 1, y], k, charge[LAGS + j - lag, y])
-                    _add_product(lags[LAGS + lag - 1, y], r, readout[LAGS + j - lag, y])
-                if done + j > 0:
-                    _add_product(lags[2 * LAGS, y], r, charge[LAGS + j - 1, y])
-                    _add_product(lags[2 * LAGS + 1, y], k, readout[LAGS + j - 1, y])
-                if nx > 1:
-                    _add_product(beside[0, y, :-1], k[:-1], k[1:])
-                    _add_product(beside[1, y, :-1], r[:-1], r[1:])
-                    _add_both(beside[2, y, :-1], r[:-1], k[:-1], r[1:], k[1:])
-                if y > 0:
-                    up_k, up_r = charge[LAGS + j, y - 1], readout[LAGS + j, y - 1]
-                    _add_product(below[0, y - 1], up_k, k)
-                    _add_product(below[1, y - 1], up_r, r)
-                    _add_both(below[2, y - 1], up_r, up_k, r, k)
+            for lag in range(1, LAGS + 1):
+                _add_lagged(charge, charge, lag, y, done, size, lag - 1, lags)
+                _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, lags)
+            _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, lags)
+            _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, lags)
+            _add_neighbours(charge, readout, y, 0, 1, size, beside)
+            if y < ny - 1:
+                _add_neighbours(charge, readout, y, 1, 0, size, below)
         done += size
         for j in range(LAGS):
             charge[j] = charge[size + j]

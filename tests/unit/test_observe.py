@@ -258,15 +258,17 @@ def test_loops_are_the_same_uncompiled() -> None:
 
     support = np.array([[[90, 90, 90], [130, 130, 130], [0, 41, 82]]] * 2, np.int32)
     tables = np.random.default_rng(1).normal(size=(123, 2)).astype(np.float32)
-    maps = [np.full((2, 3), value, np.float32) for value in (1.5, 1.0, 0.3, 0.1)]
+    modes, weights = (
+        np.array([[[one] * 3] * 2, [[two] * 3] * 2], np.float32) for one, two in ((1.5, 1.0), (0.3, 0.1))
+    )
     results = []
     for sum_block in (sums_numba.sum_block, sums_numba.sum_block.py_func):
         arrays = [
             np.zeros((7, 2, 3), np.float32), np.zeros((7, 2, 3), np.float32), np.zeros((4, 10, 2)),
-            np.zeros((2, 10, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)), np.zeros((8, 2, 3)),
+            np.zeros((10, 2, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)), np.zeros((8, 2, 3)),
             np.zeros((3, 2, 3)), np.zeros((3, 2, 3)),
         ]  # fmt: skip
-        sum_block(frames[:10], support, tables, *maps, np.array([9.0, 6.0]), 1, *arrays)
+        sum_block(frames[:10], support, tables, modes, weights, np.array([9.0, 6.0]), *arrays)
         results.append(arrays)
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
