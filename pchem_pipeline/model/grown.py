@@ -9,23 +9,27 @@ its middle: rounding, code edges and clipping are exact, and the likelihood is b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtrc, chdtri
 
-from pchem_pipeline.model import grown_numba, grown_tile_numba
+from pchem_pipeline.model import grown_numba, grown_scan_numba, grown_tile_numba
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.grown_inputs import HasParameters, Parameters, columns_of, lobes_of, pack
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.pchem import FitResult
 from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.model.start import kernel_counts
+from pchem_pipeline.model.start import kernel_counts, starting_points
 
 __all__ = ["GrownFit", "HasParameters", "fit_grown", "lobe_threshold", "log_likelihood", "marginal_mass"]
 
 FloatArray = NDArray[np.float64]
 
+#: Bits about the data, whatever the fit.
+_OF_DATA = FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW
+_POOR = 1e-3  # probability of a larger chi-square below which a pixel at a limit is started anew
 _CLEAR_GAP = 30.0  # nats: a neighbour this far below is not tried again
 
 
@@ -59,8 +63,9 @@ def fit_grown(
     """Estimate (H, g, mu, sigma) of every pixel under a grown model by maximum likelihood.
 
     Damped Newton steps on the exact masses of the codes from ``start``; the neighbours (H -+ 1, mu +- 1/g)
-    are tried where the plain fit does not exclude them.
-    Where the model has free lobes, each amplitude is tried in each pixel with a weight of its own, see
+    are tried where the plain fit does not exclude them, or where its law was too different to do so. Pixels
+    that the limits of the codes led astray are started anew. Where the model has free lobes, each amplitude
+    is tried in each pixel with a weight of its own, see
     :func:`lobe_threshold`. No pixel raises: what cannot be fitted holds NaN and a reason. The answer for a
     pixel does not depend on the others in the batch.
 
@@ -79,27 +84,17 @@ def fit_grown(
     """
     settings = settings or FitSettings()
     counts = kernel_counts(counts)
-    n = counts.shape[0]
-    parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
-    out = np.full((n, grown_numba.N_OUT), np.nan)
-    words = np.zeros((n, grown_numba.N_WORDS), np.int64)
-    gaps = np.full(n, np.inf if warm else 0.0) if plain is None else plain.likelihood_gap
-    grown_tile_numba.fit_tile(
-        counts,
-        np.ascontiguousarray(origin, np.int64),
-        columns_of(start),
-        np.ascontiguousarray(gaps, np.float64),
-        pack(model, n),
-        np.array(model.free_lobes, np.float64),
-        _limits(settings, model, warm),
-        parameters,
-        covariance,
-        out,
-        words,
-    )
+    first = np.ascontiguousarray(origin, np.int64)
+    beside = not warm and (plain is None or _reshapes(model))
+    found = _climb(counts, first, columns_of(start), model, settings, plain, warm=warm, beside=beside)
+    if not warm:
+        found = _with_limits(found, counts, first, model, settings)
+    parameters, covariance, out, words, carried = found
     chi2, dof = out[:, grown_numba.CHI2], words[:, grown_numba.FREEDOM]
     probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
-    status = _status(parameters, out, words, probability, settings, plain)
+    status = _status(parameters, out, words, probability, settings, carried)
+    if plain is not None:
+        status |= plain.fit_status & int(_OF_DATA)
     failed = (status & int(FAILED)) != 0
     parameters[failed] = np.nan
     covariance[failed] = np.nan
@@ -201,7 +196,101 @@ def marginal_mass(
     return out
 
 
-def _limits(settings: FitSettings, model: MarginalModel, warm: bool) -> FloatArray:
+class _Found(NamedTuple):
+    """What the loops fill, and the status words that their start came with."""
+
+    parameters: FloatArray
+    covariance: FloatArray
+    out: FloatArray
+    words: NDArray[np.int64]
+    carried: NDArray[np.int64]
+
+
+def _climb(
+    counts: NDArray[np.integer],
+    origin: NDArray[np.int64],
+    start: FloatArray,
+    model: MarginalModel,
+    settings: FitSettings,
+    plain: FitResult | None,
+    *,
+    warm: bool,
+    beside: bool,
+) -> _Found:
+    """Climb from one start in every pixel; ``beside``: and from its neighbours."""
+    n = counts.shape[0]
+    found = _Found(
+        np.full((n, 4), np.nan),
+        np.full((n, 4, 4), np.nan),
+        np.full((n, grown_numba.N_OUT), np.nan),
+        np.zeros((n, grown_numba.N_WORDS), np.int64),
+        np.zeros(n, np.int64) if plain is None else plain.fit_status.astype(np.int64) & int(FAILED),
+    )
+    gaps = np.full(n, np.inf) if plain is None else plain.likelihood_gap
+    grown_tile_numba.fit_tile(
+        counts,
+        origin,
+        start,
+        np.ascontiguousarray(gaps, np.float64),
+        pack(model, n),
+        np.array(model.free_lobes, np.float64),
+        _limits(settings, model, warm=warm, beside=beside),
+        *found[:-1],
+    )
+    return found
+
+
+def _better(found: _Found, again: _Found, pixels: NDArray[np.intp]) -> _Found:
+    """Put the second fit of some pixels in the place of the first where it is likelier."""
+
+    def height(fit: _Found) -> FloatArray:
+        converged = fit.words[:, grown_numba.CONVERGED] > 0
+        return np.where(converged, fit.out[:, grown_numba.LOG_LIKELIHOOD], -np.inf)
+
+    higher = height(again) > height(found)[pixels]
+    for mine, theirs in zip(found, again, strict=True):
+        mine[pixels[higher]] = theirs[higher]
+    return found
+
+
+def _with_limits(
+    found: _Found,
+    counts: NDArray[np.integer],
+    origin: NDArray[np.int64],
+    model: MarginalModel,
+    settings: FitSettings,
+) -> _Found:
+    """Start anew in pixels that the plain fit misjudged because codes pile up at a limit of the law."""
+    codes = origin[:, None] + np.arange(counts.shape[1])
+    beyond = np.zeros(codes.shape, bool)
+    if model.clip_low is not None:
+        beyond |= codes <= model.clip_low
+    if model.clip_high is not None:
+        beyond |= codes >= model.clip_high
+    beyond &= counts > 0
+    chi2, dof = found.out[:, grown_numba.CHI2], found.words[:, grown_numba.FREEDOM]
+    poor = (found.words[:, grown_numba.CONVERGED] == 0) | (chdtrc(np.maximum(dof, 1), chi2) < _POOR)
+    pixels = np.flatnonzero(poor & beyond.any(axis=1))
+    if pixels.size == 0:
+        return found
+    part, first, own = counts[pixels], origin[pixels], model.of(pixels)
+    inside = np.where(beyond[pixels], 0, part).astype(part.dtype)
+    starts = starting_points(inside, first)
+    chosen = np.full((pixels.size, 4), np.nan)
+    gains = np.ascontiguousarray(starts[:, :, 1])
+    grown_scan_numba.scan_tile(part, first, gains, pack(own, pixels.size), chosen)
+    again = _climb(part, first, chosen, own, settings, None, warm=True, beside=True)
+    return _better(found, again, pixels)
+
+
+def _reshapes(model: MarginalModel) -> bool:
+    """Tell whether a law changes more than the width of peaks: the plain fit may then be an electron off."""
+    one_peak = model.lobe_weights.shape[1] == 1
+    one_law = model.law == "poisson" and model.exposure_weights.size == 1
+    return not (one_peak and one_law and model.curvature == 0.0 and model.variance_per_electron2 == 0.0)
+
+
+def _limits(settings: FitSettings, model: MarginalModel, *, warm: bool, beside: bool) -> FloatArray:
     limits = np.zeros(grown_numba.N_LIMITS)
     limits[grown_numba.MIN_LOG_EXPOSURE] = np.log(settings.minimum_quanta_exposure)
     limits[grown_numba.TOLERANCE] = settings.tolerance
@@ -209,6 +298,7 @@ def _limits(settings: FitSettings, model: MarginalModel, warm: bool) -> FloatArr
     limits[grown_numba.CLEAR_GAP] = _CLEAR_GAP
     limits[grown_numba.LOBE_RISE] = lobe_threshold(model)
     limits[grown_numba.WARM] = warm
+    limits[grown_numba.BESIDE] = beside
     return limits
 
 
@@ -218,15 +308,13 @@ def _status(
     words: NDArray[np.int64],
     probability: FloatArray,
     settings: FitSettings,
-    plain: FitResult | None,
+    carried: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     """Return the status words: what the plain fit said of the data, and what this fit says of itself.
 
     Rounding is exact here, so coarse steps bias nothing and their bit falls.
     """
-    carried = int(FAILED | FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW)
-    n = parameters.shape[0]
-    status = np.zeros(n, np.int64) if plain is None else plain.fit_status.astype(np.int64) & carried
+    status = carried.copy()
     fitted = (status & int(FAILED)) == 0
     status[fitted & (words[:, grown_numba.CONVERGED] == 0)] |= FitStatus.NOT_CONVERGED
     with np.errstate(invalid="ignore"):

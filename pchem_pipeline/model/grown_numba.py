@@ -29,8 +29,8 @@ from pchem_pipeline.model.grown_types_numba import (
 )
 
 # places in `limits`
-MIN_LOG_EXPOSURE, TOLERANCE, MAX_EVALUATIONS, CLEAR_GAP, LOBE_RISE, WARM = range(6)
-N_LIMITS = 6
+MIN_LOG_EXPOSURE, TOLERANCE, MAX_EVALUATIONS, CLEAR_GAP, LOBE_RISE, WARM, BESIDE = range(7)
+N_LIMITS = 7
 
 # columns of `out`
 LOG_LIKELIHOOD, GAP, CHI2, AMPLITUDE, LOBE_WEIGHT = range(5)

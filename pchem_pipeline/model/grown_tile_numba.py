@@ -14,6 +14,7 @@ from pchem_pipeline.model.grown_lobes_numba import search_lobes
 from pchem_pipeline.model.grown_newton_numba import climb
 from pchem_pipeline.model.grown_numba import (
     AMPLITUDE,
+    BESIDE,
     CHI2,
     CLEAR_GAP,
     CONVERGED,
@@ -90,7 +91,7 @@ def fit_pixel(
     if not fine:
         return False, used, 0
     out[GAP] = gap
-    if gap < limits[CLEAR_GAP]:
+    if gap < limits[CLEAR_GAP] or limits[BESIDE] > 0.0:
         loglik, beside, count = climb_neighbours(theta, loglik, cells, law, limits, False, room)
         if beside > -math.inf:
             out[GAP] = loglik - beside
