@@ -139,6 +139,13 @@ def test_the_opposite_direction_counts_for_nothing(effect):
     assert bool(effect.estimate(against)) == signed
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 1)])
+def test_very_small_sensors_do_no_harm(shape):
+    evidence = seen(taken(drawn_truth(shape), n_frames=400))
+    for effect in CLASSES:
+        assert len(effect.estimate(evidence)) <= 1
+
+
 @pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
 def test_histograms_without_frames_are_enough_or_give_nothing(effect):
     for truth in (HeavyTailedNoise(share=1e-3), Nonlinearity(step_change=0.01)):

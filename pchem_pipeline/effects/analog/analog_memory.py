@@ -39,7 +39,9 @@ class AnalogMemory(Effect):
     plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "Memory of the analog chain (incomplete reset)"
     source: ClassVar[str] = "Janesick 2001 (incomplete reset); Boone et al. 2018 (memory of readout chains)"
-    signature: ClassVar[tuple[str, ...]] = ("time.cross.readout_charge", "time.lag1.readout.mean")
+    signature: ClassVar[tuple[str, ...]] = (
+        "time.cross.readout_charge", "time.lag1.readout.mean", "time.lag1.charge.mean",
+    )  # fmt: skip
     strength: ClassVar[str] = "memory"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {

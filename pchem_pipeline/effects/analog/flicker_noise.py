@@ -101,7 +101,7 @@ class FlickerNoise(Effect):
         A shift by d changes ``E[R | x]`` by ``d Var(r) / sigma^2`` on average (a), so that residuals l frames
         apart are correlated by ``a share exp(-l / tau)``.
         """
-        if evidence.time is None:
+        if evidence.time is None or not _good(evidence).any():
             return ()
         seen, error, response = _correlations(evidence, evidence.time)
         best: list[tuple[float, Self]] = []
@@ -131,13 +131,18 @@ def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flic
     return kept
 
 
+def _good(evidence: Evidence) -> NDArray[np.bool_]:
+    """Return the pixels whose residuals vary, (y, x)."""
+    return evidence.maps.usable & np.isfinite(evidence.readout_std) & (evidence.readout_std > 0)
+
+
 def _correlations(
     evidence: Evidence, time: TimeSeries
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Return lags 1 to 3 and the relative excess of block means, their standard errors, and the response."""
     maps = evidence.maps
     response = (evidence.readout_std / maps.read_noise_dn) ** 2
-    good = maps.usable & np.isfinite(response) & (evidence.readout_std > 0)
+    good = _good(evidence)
     lags = np.asarray(time.lag_readout, np.float64)[:, good]
     n = max(good.sum(), 1)
     pairs = np.maximum(time.n_pairs * (1.0 - np.arange(3) / max(time.block_frames - 1, 1)), 1.0)

@@ -46,8 +46,8 @@ class GainDrift(Effect):
     title: ClassVar[str] = "Drift of the conversion gain"
     source: ClassVar[str] = "EMVA 1288 (stability of the gain); Janesick 2007"
     signature: ClassVar[tuple[str, ...]] = (
-        "frame.gain.trend", "frame.gain.slow", "time.block.readout.chi", "frame.readout.trend",
-        "frame.readout.slow",
+        "frame.gain.trend", "frame.gain.slow", "frame.readout.trend", "frame.readout.slow",
+        "frame.charge.trend", "frame.charge.slow",
     )  # fmt: skip
     strength: ClassVar[str] = "drift"
     power: ClassVar[float] = 1.0

@@ -48,7 +48,7 @@ class HeavyTailedNoise(Effect):
         "of CMOS read noise)"
     )
     signature: ClassVar[tuple[str, ...]] = (
-        "tail.low.count", "shape.He4.mean", "tail.low.pixels", "shape.goodness.mean", "shape.He2C2.mean",
+        "tail.low.count", "shape.He4.mean", "tail.low.pixels", "shape.He3.mean", "shape.He3C1.mean",
     )  # fmt: skip
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 1.0

@@ -41,7 +41,9 @@ class InterpixelCapacitance(Effect):
     plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "Interpixel capacitance (IPC)"
     source: ClassVar[str] = "Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018"
-    signature: ClassVar[tuple[str, ...]] = ("space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr")
+    signature: ClassVar[tuple[str, ...]] = (
+        "space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr", "space.x.kk", "space.y.kk",
+    )  # fmt: skip
     strength: ClassVar[str] = "coupling"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {

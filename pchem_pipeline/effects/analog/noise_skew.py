@@ -42,7 +42,7 @@ class NoiseSkew(Effect):
     title: ClassVar[str] = "Skewed read noise (exponentially modified Gaussian)"
     source: ClassVar[str] = "Grushka 1972 (exponentially modified Gaussian)"
     signature: ClassVar[tuple[str, ...]] = (
-        "shape.He3.mean", "shape.He4.mean", "shape.goodness.mean", "shape.He3C1.mean", "tail.low.count",
+        "shape.He3.mean", "shape.He2C1.mean", "shape.He3C1.mean", "shape.He4.mean", "code.smooth",
     )  # fmt: skip
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 3.0
@@ -72,7 +72,7 @@ class NoiseSkew(Effect):
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return a tail to high DN and one to low DN."""
-        return cls(share=0.64), cls(share=-0.64)
+        return cls(share=0.4), cls(share=-0.4)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -40,7 +40,7 @@ class Nonlinearity(Effect):
     title: ClassVar[str] = "Nonlinearity of the pixel's response"
     source: ClassVar[str] = "Janesick 2007 (V/V and V/e- nonlinearity)"
     signature: ClassVar[tuple[str, ...]] = (
-        "shape.He1C2.mean", "shape.He3C1.mean", "shape.He2C1.mean", "shape.goodness.mean",
+        "shape.He1C2.mean", "code.smooth", "shape.He3C1.mean", "shape.He1C2.slope", "shape.C3.mean",
     )  # fmt: skip
     strength: ClassVar[str] = "step_change"
     power: ClassVar[float] = 1.0

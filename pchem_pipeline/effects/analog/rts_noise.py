@@ -60,7 +60,8 @@ class RtsNoise(Effect):
         "behind correlated double sampling)"
     )
     signature: ClassVar[tuple[str, ...]] = (
-        "shape.He4.cnt", "shape.goodness.cnt", "shape.He4.chi", "tail.low.pixels", "shape.He2C1.chi",
+        "shape.goodness.cnt", "shape.He4.chi", "shape.He3.chi", "shape.C2.cnt", "tail.low.count",
+        "time.block.readout.cnt",
     )  # fmt: skip
     strength: ClassVar[str] = "fraction"
     power: ClassVar[float] = 1.0

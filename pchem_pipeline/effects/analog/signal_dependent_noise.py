@@ -41,7 +41,7 @@ class SignalDependentNoise(Effect):
     title: ClassVar[str] = "Signal-dependent noise (gain or excess noise)"
     source: ClassVar[str] = "McIntyre 1966 (multiplication noise); Eckert et al. 2010 (peaks of SiPM spectra)"
     signature: ClassVar[tuple[str, ...]] = (
-        "shape.He2C1.mean", "shape.He3.mean", "shape.He2C2.mean", "shape.goodness.mean", "shape.He4.mean",
+        "shape.He2C1.mean", "shape.He3.mean", "shape.He2C1.slope", "shape.He4.mean", "shape.He2C2.mean",
     )  # fmt: skip
     strength: ClassVar[str] = "noise_e"
     power: ClassVar[float] = 2.0
