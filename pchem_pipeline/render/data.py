@@ -45,6 +45,7 @@ class PixelFit:
         status: words of ``fit_status``; empty if all is well.
         goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
         channel: whether it is a channel of ready-made histograms.
+        mass: probability of each DN under a model with effects; None where the PCD was fitted.
     """
 
     label: str
@@ -57,6 +58,7 @@ class PixelFit:
     status: str = ""
     goodness_p: float = float("nan")
     channel: bool = False
+    mass: NDArray[np.float64] | None = None
 
     @property
     def place(self) -> str:

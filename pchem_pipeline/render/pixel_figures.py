@@ -151,7 +151,8 @@ def shown_bins(counts: NDArray[Any], *, tail: float = 2e-4) -> slice:
 def pixel_fits(pixels: Sequence[PixelFit], *, width_mm: float = PAGE_MM) -> Figure:
     """Draw histograms of pixels with the fitted density and the residuals (fig:plot_per_pixel_fits).
 
-    Gray bars are the share of frames at each DN, the black line is the fitted density. The strip below
+    Gray bars are the share of frames at each DN, the black line is the fitted density, or under a model with
+    effects the mass of each DN. The strip below
     shows ``(count - expected) / sqrt(expected)`` where at least one frame is expected.
 
     Args:
@@ -192,7 +193,10 @@ def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -
         remarks.append(f"{outside:,} outside the axis")
     if has_fit(pixel.parameters):
         x = np.linspace(low, high, int(np.clip(8 * (high - low), 400, 3000)))
-        top.plot(x, pcd(x, *_theta(pixel.parameters)), color=BLACK)
+        if pixel.mass is None:
+            top.plot(x, pcd(x, *_theta(pixel.parameters)), color=BLACK)
+        else:
+            top.plot(dn[where], pixel.mass[where], color=BLACK)
         if np.isfinite(pixel.goodness_p):
             remarks.append(f"goodness of fit p = {pixel.goodness_p:.2g}")
         _residual_strip(strip, pixel, dn.astype(np.float64), where)
@@ -204,7 +208,8 @@ def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -
 
 
 def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) -> None:
-    expected = pixel.counts.sum() * pcd(dn[where], *_theta(pixel.parameters))
+    density = pcd(dn[where], *_theta(pixel.parameters)) if pixel.mass is None else pixel.mass[where]
+    expected = pixel.counts.sum() * density
     enough = expected >= 1.0
     residual = (pixel.counts[where] - expected)[enough] / np.sqrt(expected[enough])
     limit = float(np.clip(1.15 * np.max(np.abs(residual), initial=0.0), 3.5, 12.0))

@@ -136,6 +136,8 @@ def sentence(data: ReportData) -> str:
     if pixels.failed == 0 and pixels.total > 1:
         share = f"All {count(pixels.total, data.noun)} were"
     text = f"{share} fitted{frames}. "
+    if "model" in data.run:
+        text += f"The model is {data.run['model']}. "
     text += f"Medians over the {data.noun}s: " + ", ".join(parts) + "."
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     if "epcd_exact" in rmse and rmse.get("noise_floor"):
@@ -206,11 +208,11 @@ def _goodness(data: ReportData) -> list[Flag]:
         return [
             Flag(
                 "serious",
-                f"{text}. The PCD does not describe this sensor; see the residuals of single pixels.",
+                f"{text}. {_model(data)} does not describe this sensor; see the residuals of single pixels.",
             )
         ]
     if poor > 2.0 * expected + 5.0 * np.sqrt(expected):
-        return [Flag("caution", f"{text}. Some pixels are not described by the PCD.")]
+        return [Flag("caution", f"{text}. Some pixels are not described by {_model(data, 'the')}.")]
     return [Flag("good", f"{text}.")]
 
 
@@ -277,6 +279,11 @@ def _conditions(data: ReportData) -> list[Flag]:
             if not ("dark_current" in data.missing and "no dark current" in remark)
         ]
     return list(dict.fromkeys(found))
+
+
+def _model(data: ReportData, article: str = "The") -> str:
+    """Return the name of the model that the pixels were fitted with."""
+    return f"{article} model {data.run['model']}" if "model" in data.run else f"{article} PCD"
 
 
 def _as_sentence(text: str) -> str:

@@ -24,6 +24,7 @@ from pchem_pipeline.model.pixels import PixelParameters
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.ensemble_result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble_tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
+from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.stages.frame_source import open_source
 from pchem_pipeline.stages.tile_bands import tile_bands
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS
@@ -39,7 +40,7 @@ __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "ensemb
 NAME = "ensemble"
 VERSION = 1
 UPSTREAM: tuple[str, ...] = ("histogram", "fit")
-SETTINGS: tuple[str, ...] = ("ensemble", "model", "run.tile")
+SETTINGS: tuple[str, ...] = ("ensemble", "run.tile")
 READS: tuple[str, ...] = ("frames", "histogram", "fit", "truth")
 WRITES: tuple[str, ...] = ("ensemble", "ensemble_tiles")
 
@@ -60,7 +61,7 @@ class _Job:
         frames: the chosen frames (first, end), or None for all of the histogram.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
-        effects: of the run's model.
+        effects: with which the maps were fitted.
     """
 
     store: Path
@@ -104,7 +105,7 @@ def run(context: StageContext) -> None:
         None if everything else frames,
         source,
         truth,
-        context.config.model.effects,
+        fitted_effects(context.store),
     )
     bins = context.store.array("histogram/counts").shape[2]
     rows = max(1, _BAND_BYTES // (context.sensor.nx * bins * 4))
@@ -165,7 +166,7 @@ def _axes(context: StageContext, tiles: list[Tile]) -> EnsembleAxes | None:
     largest = min(float(pixels.quanta_exposure.max()), 60_000.0)
     mass = electron_pmf(pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
     n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
-    return EnsembleAxes(dn, nuced, n_k, bool(context.config.model.effects))
+    return EnsembleAxes(dn, nuced, n_k, bool(fitted_effects(store)))
 
 
 def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:

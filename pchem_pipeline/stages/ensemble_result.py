@@ -19,6 +19,7 @@ from pchem_pipeline.model.pixels import PixelParameters
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.stages.ensemble_curves import components, curves, electron_numbers, error_rates
 from pchem_pipeline.stages.ensemble_tile import EnsembleAxes, EnsembleTotals
+from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.stages.plain import plain
 from pchem_pipeline.variables import PARAMETERS
 
@@ -77,7 +78,7 @@ def write_result(
         "tiles_missing": context.n_keys - len(tiles),
     }
     if axes.grown:
-        facts["model"] = model_words(context.config.model.effects)
+        facts["model"] = model_words(fitted_effects(context.store))
     for name, values in arrays.items():
         context.store.write_array(f"ensemble/{name}", values)
     per_pixel: int | NDArray[Any] = samples[0]

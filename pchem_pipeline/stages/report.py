@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.effects.compose import marginal_model, model_words, pixel_maps
 from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.model.components import COMPONENT_CASES
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS, describe
+from pchem_pipeline.model.grown import marginal_mass
 from pchem_pipeline.render.captions import case_name
 from pchem_pipeline.render.data import PixelFit, ReportData
 from pchem_pipeline.render.discrepancy_exhibits import DISCREPANCY_NAMES
@@ -21,10 +23,12 @@ from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy_result import discrepancy_state, read_discrepancy
-from pchem_pipeline.variables import PARAMETERS, variables_of
+from pchem_pipeline.stages.fitted_model import fitted_effects
+from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.effects.base import Effect
     from pchem_pipeline.render.settings import ReportSettings
     from pchem_pipeline.stages.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
@@ -240,24 +244,47 @@ def _pixels(
     if not chosen:
         chosen = choose_pixels(maps["read_noise_e"], maps["quanta_exposure"], fit["fit_status"])
     names = (*PARAMETERS, "read_noise_e")
+    effects = fitted_effects(store)
     found = []
     for label, y, x in chosen:
         word = int(fit["fit_status"][y, x])
+        origin = int(store.read("histogram/origin", (slice(y, y + 1), slice(x, x + 1)))[0, 0])
+        counts = store.read("histogram/counts", (slice(y, y + 1), slice(x, x + 1), slice(None)))[0, 0]
+        parameters = {name: float(maps[name][y, x]) for name in names}
         found.append(
             PixelFit(
                 label=label,
                 y=y,
                 x=x,
-                origin=int(store.read("histogram/origin", (slice(y, y + 1), slice(x, x + 1)))[0, 0]),
-                counts=store.read("histogram/counts", (slice(y, y + 1), slice(x, x + 1), slice(None)))[0, 0],
-                parameters={name: float(maps[name][y, x]) for name in names},
+                origin=origin,
+                counts=counts,
+                parameters=parameters,
                 stderr={name: float(maps[f"{name}_stderr"][y, x]) for name in names},
                 status=describe(word) if word else "",
                 goodness_p=float(fit["goodness_p"][y, x]) if "goodness_p" in fit else float("nan"),
                 channel=sensor.kind == "histograms",
+                mass=_grown_mass(store, effects, parameters, (y, x), origin + np.arange(counts.size)),
             )
         )
     return found
+
+
+def _grown_mass(
+    store: RunStore,
+    effects: tuple[Effect, ...],
+    parameters: Mapping[str, float],
+    place: tuple[int, int],
+    codes: NDArray[np.int64],
+) -> NDArray[np.float64] | None:
+    """Return the mass of a pixel's codes under the model with effects; None without effects or a value."""
+    columns = [np.array([parameters[name]]) for name in PARAMETERS]
+    if not effects or not np.isfinite(columns).all():
+        return None
+    region = tuple(slice(i, i + 1) for i in place)
+    lobes = tuple(store.read(f"fit/{name}", region).ravel() for name in FREE_LOBES)
+    model = marginal_model(effects, pixel_maps(columns, np.ones(1, bool)))
+    mass: NDArray[np.float64] = marginal_mass(model, columns, codes, lobes=(lobes[0], lobes[1]))[0]
+    return mass
 
 
 def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[str, Any]:
@@ -271,6 +298,9 @@ def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[s
     }
     if config.simulate is not None:
         facts["seed of the simulation"] = config.simulate.seed
+    effects = fitted_effects(store)
+    if effects:
+        facts["model"] = model_words(effects)
     if record is not None:
         facts["report made (UTC)"] = record.started
         facts["versions"] = record.versions
