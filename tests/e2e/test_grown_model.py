@@ -1,0 +1,160 @@
+"""A run whose model holds the effects of its camera: biased maps come right, and the pages say why."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.stages.session import Command, find_run, run_stages, run_status
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.variables import FREE_LOBES, PARAMETERS
+
+EFFECTS: list[dict[str, Any]] = [
+    {"tag": "signal_dependent_noise", "noise_e": 0.09},
+    {"tag": "row_noise", "row_noise_dn": 1.2},
+    {"tag": "nonlinearity", "step_change": 0.004},
+]
+QUIET = Command(quiet=True)
+
+
+def configured(folder: Path, effects: list[dict[str, Any]], tile: int = 8) -> Path:
+    content = {
+        "run": {"tile": tile},
+        "simulate": {
+            "shape": [16, 20],
+            "n_frames": 4000,
+            "seed": 3,
+            "format": "npy",
+            "effects": EFFECTS,
+            "truth_frames": 0,
+        },
+        "model": {"effects": effects},
+        "compute": {"backend": "serial"},
+    }
+    path = folder / "run.yaml"
+    path.write_text(dump_config(RunConfig.model_validate(content)), encoding="utf-8")
+    return path
+
+
+def states(path: Path) -> dict[str, str]:
+    return {state.stage: state.words() for state in run_status(find_run(path))}
+
+
+def mean_pulls(store: RunStore) -> dict[str, float]:
+    """Mean pull against the truth of the pixels with a good value, in units of its own standard error."""
+    found = {}
+    for name in (*PARAMETERS, "read_noise_e"):
+        value, error = (store.read(f"maps/{name}{end}") for end in ("", "_stderr"))
+        each = (value - store.read(f"truth/{name}")) / error
+        each = each[np.isfinite(each) & (store.read("maps/quality") == 0)]
+        assert each.size > 250
+        found[name] = float(each.mean() * np.sqrt(each.size))
+    return found
+
+
+def fitted(store: RunStore) -> dict[str, NDArray[Any]]:
+    return {name: store.read(f"fit/{name}") for name in (*PARAMETERS, "covariance", "fit_status")}
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of the run, grown, and what was seen of it before."""
+    folder = tmp_path_factory.mktemp("grown")
+    path = configured(folder, [])
+    run_stages(
+        find_run(path), ["simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"], QUIET
+    )
+    store = RunStore.open(folder / "run.zarr")
+    assert not any(store.has(f"fit/{name}") for name in FREE_LOBES)
+    before = {
+        "pulls": mean_pulls(store),
+        "facts": dict(store.attributes("ensemble")),
+        "html": (folder / "run.zarr/report.html").read_text(),
+        "json": json.loads((folder / "run.zarr/report.json").read_text()),
+        "fit": fitted(store),
+    }
+    configured(folder, EFFECTS)
+    before["states"] = states(path)
+    run_stages(find_run(path), ["fit", "maps", "ensemble", "report"], QUIET)
+    return path, before
+
+
+def test_a_change_of_the_model_makes_the_fit_stale_and_nothing_before_it(both) -> None:
+    path, before = both
+    assert before["states"]["histogram"] == "complete"
+    assert before["states"]["fit"].startswith("stale - model.effects [] -> ")
+    for stage in ("maps", "ensemble", "report"):
+        assert before["states"][stage].startswith("stale")
+    assert set(states(path).values()) == {"complete"}
+
+
+def test_bias_is_cut_at_least_five_times_where_it_was_significant(both) -> None:
+    path, before = both
+    after = mean_pulls(RunStore.open(path.parent / "run.zarr"))
+    for name, was in before["pulls"].items():
+        print(f"{name:20s} mean pull / its standard error: {was:+8.2f} -> {after[name]:+6.2f}")
+    significant = {name: was for name, was in before["pulls"].items() if abs(was) > 8}
+    assert {"read_noise_dn", "read_noise_e", "conversion_gain"} <= significant.keys()
+    for name, was in significant.items():
+        assert abs(after[name]) < abs(was) / 5, name
+    for name, now in after.items():
+        assert abs(now) < 5, name
+
+
+def test_ensemble_is_predicted_with_the_grown_law(both) -> None:
+    path, before = both
+    store = RunStore.open(path.parent / "run.zarr")
+    facts, old = dict(store.attributes("ensemble")), before["facts"]
+    assert facts["model"] == "PCD + signal_dependent_noise + row_noise + nonlinearity"
+    assert "model" not in old
+    assert store.read("ensemble/epcd_exact").sum() == pytest.approx(1.0, abs=1e-4)
+    for name in ("epcd_exact", "nuced_exact"):
+        floor = facts["rmse"]["noise_floor" if name == "epcd_exact" else "nuced_noise_floor"]
+        assert facts["rmse"][name] < 1.3 * floor
+        assert facts["rmse"][name] <= old["rmse"][name] * 1.001
+    rows = {row["name"]: row for row in facts["moments"]}
+    added = rows["effects"]["predicted"]
+    assert added > 1.2**2
+    for name in ("mean", "variance", "nuced_mean", "nuced_variance"):
+        row = rows[name]
+        assert abs(row["predicted"] - row["observed"]) < 5 * row["stderr"]
+    terms = ("variance_of_bias", "variance_of_signal", "mean_read_variance", "mean_shot_variance")
+    total = sum(rows[name]["predicted"] for name in (*terms, "bias_signal_covariance", "effects"))
+    assert total == pytest.approx(rows["variance"]["predicted"], rel=1e-12)
+
+
+def test_report_names_the_model(both) -> None:
+    path, before = both
+    words = "PCD + signal_dependent_noise + row_noise + nonlinearity"
+    assert words not in before["html"]
+    assert words not in json.dumps(before["json"])
+    html = (path.parent / "run.zarr/report.html").read_text()
+    assert f"The model is {words}." in html
+    assert words in (path.parent / "run.zarr/report.json").read_text()
+
+
+def test_tiles_do_not_change_the_grown_fit(both, tmp_path: Path) -> None:
+    path, _ = both
+    store = RunStore.open(path.parent / "run.zarr")
+    other = configured(tmp_path, EFFECTS, tile=32)
+    run_stages(find_run(other), ["simulate", "ingest", "histogram", "fit"], QUIET)
+    again = RunStore.open(tmp_path / "run.zarr")
+    for name in (*PARAMETERS, "covariance", "fit_status", *FREE_LOBES):
+        np.testing.assert_array_equal(again.read(f"fit/{name}"), store.read(f"fit/{name}"), err_msg=name)
+
+
+def test_back_to_the_plain_model_is_back_to_the_plain_fit(both) -> None:
+    path, before = both
+    configured(path.parent, [])
+    run_stages(find_run(path), ["fit"], QUIET)
+    store = RunStore.open(path.parent / "run.zarr")
+    for name, values in before["fit"].items():
+        np.testing.assert_array_equal(store.read(f"fit/{name}"), values, err_msg=name)
+    assert not any(store.has(f"fit/{name}") for name in FREE_LOBES)
