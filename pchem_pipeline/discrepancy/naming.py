@@ -26,7 +26,8 @@ _PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
 _SHORTLIST = 9
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
-_SEEN = 3.0  # standard deviations by which an effect moves some statistic, beside others
+_SEEN = 3.5  # standard deviations by which some statistic must ask for an effect beside others
+_MOVED = 2.0  # standard deviations by which the effect itself must move it
 _BLUR = 2.0  # model errors of the others that are added to chance there
 
 
@@ -121,7 +122,7 @@ def choose(
         for members in itertools.combinations(shortlist, size):
             if len({h.tag for h in members}) == size:
                 scored = score_set(members, shifts, noise)
-                if _all_needed(scored, noise):
+                if _all_needed(scored, shifts, noise):
                     sets.append(scored)
     base = sum(log_density(shift, noise.covariance) for shift in shifts)
     sets = [s for s in sets if s.worth > base]
@@ -202,22 +203,26 @@ def _shortlist(
     return chosen
 
 
-def _all_needed(scored: ScoredSet, noise: Noise) -> bool:
+def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:
     """Tell whether every effect of the set is there by more than its error, and seen beside the others.
 
-    Where a strong effect moves a statistic, a weak one there is not told from the details of the strong one.
+    Seen means: some statistic deviates, in the direction of the effect, from what the others make of it. Where
+    a strong effect moves a statistic, a weak one is not told from the details of the strong one; and one
+    without a statistic of its own only helps out where others fit badly.
     """
     first, second = scored.fits
     factor = (first.factors + second.factors) / 2.0
     error = np.hypot(first.stderr, second.stderr) / 2.0
-    parts = (first.parts + second.parts) / 2.0
     if not np.all(factor > _SMALLEST_FACTOR * error):
         return False
+    parts = (first.parts + second.parts) / 2.0
+    shift = (shifts[0] + shifts[1]) / 2.0
     chance = np.diag(noise.covariance) / 2.0
     for member, part in enumerate(parts):
         others = np.delete(parts, member, axis=0)
         if len(others):
-            blur = _BLUR * tolerance(others, noise.model_error)
-            if np.max(np.abs(part) / np.sqrt(chance + blur**2)) < _SEEN:
+            scale = np.sqrt(chance + (_BLUR * tolerance(others, noise.model_error)) ** 2)
+            left, own = (shift - others.sum(axis=0)) / scale, part / scale
+            if not np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)):
                 return False
     return True

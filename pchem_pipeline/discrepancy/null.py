@@ -23,6 +23,8 @@ _SHRINKAGE = 0.6
 # many fewer than this number of earlier ones
 _PRIOR_WEIGHT = 10.0
 _SMALLEST_STD = 0.6
+# errors of its mean by which a statistic must move to count as moved
+_MOVED = 4.0
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,25 @@ class NullModel:
     effective_tests: float
 
     @classmethod
-    def from_replicates(cls, names: tuple[str, ...], vectors: FloatArray) -> NullModel:
-        """Estimate from replicates, shape (b, m)."""
+    def from_replicates(
+        cls, names: tuple[str, ...], vectors: FloatArray, before: NullModel | None = None
+    ) -> NullModel:
+        """Estimate from replicates, shape (b, m).
+
+        Args:
+            names: of the statistics.
+            vectors: the replicates.
+            before: null of the model to which effects were added: statistics that they leave where they were
+                scatter as they did, which few new replicates need not tell again.
+        """
         mean, std, covariance = moments(vectors)
-        return cls(names, mean, std, covariance, vectors, _effective_tests(vectors))
+        tests = _effective_tests(vectors)
+        if before is not None:
+            moved = np.abs(mean - before.mean) > _MOVED * before.std * np.sqrt(1.0 / len(vectors))
+            pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
+            covariance *= np.outer(pooled / std, pooled / std)
+            std, tests = pooled, before.effective_tests
+        return cls(names, mean, std, covariance, vectors, tests)
 
     @property
     def n_replicates(self) -> int:
@@ -99,6 +116,10 @@ def look_elsewhere(p: float, tests: float) -> float:
 def as_matrix(names: Sequence[str], vectors: Sequence[Mapping[str, float]]) -> FloatArray:
     """Return statistics as rows in the order of the names."""
     return np.array([[vector[name] for name in names] for vector in vectors], np.float64)
+
+
+def _pooled(first: FloatArray, n_first: int, second: FloatArray, n_second: int) -> FloatArray:
+    return np.asarray(np.sqrt((n_first * first**2 + n_second * second**2) / (n_first + n_second)))
 
 
 def _std(deviations: FloatArray) -> FloatArray:

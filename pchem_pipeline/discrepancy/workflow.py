@@ -139,7 +139,7 @@ class _Search:
             refit = refit_maps(self.stack[self.splits.train], train.maps, self.model)
             maps = refit.maps
             grown, _ = self._null(
-                maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), names
+                maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), first
             )
             rounds.append(Round(choice, added, tuple(hypotheses), null, grown, refit.moved))
             null = grown
@@ -179,7 +179,7 @@ class _Search:
         prefix: str,
         count: int,
         measured: Sequence[Evidence],
-        names: tuple[str, ...] | None = None,
+        before: NullModel | None = None,
     ) -> tuple[NullModel, tuple[str, ...]]:
         """Simulate and observe the present model ``count`` times."""
         text = "|".join(e.model_dump_json() for e in self.model)
@@ -196,10 +196,11 @@ class _Search:
             if isinstance(result, Exception):
                 raise result
             vectors.append(result)
-        if names is None:
+        names = () if before is None else before.names
+        if before is None:
             common = set(STATISTICS).intersection(*vectors, *(e.z for e in measured))
             names = tuple(name for name in STATISTICS if name in common)
-        return NullModel.from_replicates(names, as_matrix(names, vectors)), names
+        return NullModel.from_replicates(names, as_matrix(names, vectors), before), names
 
     def _seed(self, purpose: str, index: int = 0) -> int:
         text = f"{self.settings.seed}/{purpose}/{index}"
