@@ -92,6 +92,15 @@ class Choice:
     probability: tuple[float, ...]
     tried: tuple[ScoredSet, ...]
 
+    def present(self, certainty: float) -> tuple[Hypothesis, ...]:
+        """Return the effects of the best set in whose place there is something, with that probability."""
+        kept = tuple(
+            hypothesis
+            for hypothesis, rivals in zip(self.best.hypotheses, self.rivals, strict=True)
+            if sum(rival.probability for rival in rivals) >= certainty
+        )
+        return kept or self.best.hypotheses[:1]
+
     def rivals_of(self, tag: str) -> tuple[Rival, ...]:
         """Return who could stand in the place of an effect of the best set."""
         tags = [h.tag for h in self.best.hypotheses]
@@ -206,8 +215,8 @@ def _shortlist(
 def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:
     """Tell whether every effect of the set is there by more than its error, and seen beside the others.
 
-    Seen means: some statistic deviates, in the direction of the effect, from what the others make of it. Where
-    a strong effect moves a statistic, a weak one is not told from the details of the strong one; and one
+    Seen means: some statistic deviates, in the direction of the effect, from what the others make of it.
+    Where a strong effect moves a statistic, a weak one is not told from the details of the strong one; and one
     without a statistic of its own only helps out where others fit badly.
     """
     first, second = scored.fits

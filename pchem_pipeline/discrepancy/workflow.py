@@ -265,7 +265,7 @@ class _Search:
         """Refine the strengths of the chosen set together; drop what comes to nothing."""
         noise = Noise(noise.covariance, _FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
-        chosen = choice.best.hypotheses
+        chosen = choice.present(self.settings.certainty)
         for _ in range(len(chosen)):
             [chosen] = laboratory.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
             kept = tuple(h for h, _ in fit_set(chosen, shift, noise).substantial())
