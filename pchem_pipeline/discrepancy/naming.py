@@ -216,8 +216,8 @@ def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise:
     """Tell whether every effect of the set is there by more than its error, and seen beside the others.
 
     Seen means: some statistic deviates, in the direction of the effect, from what the others make of it.
-    Where a strong effect moves a statistic, a weak one is not told from the details of the strong one; and one
-    without a statistic of its own only helps out where others fit badly.
+    Where a strong effect moves a statistic, a weak one is not told from the details of the strong one; and
+    one without a statistic of its own only helps out where others fit badly.
     """
     first, second = scored.fits
     factor = (first.factors + second.factors) / 2.0

@@ -13,13 +13,13 @@ class DiscrepancySettings(Section):
     """Comparison of the frames with replicates simulated from the fitted model, and naming of effects."""
 
     replicates: int = Field(
-        default=60,
+        default=40,
         ge=20,
         le=2000,
         description="simulated and refitted stacks behind the null distribution, a third of the run each",
     )
     grown_replicates: int = Field(
-        default=24, ge=12, le=2000, description="the same for each model that effects were added to"
+        default=16, ge=12, le=2000, description="the same for each model that effects were added to"
     )
     block_frames: int | None = Field(
         default=None,
