@@ -16,7 +16,7 @@ from pchem_pipeline.discrepancy.where import Place
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 
-__all__ = ["Candidate", "Discrepancy", "Pull", "Step", "Verdict", "unit_of"]
+__all__ = ["Candidate", "Discrepancy", "Pull", "Residual", "Step", "Verdict", "unit_of"]
 
 Verdict = Literal["named", "ambiguous", "unexplained", "consistent"]
 SCHEMA = 1
@@ -61,6 +61,45 @@ class Pull:
         """Return it as JSON data."""
         sentence = STATISTICS[self.statistic].sentence
         return {"statistic": self.statistic, "sentence": sentence, "before": self.before, "after": self.after}
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Samples of some codes that the model does not account for.
+
+    Attributes:
+        words: where, which way and how many.
+        direction: "+" (more than the model has) or "-".
+        z: signed root of the Poisson deviance, standard deviations.
+        p: chance of one like it anywhere.
+        dn: first and last code, DN.
+        seen, expected: samples.
+        share: of the gap that is left.
+    """
+
+    words: str
+    direction: str
+    z: float
+    p: float
+    dn: tuple[int, int]
+    seen: float
+    expected: float
+    share: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON data."""
+        return {
+            "statistic": "code.smooth",
+            "channel": STATISTICS["code.smooth"].channel,
+            "sentence": self.words,
+            "direction": self.direction,
+            "z": self.z,
+            "p": self.p,
+            "dn": list(self.dn),
+            "seen": self.seen,
+            "expected": self.expected,
+            "share_of_gap": self.share,
+        }
 
 
 @dataclass(frozen=True)
@@ -140,6 +179,9 @@ class Discrepancy:
         maps: parameters of the pixels examined, under the final model.
         evidence: of the train frames.
         statistics: names, and deviations before and after, for pictures.
+        residuals: codes that the final model does not account for (ready-made histograms).
+        set_aside: codes that its fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
+            limit.
     """
 
     verdict: Verdict
@@ -158,6 +200,8 @@ class Discrepancy:
     maps: PixelMaps
     evidence: Evidence
     statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
+    residuals: tuple[Residual, ...] = ()
+    set_aside: tuple[tuple[float | None, float | None], ...] = ()
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -193,9 +237,9 @@ class Discrepancy:
             "where": [_place(p) for p in self.where],
             "untestable": list(self.untestable),
             "untestable_reasons": dict(self.untestable),
-            "unexplained": [
-                {"statistic": n, "z": z, "sentence": STATISTICS[n].sentence} for n, z in self.unexplained
-            ],
+            "unexplained": [r.to_json() for r in self.residuals]
+            + [{"statistic": n, "z": z, "sentence": STATISTICS[n].sentence} for n, z in self.unexplained],
+            "set_aside": [list(interval) for interval in self.set_aside],
             "examined": dict(self.examined),
             "left_out": dict(self.left_out),
             "p_global": {"before": self.global_p[0], "after": self.global_p[1]},

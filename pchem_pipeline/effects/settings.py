@@ -18,3 +18,9 @@ class ModelSettings(Section):
         description="effects beyond the PCD with which pixels are fitted and ensembles predicted; "
         "pchem discrepancy adds those that it names",
     )
+    set_aside_e: tuple[tuple[float | None, float | None], ...] = Field(
+        default=(),
+        description="codes that the fit leaves out, since the model does not describe them: intervals of "
+        "their place on the comb of the plain fit, (x - bias) * gain, null for no limit ([[null, 0.5]] sets the "
+        "0-electron peak aside), e-",
+    )

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.config.grow import with_model_effects
 from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.discrepancy.marginal import find_in_histograms
 from pchem_pipeline.discrepancy.replicate import Replicate
 from pchem_pipeline.discrepancy.result import Discrepancy
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.workflow import find_discrepancies
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.settings import ModelSettings
-from pchem_pipeline.errors import InputError, PchEmError
-from pchem_pipeline.stages.base import StageContext
+from pchem_pipeline.errors import PchEmError, StoreError, quoted
+from pchem_pipeline.stages.base import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy_arrays import evidence_arrays
 from pchem_pipeline.stages.frame_source import FrameSource, open_source
 from pchem_pipeline.store.files import write_atomic
@@ -120,7 +121,8 @@ def run(context: StageContext) -> None:
     settings, sensor = context.config.discrepancy, context.sensor
     before = context.config.model.effects
     if sensor.kind != "frames":
-        raise InputError(f"{context.store.path} was made from histograms")
+        _run_histograms(context)
+        return
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
     window = choose_window(source.shape, settings.max_samples, settings.block_frames, context.options.roi)
@@ -140,6 +142,27 @@ def run(context: StageContext) -> None:
         # the search counts pixels from the corner of its window, people from that of the sensor
         place["pixels"] = [[y + window.rows[0], x + window.columns[0]] for y, x in place["pixels"]]
     _write(context, found, result, before)
+
+
+def _run_histograms(context: StageContext) -> None:
+    """Do the same with ready-made histograms, in one unit."""
+    if not context.store.has("histogram/counts"):
+        place = quoted(context.store.path)
+        raise StoreError(f"{NAME} of histograms needs them in the store; run: pchem histogram {place}")
+    before = context.config.model.effects
+    counts = context.store.read("histogram/counts")
+    found = find_in_histograms(
+        counts.reshape(-1, counts.shape[2]),
+        context.store.read("histogram/origin").ravel(),
+        context.config.discrepancy,
+        model=before,
+    )
+    _write(context, found, found.to_json(), before)
+    context.run_units([WHOLE], _nothing_left, by_tiles=False)
+
+
+def _nothing_left(unit: Unit) -> None:
+    """Be a unit whose work is done."""
 
 
 @dataclass
@@ -215,18 +238,23 @@ def _write(
     for tag, reason in found.left_out.items():
         context.note(f"effect {tag} left out: {reason}")
     if context.config.discrepancy.add and found.model != tuple(before):
-        grow_model(context, found.model)
+        grow_model(context, found.model, found.set_aside)
 
 
-def grow_model(context: StageContext, effects: Sequence[Effect]) -> None:
+def grow_model(
+    context: StageContext,
+    effects: Sequence[Effect],
+    set_aside: tuple[tuple[float | None, float | None], ...] = (),
+) -> None:
     """Put effects into the model of the run: in the store's copy of the YAML, and in the user's own file."""
-    model = ModelSettings(effects=tuple(effects))
+    set_aside = set_aside or context.config.model.set_aside_e
+    model = ModelSettings(effects=tuple(effects), set_aside_e=set_aside)
     context.store.write_config(dump_config(context.config.model_copy(update={"model": model})))
     path = context.config_path
     if path is None or not path.exists():
         return
     text = path.read_text(encoding="utf-8")
-    write_atomic(path, with_model_effects(text, _dump(effects), str(path)).encode())
+    write_atomic(path, with_model_effects(text, _dump(effects), str(path), set_aside).encode())
     context.reporter.info(f"model.effects of {path}: {', '.join(e.tag for e in effects)}")
 
 

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
+from pchem_pipeline.model.beside import Interval, fit_beside
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.grown import fit_grown
+from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.base import StageContext, open_store
@@ -46,6 +48,7 @@ def fit_tile(
     settings: FitSettings,
     adc_limits: tuple[int, int] | None,
     effects: Sequence[Effect] = (),
+    set_aside: Sequence[Interval] = (),
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the group ``fit`` of a tile, by name.
 
@@ -56,14 +59,17 @@ def fit_tile(
         settings: of the fit.
         adc_limits: first and last code of the ADC, DN, or None where they are not known.
         effects: of the run's model.
+        set_aside: codes that the fit leaves out, e- on the comb of the plain fit.
     """
     counts = histogram["counts"]
     shape = counts.shape[:2]
     flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
     rows = counts.reshape(-1, counts.shape[2])
-    result: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits)
-    if effects:
-        result = _grown(rows, flat["origin"], result, settings, effects)
+    plain: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits)
+    result = _grown(rows, flat["origin"], plain, settings, effects) if effects else plain
+    if set_aside:
+        law = functools.partial(_law, effects=effects)
+        result = fit_beside(rows, flat["origin"], plain, result, law, set_aside, settings)
     variances = np.diagonal(result.covariance, axis1=1, axis2=2)
     arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
     arrays |= {
@@ -85,6 +91,11 @@ def _grown(
     usable = (plain.fit_status & int(_UNUSABLE)) == 0
     maps = pixel_maps([getattr(plain, name) for name in PARAMETERS], usable)
     return fit_grown(counts, origin, plain, marginal_model(effects, maps), settings, plain=plain)
+
+
+def _law(parameters: NDArray[np.float64], *, effects: Sequence[Effect]) -> MarginalModel:
+    """Return the law of pixels with (H, g, mu, sigma), shape (n, 4)."""
+    return marginal_model(effects, pixel_maps(list(parameters.T), np.ones(parameters.shape[0], np.bool_)))
 
 
 def run(context: StageContext) -> None:
@@ -110,6 +121,7 @@ def run(context: StageContext) -> None:
         settings=context.config.fit,
         adc_limits=context.adc_limits,
         effects=effects,
+        set_aside=context.config.model.set_aside_e,
     )
     context.run_units(context.tiles(), task, needs="histogram")
 
@@ -127,11 +139,12 @@ def _do_tile(
     settings: FitSettings,
     adc_limits: tuple[int, int] | None,
     effects: Sequence[Effect],
+    set_aside: Sequence[Interval],
 ) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels."""
     run_store = open_store(store)
     histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
-    arrays = fit_tile(histogram, settings, adc_limits, effects)
+    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]

@@ -7,10 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from pchem_pipeline.stages.discrepancy_words import verdict_text
+from pchem_pipeline.stages.sensor import SensorInfo
 from pchem_pipeline.stages.session import Command, Target, find_run, run_stages, run_status
+from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["find_and_grow"]
 
+_BEFORE = ("ingest", "histogram")
 _AFTERWARDS = ("fit", "maps", "ensemble", "report")
 
 
@@ -25,8 +28,11 @@ def find_and_grow(target: Target, command: Command, *, refit: bool) -> str:
     Raises:
         PchEmError: a stage cannot be done.
     """
-    missing = [s.stage for s in run_status(target) if s.stage == "ingest" and s.state != "complete"]
-    run_stages(target, [*missing, "discrepancy"], command)
+    missing = [s.stage for s in run_status(target) if s.stage in _BEFORE and s.state != "complete"]
+    if "ingest" in missing:
+        run_stages(target, ["ingest"], command)
+    counted = ["histogram"] if "histogram" in missing and _of_histograms(target) else []
+    run_stages(target, [*counted, "discrepancy"], command)
     if command.options.dry_run:
         return ""
     grown = find_run(target.config_path or target.store)
@@ -36,6 +42,14 @@ def find_and_grow(target: Target, command: Command, *, refit: bool) -> str:
         if stages:
             run_stages(grown, stages, without_choice(command))
     return verdict_text(read_verdict(grown.store)) + f"\n\n{grown.store / 'discrepancy.json'}"
+
+
+def _of_histograms(target: Target) -> bool:
+    """Tell whether a run was made from ready-made histograms: the search looks at them, not at frames."""
+    if not (target.store / "zarr.json").exists():
+        return False
+    store = RunStore.open(target.store)
+    return store.has("frames") and SensorInfo.read(store).kind == "histograms"
 
 
 def without_choice(command: Command) -> Command:
