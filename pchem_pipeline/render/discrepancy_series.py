@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 #: Residuals beyond this many standard deviations make their axis logarithmic outside of it.
 _LINEAR = 8.0
 #: Number of stretches of the run over which frames are averaged.
-_STRETCHES = 60
+_STRETCHES = 24
 #: Colour of what the verdict points to.
 _MARK = "#F0E442"
 
