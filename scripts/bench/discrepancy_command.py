@@ -17,7 +17,8 @@ from discrepancy_figures import Answer
 from discrepancy_worker import make
 
 PCHEM = Path(sys.executable).with_name("pchem")
-RUN = """run: {{store: run.zarr, workers: {workers}}}
+RUN = """run: {{store: run.zarr}}
+compute: {{workers: {workers}}}
 input: {{files: [frames.npy], integration_time: 1.0}}
 """
 
