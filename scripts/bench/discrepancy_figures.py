@@ -108,7 +108,10 @@ def print_figures(records: Iterable[Record]) -> None:
     _confusion(answers)
     _naming(answers)
     _gaps([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
-    _biases([r for r in records if r.get("bias")])
+    compared = [(r, a) for r, a in zip(records, answers, strict=True) if r.get("bias")]
+    _bias_titles()
+    _biases("all", [r for r, _ in compared], 6)
+    _biases("named alone", [r for r, a in compared if a.alone], 0)
     _times(records)
 
 
@@ -207,14 +210,18 @@ def _better_than_runner_up(step: dict[str, Any]) -> bool:
     return bool(step["gap_after"] < step["runner_up"]["gap_after"] or step["gap_after"] <= step["gap_floor"])
 
 
-def _biases(records: Sequence[Record]) -> None:
+def _bias_titles() -> None:
     print("\nBias of the maps by the effect, in standard errors of a pixel, mean over the pixels it touches,")
     print("against the plain fit of the same stack without the effect; without -> with the named effects")
+
+
+def _biases(which: str, records: Sequence[Record], most: int) -> None:
+    """Print how often a bias was cut, and the largest ones."""
     for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e"):
         rows = [(r["case"], r["bias"][name]) for r in records]
         for limit, title in (
-            (1.0, "one standard error of a pixel"),
-            (None, "5 standard errors of the mean of all"),
+            (1.0, "one s.e. of a pixel"),
+            (None, "5 s.e. of the mean of all"),
         ):
             large = [
                 (case, b)
@@ -222,12 +229,12 @@ def _biases(records: Sequence[Record]) -> None:
                 if abs(b["before"]) > (limit or 5 / math.sqrt(max(b["pixels"], 1)))
             ]
             _share(
-                f"{name}: beyond {title}: cut 5 times",
+                f"{which}, {name}: beyond {title}: cut 5 times",
                 [b for _, b in large],
                 lambda b: abs(b["after"]) <= max(abs(b["before"]) / 5, 2 * b["chance"]),
                 least=0.9,
             )
-            for case, b in sorted(large, key=lambda row: -abs(row[1]["before"]))[:6]:
+            for case, b in sorted(large, key=lambda row: -abs(row[1]["before"]))[:most]:
                 tag = "+".join(case["hidden"])
                 print(
                     f"      {tag:26s}{case['level']:4g} s95{b['before']:9.2f} -> {b['after']:7.2f}"

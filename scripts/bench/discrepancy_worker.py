@@ -32,7 +32,7 @@ def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, 
             # only now is the key opened
             record["hidden"] = json.loads(key.read_text())["effects"]
             effects = record.pop("effects")
-            if with_bias and effects:
+            if with_bias:
                 record |= _compared(case, frames, effects, key)
         # a study of hundreds of cases goes on, and counts this one as failed
         except Exception as error:
@@ -141,7 +141,9 @@ def _bias(
     affected: NDArray[np.bool_],
 ) -> dict[str, Any]:
     """Compare fits without and with the named effects to the plain fit of the twin without the effect."""
-    reference, before, after = fit_maps(twin), fit_maps(frames), fit_maps(frames, effects)
+    reference, before = fit_maps(twin), fit_maps(frames)
+    # where nothing was named the bias stays what it is
+    after = fit_maps(frames, effects) if effects else before
     good = affected & reference["good"] & before["good"] & after["good"]
     found: dict[str, Any] = {"pixels": int(good.sum()), "affected": int(affected.sum())}
     for name in PARAMETERS:

@@ -81,7 +81,7 @@ def test_figures_count_and_compare_with_their_targets(capsys):
     assert "MISSED" in line("4 s95: named alone")
     assert "1/11 " in line("4 s95: a wrong name")
     assert "0/1 " in line("nothing hidden: any name  ")
-    assert "1/1 " in line("bias: beyond one standard error")
+    assert "1/1 " in line("all, bias: beyond one s.e.")
     assert "reached" in line("a placebo closes a quarter")
     assert any("failed x1: ValueError: broken" in text for text in lines)
 
