@@ -14,7 +14,7 @@ from pchem_pipeline.model.grown_profile import profile_effects
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 
-PIXELS, FRAMES = 150, 4000
+PIXELS, FRAMES = 120, 4000
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 PLAIN = MarginalModel()
 
@@ -161,11 +161,11 @@ def test_effect_and_pixels_are_fitted_together() -> None:
         [0.02, 0.01],
         scales=[0.05, 0.01],
         bounds=[(0, 1), (0, 1)],
-        max_pixels=100,
+        max_pixels=80,
     )
     assert found.converged
     assert found.log_likelihood > found.start_log_likelihood + 100
-    assert found.pixels.size == 100
+    assert found.pixels.size == 80
     assert abs(found.theta[0] - 0.07) < 5 * np.sqrt(found.covariance[0, 0])
     assert np.sqrt(found.covariance[0, 0]) < 0.005
     # no dispersion there: at or near the bound

@@ -1,0 +1,91 @@
+"""From effects to the law of the pixels, and what the fit of a tile makes of it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import pytest
+from drawn_pixels import draw
+
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.rts_noise import RtsNoise
+from pchem_pipeline.effects.base import Effect, Plane
+from pchem_pipeline.effects.compose import marginal_model, model_words, pixel_maps
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.stages.fit import fit_tile
+from pchem_pipeline.variables import variables_of
+
+
+class Broken(Effect):
+    """An effect of somebody else that cannot say what it does."""
+
+    tag: Literal["broken"] = "broken"
+    plane: ClassVar[Plane] = Plane.ANALOG
+
+    def apply(self, values: Any, context: Any) -> Any:
+        return values
+
+    def marginal(self, model: MarginalModel, maps: Any) -> MarginalModel:
+        raise IndexError("list index out of range")
+
+
+class Wide(Broken):
+    """Variance in e-^2 that grows with the pixel's own exposure."""
+
+    tag: Literal["wide"] = "wide"  # type: ignore[assignment]
+
+    def marginal(self, model: MarginalModel, maps: Any) -> MarginalModel:
+        return model.with_variance(e2=0.01 * np.nan_to_num(maps.quanta_exposure))
+
+
+def maps_of(*exposures: float):
+    h = np.array(exposures)
+    return pixel_maps([h, h * 0 + 0.1, h * 0 + 100, h * 0 + 2.5], np.ones(h.size, bool))
+
+
+def test_effects_add_up_in_their_order() -> None:
+    maps = maps_of(1.0, np.nan, 3.0)
+    assert maps.usable.tolist() == [True, False, True]
+    assert np.isnan(maps.bias).tolist() == [False, True, False]
+    model = marginal_model([Wide(), RowNoise(row_noise_dn=0.5), RowNoise(row_noise_dn=1.0)], maps)
+    np.testing.assert_allclose(model.extra_variance_e2, [0.01, 0.0, 0.03])
+    np.testing.assert_allclose(model.extra_variance_dn2, [1.25])
+    assert marginal_model([], maps).neutral
+    assert model_words([RowNoise(row_noise_dn=0.5), Wide()]) == "PCD + row_noise + wide"
+    assert model_words([]) == "PCD"
+
+
+def test_an_effect_that_raises_is_named() -> None:
+    with pytest.raises(
+        ConfigError, match=r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
+    ):
+        marginal_model([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
+
+
+def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
+    pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0], 11.0, 0.3)
+    histogram = {
+        "counts": pixels.counts.reshape(2, 2, -1),
+        "origin": pixels.origin.reshape(2, 2).astype(np.int32),
+        "under": np.zeros((2, 2), np.uint32),
+        "over": np.zeros((2, 2), np.uint32),
+    }
+    plain = fit_tile(histogram, FitSettings(), None)
+    again = fit_tile(histogram, FitSettings(), None, ())
+    for name, values in plain.items():
+        np.testing.assert_array_equal(again[name], values)
+    trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
+    grown = fit_tile(histogram, FitSettings(), None, [RowNoise(row_noise_dn=1.0), trap])
+    assert set(grown) == {variable.name for variable in variables_of("fit")}
+    for variable in variables_of("fit"):
+        assert grown[variable.name].dtype == np.dtype(variable.dtype), variable.name
+        assert grown[variable.name].shape[:2] == (2, 2), variable.name
+    # the pixel's own noise is what the rows leave of it
+    expected = plain["read_noise_dn"] ** 2 - 1.0
+    np.testing.assert_allclose(grown["read_noise_dn"] ** 2, expected, rtol=2e-3)
+    np.testing.assert_allclose(grown["bias"], plain["bias"], atol=0.01)
+    assert not grown["lobe_weight"].any()
+    assert np.isnan(grown["lobe_amplitude_e"]).all()
