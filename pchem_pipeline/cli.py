@@ -225,7 +225,7 @@ def status(target: Target) -> None:
     from pchem_pipeline.stages.session import find_run, run_status
 
     for state in run_status(find_run(target)):
-        typer.echo(f"{state.stage:<10} {state.words()}")
+        typer.echo(f"{state.stage:<11} {state.words()}")
 
 
 @app.command()

@@ -32,6 +32,7 @@ _MOST_HYPOTHESES = 6  # of one effect
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 _LARGEST_STEP = 30.0
+_CHANCE, _CERTAIN = 2.0, 4.0
 
 
 def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
@@ -198,7 +199,7 @@ class Laboratory:
     def _shift(self, effect: Effect, vector: Vector) -> FloatArray:
         """Return what an effect does; for counts of rare events the mean instead of what happened to come."""
         assert self._base is not None
-        shift = self._row(vector) - self._base
+        shift = _without_chance(self._row(vector) - self._base)
         pairs = int(np.sum(np.diff(self.acquisition.numbers) == 1))
         for name, mean in effect.counted(pairs).items():
             if name in self.names:
@@ -213,6 +214,16 @@ class Laboratory:
             f"{type(error).__name__}: {error}" if not isinstance(error, PchEmError) else str(error)
         )
         _log.warning("effect %s left out: %s", tag, self.left_out[tag])
+
+
+def _without_chance(shift: FloatArray) -> FloatArray:
+    """Return a fingerprint without what is likely chance: 0 below 2 standard deviations, all of it above 4.
+
+    The random numbers are shared with the model without the effect, but where every sample moves a little the
+    histograms are drawn anew; regressed on such chance, every strength would come out too low.
+    """
+    weight = np.clip((np.abs(shift) - _CHANCE) / (_CERTAIN - _CHANCE), 0.0, 1.0)
+    return np.asarray(shift * weight)
 
 
 @dataclass

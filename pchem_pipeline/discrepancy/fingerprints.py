@@ -17,7 +17,7 @@ from scipy import linalg, optimize
 
 from pchem_pipeline.effects.base import Effect
 
-__all__ = ["Hypothesis", "Noise", "SetFit", "fit_set", "log_density", "tolerance"]
+__all__ = ["Hypothesis", "Noise", "SetFit", "correction", "fit_set", "log_density", "tolerance"]
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +25,7 @@ _REWEIGHTINGS = 3
 _LEAK = 0.1
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
 _NEXT_TO_NOTHING = 1e-3
+_LARGEST_CORRECTION = 0.4
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,22 @@ class SetFit:
         factor = linalg.cholesky(noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0)), lower=True)
         white = linalg.solve_triangular(factor, mine.sum(axis=0) - theirs.sum(axis=0), lower=True)
         return float(np.sqrt(white @ white))
+
+
+def correction(parts: FloatArray, residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Return relative changes of the strengths that a residual asks for, and standard errors, (e,) each.
+
+    Args:
+        parts: shifts of the statistics by effect, shape (e, m).
+        residual: what the model with all effects leaves, shape (m,).
+        noise: of the residual.
+    """
+    factor = linalg.cholesky(noise.of(parts), lower=True)
+    design = linalg.solve_triangular(factor, parts.T, lower=True)
+    target = linalg.solve_triangular(factor, residual, lower=True)
+    change = np.linalg.lstsq(design, target, rcond=None)[0]
+    stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
+    return np.clip(change, -_LARGEST_CORRECTION, _LARGEST_CORRECTION), stderr
 
 
 def tolerance(parts: FloatArray, model_error: float) -> FloatArray:

@@ -7,7 +7,7 @@ absorbs is absorbed in them too.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,10 @@ class NullModel:
             covariance *= np.outer(pooled / std, pooled / std)
             std, tests = pooled, before.effective_tests
         return cls(names, mean, std, covariance, vectors, tests)
+
+    def shifted(self, shift: FloatArray) -> NullModel:
+        """Return the null of a model that gives ``shift`` more, shape (m,)."""
+        return replace(self, mean=self.mean + shift, replicates=self.replicates + shift)
 
     @property
     def n_replicates(self) -> int:

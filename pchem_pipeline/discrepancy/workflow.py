@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
 from pchem_pipeline.discrepancy.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, tolerance
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, correction, fit_set, tolerance
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
@@ -40,6 +40,9 @@ _FEWEST_PIXELS = 32
 _REFINEMENTS = 4
 _CLOSE = 0.02  # relative: strengths known so well are not simulated again
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
+_TELLING = (
+    4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
+)
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
@@ -115,9 +118,9 @@ class _Search:
         classes = candidate_classes(self.settings)
         train, test, final = (self._observe(part) for part in self._parts())
         self._check(train)
-        maps = train.maps
-        if self.model:
-            maps = refit_maps(self.stack[self.splits.train], maps, self.model).maps
+        # parameters of a third of the frames scatter too much to stand for the pixels
+        plain = self._observe(self._seen()).maps
+        maps = refit_maps(self.stack[self._seen()], plain, self.model).maps if self.model else plain
         null, names = self._null(maps, "r0", self.settings.replicates, (train, test, final))
         z = Measured(*(self._row(evidence, names) for evidence in (train, test, final)))
         first = null
@@ -135,12 +138,15 @@ class _Search:
             if choice is None:
                 break
             added = self._added(laboratory, choice, shifts, self._noise(null, 2, z))
-            self.model = (*self.model, *(h.effect for h in added.hypotheses))
-            refit = refit_maps(self.stack[self.splits.train], train.maps, self.model)
-            maps = refit.maps
+            before, self.model = self.model, (*self.model, *(h.effect for h in added.hypotheses))
+            maps = refit_maps(self.stack[self._seen()], plain, self.model).maps
             grown, _ = self._null(
                 maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), first
             )
+            added, grown = self._corrected(added, null, grown, z)
+            self.model = (*before, *(h.effect for h in added.hypotheses))
+            refit = refit_maps(self.stack[self._seen()], plain, self.model)
+            maps = refit.maps
             rounds.append(Round(choice, added, tuple(hypotheses), null, grown, refit.moved))
             null = grown
             still = disagrees(null, z, limit, self._tolerance(rounds))
@@ -150,6 +156,10 @@ class _Search:
 
     def _parts(self) -> tuple[NDArray[np.int64], ...]:
         return self.splits.train, self.splits.test, self.splits.final
+
+    def _seen(self) -> NDArray[np.int64]:
+        """Return the positions of the train and test frames."""
+        return np.sort(np.concatenate([self.splits.train, self.splits.test]))
 
     def _observe(self, part: NDArray[np.int64]) -> Evidence:
         return observe(
@@ -278,6 +288,24 @@ class _Search:
             Hypothesis(h.rescaled(float(c)), h.fingerprint * c) for h, c in zip(chosen, near, strict=True)
         ]
         return SetFit(tuple(last), np.ones(len(last)), fit.stderr / near)
+
+    def _corrected(
+        self, added: SetFit, null: NullModel, grown: NullModel, z: Measured
+    ) -> tuple[SetFit, NullModel]:
+        """Correct the strengths by the mean of the replicates, of which one simulation was but a sample."""
+        total = added.parts.sum(axis=0)
+        moved = np.abs(total) > _TELLING
+        ratio = np.where(moved, (grown.mean - null.mean) / np.where(moved, total, 1.0), 1.0)
+        parts = added.parts * np.clip(ratio, 0.5, 2.0)
+        noise = Noise(grown.covariance * (0.5 + 1.0 / grown.n_replicates), _FINE_ERROR)
+        change, stderr = correction(parts, z.both - grown.mean, noise)
+        change *= np.array([bool(h.effect.strength) for h in added.hypotheses])
+        new = tuple(
+            Hypothesis(h.rescaled(1.0 + float(c)), part * (1.0 + c))
+            for h, part, c in zip(added.hypotheses, parts, change, strict=True)
+        )
+        fit = SetFit(new, np.ones(len(new)), stderr / (1.0 + change))
+        return fit, grown.shifted(np.sum(parts * change[:, None], axis=0))
 
     def _result(
         self,

@@ -14,7 +14,7 @@ CAMERA = """
 run: {store: run.zarr, tile: 8}   # small tiles
 simulate:
   shape: [16, 16]
-  n_frames: 900
+  n_frames: 1800
   seed: 5
   output: frames
   format: npy
@@ -126,7 +126,7 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, tmp_path, moment)
     ("old", "new", "message"),
     [
         ("[row_noise, frame_noise]", "[row_nois]", "unknown effects row_nois"),
-        ("n_frames: 900", "n_frames: 500", "take more frames"),
+        ("n_frames: 1800", "n_frames: 500", "take more frames"),
         ("shape: [16, 16]", "shape: [4, 4]", "fewer than 32"),
     ],
 )
