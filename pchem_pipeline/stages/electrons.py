@@ -1,7 +1,8 @@
 """Stage ``electrons``: the stack of electron numbers, any number of frames, band by band.
 
 Each sample becomes the electron number of largest membership under its pixel's parameters (Hendrickson et al.
-2023, eq. demarg_K_eqn). It is not part of ``run``, since the result is as large as the stack.
+2023, eq. demarg_K_eqn), those of the nearest PCD where the fit held effects. It is not part of ``run``, since
+the result is as large as the stack.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.errors import InputError
 from pchem_pipeline.model.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.fitted_model import deciding_maps, fitted_effects
 from pchem_pipeline.stages.frame_source import open_source, read_ahead
 from pchem_pipeline.stages.tile_bands import tile_bands
 from pchem_pipeline.variables import PARAMETERS
@@ -88,7 +90,8 @@ def run(context: StageContext) -> None:
 def _do_band(band: Band, *, store: Path, source: FrameSource, depth: int) -> dict[str, Any]:
     opened = open_store(store)
     rows = slice(band.y0, band.y1)
-    parameters = tuple(opened.read(f"fit/{name}", (rows, slice(None))) for name in PARAMETERS)
+    maps = [opened.read(f"fit/{name}", (rows, slice(None))) for name in PARAMETERS]
+    parameters = deciding_maps(maps, fitted_effects(opened))
     start = 0
     for frames in read_ahead(source, (band.y0, band.y1), depth):
         stop = start + frames.shape[0]

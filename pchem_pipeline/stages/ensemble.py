@@ -24,7 +24,7 @@ from pchem_pipeline.model.pixels import PixelParameters
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.ensemble_result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble_tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
-from pchem_pipeline.stages.fitted_model import fitted_effects
+from pchem_pipeline.stages.fitted_model import deciding_maps, fitted_effects
 from pchem_pipeline.stages.frame_source import open_source
 from pchem_pipeline.stages.tile_bands import tile_bands
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS
@@ -198,7 +198,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
-    errors = _compare(job, band, maps) if job.truth is not None else {}
+    errors = _compare(job, band, deciding_maps(maps, job.effects)) if job.truth is not None else {}
     for key in band.keys:
         number, tile = job.tiles[key]
         part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))

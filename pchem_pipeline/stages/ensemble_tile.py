@@ -20,6 +20,7 @@ from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
 from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, ensemble_sums, tally
 from pchem_pipeline.model.grown_ensemble import grown_sums
 from pchem_pipeline.model.pixels import FloatArray, PixelParameters
+from pchem_pipeline.stages.fitted_model import deciding_maps
 
 __all__ = ["ERROR_SIZES", "EnsembleAxes", "EnsembleTotals", "PixelHistograms", "ensemble_tile"]
 
@@ -163,6 +164,7 @@ def ensemble_tile(
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)
     pixels, mask = PixelParameters.from_maps(maps)
+    deciding = PixelParameters(*deciding_maps(pixels.columns(), effects))
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
     chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
@@ -170,10 +172,12 @@ def ensemble_tile(
     pairs = np.stack([samples, samples_all], axis=1)
     for n, n_all in np.unique(pairs, axis=0):
         group = (samples == n) & (samples_all == n_all)
-        part = PixelParameters(*(column[group] for column in pixels.columns()))
+        part, decider = (
+            PixelParameters(*(column[group] for column in each.columns())) for each in (pixels, deciding)
+        )
         sets = (chosen.of(group), int(n)), (everything.of(group), int(n_all))
         if n > 0:
-            _add_group(part, origin[group], *sets, axes, integers, floats)
+            _add_group(part, decider, origin[group], *sets, axes, integers, floats)
             if effects:
                 own = None if lobes is None else (lobes[0][mask][group], lobes[1][mask][group])
                 _add_grown(part, own, int(n), axes, effects, floats)
@@ -206,6 +210,7 @@ def _add_grown(
 
 def _add_group(
     pixels: PixelParameters,
+    deciding: PixelParameters,
     origin: NDArray[np.integer[Any]],
     chosen: tuple[PixelHistograms, int],
     everything: tuple[PixelHistograms, int],
@@ -213,12 +218,12 @@ def _add_group(
     integers: NDArray[np.int64],
     floats: FloatArray,
 ) -> None:
-    """Add pixels that have the same number of samples."""
+    """Add pixels that have the same number of samples; ``deciding`` gives their electron numbers."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
     data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
     data_all = tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
-    numbers, beyond = electron_counts(histograms.counts, origin, pixels, axes.n_k)
-    cells = cell_probabilities(pixels, axes.n_k)
+    numbers, beyond = electron_counts(histograms.counts, origin, deciding, axes.n_k)
+    cells = cell_probabilities(deciding, axes.n_k)
     outside = int(histograms.outside.sum())
     tallies: dict[str, NDArray[np.int64] | int] = {
         "counts": data.raw,

@@ -1,16 +1,24 @@
-"""The effects with which the maps of a run were fitted, whatever its configuration says by now."""
+"""The model with which the maps of a run were fitted, whatever its configuration says by now."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.settings import ModelSettings
+from pchem_pipeline.model.grown_electrons import nearest_pcd
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
     from pchem_pipeline.effects.base import Effect
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["fitted_effects"]
+__all__ = ["deciding_maps", "fitted_effects"]
 
 
 def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
@@ -22,3 +30,21 @@ def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
     record = store.records.read("fit")
     settings = {} if record is None else record.content.get("settings", {}).get("model") or {}
     return ModelSettings.model_validate(settings).effects
+
+
+def deciding_maps(
+    maps: Sequence[NDArray[np.float64]], effects: Sequence[Effect]
+) -> tuple[NDArray[np.float64], ...]:
+    """Return the parameters with which electron numbers are decided: the maps themselves without effects.
+
+    Args:
+        maps: fitted (H, g, mu, sigma), each of the same shape; NaN where the fit failed.
+        effects: with which they were fitted.
+
+    Returns:
+        The four, in that shape; with effects those of the nearest PCD.
+    """
+    if not effects:
+        return tuple(maps)
+    model = marginal_model(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)))
+    return tuple(values.reshape(maps[0].shape) for values in nearest_pcd(list(maps), model))

@@ -32,7 +32,7 @@ def configured(folder: Path, effects: list[dict[str, Any]], tile: int = 8) -> Pa
             "seed": 3,
             "format": "npy",
             "effects": EFFECTS,
-            "truth_frames": 0,
+            "truth_frames": 500,
         },
         "model": {"effects": effects},
         "compute": {"backend": "serial"},
@@ -125,6 +125,17 @@ def test_ensemble_is_predicted_with_the_grown_law(both) -> None:
     terms = ("variance_of_bias", "variance_of_signal", "mean_read_variance", "mean_shot_variance")
     total = sum(rows[name]["predicted"] for name in (*terms, "bias_signal_covariance", "effects"))
     assert total == pytest.approx(rows["variance"]["predicted"], rel=1e-12)
+
+
+def test_electron_numbers_err_as_often_as_predicted(both) -> None:
+    path, before = both
+    facts, old = dict(RunStore.open(path.parent / "run.zarr").attributes("ensemble")), before["facts"]
+    expected, rate, stderr = (
+        facts[name] for name in ("expected_error_rate", "error_rate", "error_rate_stderr")
+    )
+    assert abs(rate - expected) < 5 * stderr + 0.05 * rate
+    # and no more often than those of the plain fit
+    assert rate <= old["error_rate"] + stderr
 
 
 def test_report_names_the_model(both) -> None:

@@ -13,9 +13,11 @@ from pchem_pipeline.effects.analog.rts_noise import RtsNoise
 from pchem_pipeline.effects.base import Effect, Plane
 from pchem_pipeline.effects.compose import marginal_model, model_words, pixel_maps
 from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.model.grown_electrons import nearest_pcd
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.fit import fit_tile
+from pchem_pipeline.stages.fitted_model import deciding_maps
 from pchem_pipeline.variables import variables_of
 
 
@@ -89,3 +91,29 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
     np.testing.assert_allclose(grown["bias"], plain["bias"], atol=0.01)
     assert not grown["lobe_weight"].any()
     assert np.isnan(grown["lobe_amplitude_e"]).all()
+
+
+def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> None:
+    columns = [
+        np.array([2.0, np.nan]),
+        np.array([0.1, np.nan]),
+        np.array([100.0, np.nan]),
+        np.array([2.5, np.nan]),
+    ]
+    model = MarginalModel().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
+    model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02).with_noise(
+        [0.5, 0.5], shift_dn=[-1.0, 2.0]
+    )
+    exposure, gain, bias, sigma = nearest_pcd(columns, model)
+    # near k = H: levels 100 + 10 (0.98 k (1 + 0.01 (k - 1)) + 0.1) + 0.5
+    levels = [100 + 10 * (0.98 * k * (1 + 0.01 * (k - 1)) + 0.1) + 0.5 for k in (1.9, 2.0, 2.1)]
+    assert exposure[0] == 2.0
+    assert 1 / gain[0] == pytest.approx((levels[2] - levels[0]) / 0.2)
+    assert bias[0] + 2.0 / gain[0] == pytest.approx(levels[1])
+    # lobes at -1 and 2 DN have the variance 2.25; the electrons' in e-^2 counts a hundredfold in DN^2
+    assert sigma[0] ** 2 == pytest.approx(2.5**2 + 1.0 + 2.25 + 100 * (0.01 + 0.01 + 0.004))
+    assert np.isnan([gain[1], bias[1], sigma[1]]).all()
+    maps = [np.array([[2.0]]), np.array([[0.1]]), np.array([[100.0]]), np.array([[2.5]])]
+    assert deciding_maps(maps, ()) == tuple(maps)
+    wider = deciding_maps(maps, [RowNoise(row_noise_dn=1.0)])
+    np.testing.assert_allclose([w.item() for w in wider], [2.0, 0.1, 100.0, np.hypot(2.5, 1.0)])
