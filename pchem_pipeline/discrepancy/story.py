@@ -26,6 +26,7 @@ __all__ = ["Round", "tell"]
 FloatArray = NDArray[np.float64]
 
 _MOST_PULLS = 12
+_CLEAR_MARGIN = 50.0  # nats
 _MOST_UNEXPLAINED = 8
 #: a named effect must leave less of the gap than this, or the rest must lie below the floor
 _LARGEST_REST = 0.2
@@ -203,7 +204,9 @@ def _ambiguous_set(rivals: Sequence[Rival], certainty: float) -> list[Rival]:
         share += rival.probability / total
         if share >= certainty:
             break
-    return kept
+    # what goes its own way in every simulation is not beaten by a few nats
+    erratic = [r for r in rivals if type(r.hypothesis.effect).erratic and r.score > -_CLEAR_MARGIN]
+    return kept + [r for r in erratic if r not in kept]
 
 
 def _comparisons(

@@ -62,6 +62,7 @@ class BiasJumps(Effect):
         "frame.readout.lag1",
         "time.lag1.readout.mean",
     )
+    erratic: ClassVar[bool] = True
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
