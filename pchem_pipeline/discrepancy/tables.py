@@ -87,8 +87,6 @@ def pixel_laws(
     supports(*np.ascontiguousarray(natural.T), np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
     length = window[:, 1] - window[:, 0] + 1
     good = usable & (length <= LONGEST_SUPPORT)
-    rows = np.where(good, length, 0)
-    start = 1 + np.cumsum(rows) - rows  # row 0 is that of the pixels without a law
     axis, n_codes = _code_axis(window[good])
     coarse = _COARSE
     while n_codes > coarse * _MOST_BINS:
@@ -99,7 +97,7 @@ def pixel_laws(
         moments=np.zeros((n, kernel.N_MOMENTS)),
         scores=np.full((n, 3, N_TESTS), np.nan),
         support=np.tile(np.array([0, 1, 0]), (n, 1)),
-        tables=np.zeros((1 + int(rows.sum()), 2), np.float32),
+        tables=np.zeros((1 + int(length[good].sum()), 2), np.float32),
         first_code=axis,
         codes=np.zeros((4, n_codes)),
         fold=np.zeros(16),
@@ -108,7 +106,7 @@ def pixel_laws(
         bin_covariance=np.zeros((n_bins, n_bins)),
     )
     kernel.summarise_pixels(
-        counts, origin, outside, natural, electrons, window, start, axis, coarse, ALLOWED_BEYOND,
+        counts, origin, outside, natural, electrons, window, axis, coarse, ALLOWED_BEYOND,
         ALLOWED_FAR_BEYOND / max(int(good.sum()), 1),
         laws.moments, laws.scores, laws.good, laws.support, laws.tables, laws.codes,
         laws.fold, laws.fold_covariance, laws.bins, laws.bin_covariance,

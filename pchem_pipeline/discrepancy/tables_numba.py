@@ -232,7 +232,6 @@ def summarise_pixels(
     parameters: FloatArray,
     electrons: IntArray,
     window: IntArray,
-    start: IntArray,
     axis: int,
     coarse: int,
     allowed: float,
@@ -257,7 +256,6 @@ def summarise_pixels(
         parameters: H, 1/g, mu, analog read noise in DN, (n, 4).
         electrons: range of electron numbers, (n, 2).
         window: range of codes of the law, (n, 2).
-        start: first row of each pixel in ``tables``, (n,).
         axis: DN of the first code of ``codes``.
         coarse: codes in a bin of ``bins``.
         allowed: samples expected beyond the support on either side, at most.
@@ -266,7 +264,7 @@ def summarise_pixels(
         scores: standardised score, its skewness and kurtosis excess, (n, 3, N_TESTS).
         good: pixels to do; unset where the parameters cannot be told apart, (n,).
         support: first code and number of codes, and the row of the first one in ``tables``, (n, 3).
-        tables: k and r, centred on the samples, (rows, 2).
+        tables: k and r, centred on the samples, one pixel after the other; enough rows for all, (rows, 2).
         codes: counts, expectation, residual and its variance per DN, (4, n_codes).
         fold: residuals by DN modulo 16, (16,).
         fold_covariance: theirs; only the lower triangle, as of all covariances.
@@ -274,6 +272,7 @@ def summarise_pixels(
         bin_covariance: of the residuals.
     """
     gram = np.empty((N_NUISANCE, N_COLUMNS))
+    used = 1  # row 0 is that of the pixels without a law
     for p in range(counts.shape[0]):
         if not good[p]:
             continue
@@ -314,9 +313,10 @@ def summarise_pixels(
                 out[SEEN_FAR_LOW] += counts[p, b]
             elif at > far_high:
                 out[SEEN_FAR_HIGH] += counts[p, b]
-        support[p, 0], support[p, 1], support[p, 2] = first, size, start[p]
+        support[p, 0], support[p, 1], support[p, 2] = first, size, used
         for x in range(size):
-            tables[start[p] + x, 0], tables[start[p] + x, 1] = table[0, x], table[1, x]
+            tables[used + x, 0], tables[used + x, 1] = table[0, x], table[1, x]
+        used += size
         if first >= axis and first + size <= axis + codes.shape[1]:
             _code_sums(
                 law, seen, expected, table[1] / (width * width + 1.0 / 12.0), inside, first, axis, coarse,

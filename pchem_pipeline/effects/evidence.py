@@ -87,7 +87,8 @@ class TimeSeries:
         column_readout: mean of r of each column, DN, shape (n, x).
         block_charge: mean of k - H of each pixel in each block, e-, shape (n_blocks, y, x).
         block_readout: mean of r of each pixel in each block, DN, shape (n_blocks, y, x).
-        lag_charge: autocorrelation of k in each pixel at lags 1, 2, 3, shape (3, y, x).
+        lag_charge: autocorrelation of k in each pixel at lags 1, 2, 3, after the frame's common mode was
+            removed as for the neighbours, and without the bias of a centred series, shape (3, y, x).
         lag_readout: autocorrelation of r, shape (3, y, x).
         lag_readout_charge: correlation of r at t with k at t - 1, shape (y, x).
         lag_charge_readout: correlation of k at t with r at t - 1, shape (y, x).
@@ -98,8 +99,9 @@ class TimeSeries:
         neighbour_pairs: number of products behind each of them.
         repeated: frame numbers that are, sample by sample, the frame before, shape (n_repeated,).
         repeated_rows: number of rows (of frames not in ``repeated``) that are the same row of the frame
-        before. hits: samples far above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4),
-            at most 20,000.
+            before.
+        hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
+            20,000.
     """
 
     frames: NDArray[np.int64]

@@ -248,7 +248,7 @@ def test_loops_are_the_same_uncompiled() -> None:
         ]  # fmt: skip
         summarise(
             counts, histograms.origin.ravel().astype(np.int64), np.zeros((6, 2)), parameters,
-            np.tile([0, 9], (6, 1)), np.tile([75, 230], (6, 1)), 200 * np.arange(6) + 1, first, 16,
+            np.tile([0, 9], (6, 1)), np.tile([75, 230], (6, 1)), first, 16,
             1e-2, 1e-3, *arrays,
         )  # fmt: skip
         results.append(arrays)
