@@ -156,7 +156,7 @@ def test_export_and_electrons(shell, frames, finished):
     electrons = RunStore.open(shell.folder / "run.zarr").read("electrons/electron_number")
     assert electrons.shape == (1200, 20, 28)
     assert 1 < electrons.mean() < 4
-    assert shell.ok("status", "run.zarr").stdout.splitlines()[-1] == "electrons  complete"
+    assert shell.ok("status", "run.zarr").stdout.splitlines()[-1] == "electrons   complete"
     assert "electrons: complete -> nothing to do" in shell.ok("electrons", "run.zarr", "--dry-run").stderr
 
 
