@@ -148,7 +148,7 @@ class DistributedExecutor:
                 self._client = distributed.Client(self._cluster)
             else:
                 self._cluster = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+                    n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
                 )
                 self._client = distributed.Client(self._cluster)
         except OSError as error:

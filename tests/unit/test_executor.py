@@ -1,4 +1,6 @@
+import contextlib
 import os
+import socket
 import threading
 
 import pytest
@@ -30,6 +32,18 @@ def test_every_backend_reports_values_and_errors_alike(backend):
     assert {item: outcome.value for item, outcome in found.items()} == {1: 1.0, 2: 0.5, 0: None, 4: 0.25}
     assert isinstance(found[0].error, ZeroDivisionError)
     assert "reciprocal" in found[0].trace
+
+
+def test_a_local_cluster_starts_beside_a_busy_dashboard_port_and_listens_on_loopback_only():
+    with socket.socket() as other:
+        with contextlib.suppress(OSError):  # whoever holds the port already serves as well
+            other.bind(("127.0.0.1", 8787))
+            other.listen()
+        executor = make_executor(ComputeSettings(backend="distributed", workers=1))
+        try:
+            assert executor._cluster.scheduler.http_server.address == "127.0.0.1"
+        finally:
+            executor.close()
 
 
 @pytest.mark.parametrize("backend", BACKENDS[:2])
