@@ -135,10 +135,7 @@ class _Search:
         before = meter.gap(arena.problem((), train + test), both.fit)
         found = None
         if self._disagrees(null, z):
-            check = Meter(test, everything, 0.0, self._count, self.rng)
-            floor = check.gap(arena.problem(()), plain.fit).floor
-            chance = check.chance(arena.problem(()), plain.fit) / check.n_samples
-            found = explain(arena, members, floor + chance)
+            found = explain(arena, members, self._count, self.rng)
             left_out |= arena.failed | found.arena.failed
         last = null if found is None or not found.named else self._null(self._hybrid(found), names)[0]
         return tell_histograms(

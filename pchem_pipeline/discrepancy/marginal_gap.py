@@ -79,7 +79,7 @@ class Meter:
         judged = self._judged(problem)
         log_masses = judged.log_masses(fit.theta, fit.shared)
         distance = self._distance(log_masses, self.counts)
-        own = self._by_chance(problem, judged, fit)
+        own = self.by_chance(problem, fit)
         excess = distance - float(own.mean())
         spread = float(np.sqrt(own.var(ddof=1) + self._variance(log_masses)))
         n = self.n_samples
@@ -112,8 +112,9 @@ class Meter:
         sums = (seen * ratio).sum(axis=1)
         return float(max(((seen * ratio**2).sum(axis=1) - sums**2 / total[:, 0]).sum(), 0.0))
 
-    def _by_chance(self, problem: SharedProblem, judged: SharedProblem, fit: SharedFit) -> FloatArray:
-        """Return distances that replicates of the fit have from their own refits, shape (replicates,)."""
+    def by_chance(self, problem: SharedProblem, fit: SharedFit) -> FloatArray:
+        """Return distances that replicates of the fit have from their own refits, nats, (replicates,)."""
+        judged = self._judged(problem)
         tangent = Tangent.at(problem, fit.theta, fit.shared)
         fitted, compared = (
             _frequencies(p.log_masses(fit.theta, fit.shared), p.kept) for p in (problem, judged)
@@ -131,7 +132,7 @@ class Meter:
 
     def chance(self, problem: SharedProblem, fit: SharedFit) -> float:
         """Return what chance contributes to the distance of a fit, nats."""
-        return float(self._by_chance(problem, self._judged(problem), fit).mean())
+        return float(self.by_chance(problem, fit).mean())
 
 
 def _frequencies(log_masses: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:

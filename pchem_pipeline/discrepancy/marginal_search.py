@@ -8,16 +8,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.marginal_gap import Meter
 from pchem_pipeline.discrepancy.marginal_members import Member
 from pchem_pipeline.discrepancy.marginal_sets import (
     SWAPPED,
     Arena,
+    Contest,
     FittedSet,
     compare_sets,
     find_rivals,
     of_best_kind,
 )
-from pchem_pipeline.discrepancy.marginal_views import Interval, electrons_of, find_cut_peak, inside, valleys
+from pchem_pipeline.discrepancy.marginal_views import (
+    Interval,
+    doubtful_peaks,
+    electrons_of,
+    inside,
+    valleys,
+)
 
 __all__ = ["Explanation", "Named", "combs_coincide", "explain"]
 
@@ -26,6 +34,8 @@ FloatArray = NDArray[np.float64]
 _SIGMAS = 3.0
 #: a set must leave less of the gap than this
 LARGEST_REST = 0.2
+_PAYS = 0.5  # of the gap: more must go with a peak that is set aside
+_PEAKS_TRIED = 3
 _COINCIDE = 0.3  # e-
 _STEADY = 4.0  # factor within which a strength must stay when more codes are compared
 
@@ -36,7 +46,7 @@ class Named:
 
     Attributes:
         member: as fitted.
-        stderr: standard error of its strength; what it moves by when more codes are compared counts.
+        apart: by how much its strength differs when fewer codes are compared.
         rivals: sets with another effect in its place, the best first.
         without: the set without it.
         equals: rivals (tags) that do as well within three standard errors.
@@ -44,7 +54,7 @@ class Named:
     """
 
     member: Member
-    stderr: float
+    apart: float
     rivals: tuple[FittedSet, ...]
     without: FittedSet | None
     equals: tuple[str, ...]
@@ -85,32 +95,40 @@ class Explanation:
         return self.set_aside[0] if self.set_aside else None
 
 
-def explain(arena: Arena, candidates: Sequence[Member], floor: float) -> Explanation:
+def explain(
+    arena: Arena, candidates: Sequence[Member], replicates: int, rng: np.random.Generator
+) -> Explanation:
     """Find the effects that explain histograms.
 
     Args:
         arena: with all codes.
         candidates: effects at their starts.
-        floor: gap that chance alone leaves on the scored part, nats per sample.
+        replicates: behind what chance leaves.
+        rng: their random numbers.
     """
     contest = compare_sets(arena, candidates)
-    left, at_first = arena.gap(contest.best), arena.gap(contest.plain)
     nearest = tuple(m.tag for s in contest.fitted[:3] for m in s.members)
-    good = left <= max(floor, LARGEST_REST * at_first)
+    left, floor = _left(arena, contest.best, replicates, rng)
     if left > floor and any(m.tabulated for m in contest.best.members):
         candidates = [c for c in candidates if not c.tabulated]
         contest = compare_sets(arena, candidates)
-        left = arena.gap(contest.best)
-        good = left <= LARGEST_REST * at_first
-    if good and contest.best.members:
+        left, floor = _left(arena, contest.best, replicates, rng)
+    at_first = max(arena.gap(contest.plain), 1e-12)
+    if contest.best.members and left <= max(floor, LARGEST_REST * at_first):
         named = [_named(arena, contest.best, m, candidates) for m in contest.best.members]
         return Explanation(
             arena, arena.kept, (), contest.plain, contest.best, contest.best, _sorted(named), (), nearest,
-            left / max(at_first, 1e-12),
+            left / at_first,
         )  # fmt: skip
     fixed_in_dn = combs_coincide(contest.plain.fit.parameters)
     pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.bends_codes))]
-    return _narrowed(arena, pool, contest.plain, nearest)
+    return _narrowed(arena, pool, contest, nearest)
+
+
+def _left(arena: Arena, best: FittedSet, replicates: int, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the gap that a set leaves on the scored part, and its floor, nats per sample."""
+    gap = Meter(arena.test, arena.kept, 0.0, replicates, rng).gap(arena.problem(best.members), best.fit)
+    return gap.value, gap.floor
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
@@ -124,12 +142,13 @@ def combs_coincide(parameters: FloatArray) -> bool:
 
 
 def _narrowed(
-    arena: Arena, candidates: Sequence[Member], plain: FittedSet, nearest: tuple[str, ...]
+    arena: Arena, candidates: Sequence[Member], whole: Contest, nearest: tuple[str, ...]
 ) -> Explanation:
     """Compare on the codes that are understood, and keep what holds on more of them."""
+    plain = whole.plain
     parameters = plain.fit.parameters
     electrons = electrons_of(arena.origin, arena.train.shape[1], parameters)
-    peak = find_cut_peak(arena, electrons)
+    peak = _cut_peak(arena, electrons, candidates, whole)
     between = valleys(arena, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
     wide = _narrow(arena, ~inside(peak, electrons), parameters)
     view = _narrow(arena, ~inside(peak + between, electrons), parameters)
@@ -145,24 +164,34 @@ def _narrowed(
         there = view.attempt(best.members, start)
         for member in best.members:
             found = _named(view, contest.best, _member(contest.best, member.tag), candidates)
-            named.append(_moved(found, best, member, member if there is None else _member(there, member.tag)))
+            apart = 0.0 if there is None else _apart(member, _member(there, member.tag))
+            named.append(replace(found, member=member, apart=apart))
     return Explanation(
         view, wide.kept, peak, plain, best, contest.best, _sorted(named), tuple(unsteady), nearest, rest
     )
+
+
+def _cut_peak(
+    arena: Arena, electrons: FloatArray, candidates: Sequence[Member], whole: Contest
+) -> tuple[Interval, ...]:
+    """Return the peak without which known effects explain far more, if there is one."""
+    best, found = _PAYS * arena.gap(whole.best) * arena.n_test, None
+    for interval in doubtful_peaks(arena, electrons)[:_PEAKS_TRIED]:
+        view = _narrow(arena, ~interval.holds(electrons), whole.plain.fit.parameters)
+        left = view.gap(compare_sets(view, candidates, largest=2, coarse=True).best) * view.n_test
+        if left < best:
+            best, found = left, interval
+    return () if found is None else (found,)
 
 
 def _member(fitted: FittedSet, tag: str) -> Member:
     return next(m for m in fitted.members if m.tag == tag)
 
 
-def _moved(found: Named, best: FittedSet, member: Member, there: Member) -> Named:
-    """Return an effect as fitted to more codes; the difference from ``there`` is part of its error."""
-    name, stderr = member.effect.strength, found.stderr
-    if name:
-        value, error = (float(v[0]) for v in best.coordinates(member.tag))
-        apart = float(getattr(member.effect, name)) - float(getattr(there.effect, name))
-        stderr = float(np.hypot(member.coordinates[0].error(value, error), apart))
-    return replace(found, member=member, stderr=stderr)
+def _apart(member: Member, there: Member) -> float:
+    """Return how far the strengths of two fits of an effect are apart."""
+    name = member.effect.strength
+    return abs(float(getattr(member.effect, name)) - float(getattr(there.effect, name))) if name else 0.0
 
 
 def _narrow(arena: Arena, kept: NDArray[np.bool_], start: FloatArray) -> Arena:
@@ -227,12 +256,8 @@ def _named(arena: Arena, best: FittedSet, member: Member, candidates: Sequence[M
         rise, error = arena.difference(best, rival)
         if rise < _SIGMAS * error:
             equals += [tag for tag in rival.tags - best.tags if tag not in equals]
-    stderr = float("nan")
-    if member.effect.strength:
-        value, error_ = (float(v[0]) for v in best.coordinates(member.tag))
-        stderr = member.coordinates[0].error(value, error_)
     weight = arena.difference(best, without)[0] if without else 0.0
-    return Named(member, stderr, tuple(rivals), without, tuple(equals), weight)
+    return Named(member, 0.0, tuple(rivals), without, tuple(equals), weight)
 
 
 def _sorted(named: Sequence[Named]) -> tuple[Named, ...]:

@@ -7,11 +7,13 @@ error of a difference of scores is that of a mean of independent samples (Vuong 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from pchem_pipeline.discrepancy.marginal_members import Member, law_of
 from pchem_pipeline.effects.base import Effect
@@ -69,6 +71,29 @@ def saturated(counts: IntArray, kept: NDArray[np.bool_]) -> FloatArray:
     seen = np.where(kept, counts, 0).astype(np.float64)
     total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)
     return np.asarray((seen * np.log(np.maximum(seen, 1.0) / total)).sum(axis=1))
+
+
+def chance_of_cells(expected: FloatArray) -> float:
+    """Return the mean of ``sum n log(n / e)`` for Poisson counts n of expectation e, nats.
+
+    It is 1/2 per cell where many counts are expected, and less where few are.
+    """
+    grid, values = _chance_table()
+    some = expected[expected > 0.0]
+    found = np.interp(np.log(np.maximum(some, 1e-300)), grid, values)
+    few = some < np.exp(grid[0])
+    found[few] = -some[few] * np.log(some[few])
+    return float(found.sum())
+
+
+@functools.cache
+def _chance_table() -> tuple[FloatArray, FloatArray]:
+    """Return log e and the mean of ``n log(n / e)``, from 1e-6 to 1e3 (1/2 beyond)."""
+    expected = np.geomspace(1e-6, 1e3, 600)
+    n = np.arange(1, 1500)
+    log_mass = n * np.log(expected[:, None]) - expected[:, None] - special.gammaln(n + 1.0)
+    values = (np.exp(log_mass) * n * (np.log(n) - np.log(expected[:, None]))).sum(axis=1)
+    return np.log(expected), np.asarray(values, np.float64)
 
 
 @dataclass(frozen=True)
@@ -198,8 +223,12 @@ class Arena:
         return float(sums.sum()), float(np.sqrt(max(variance.sum(), 0.0)))
 
     def gap(self, found: FittedSet) -> float:
-        """Return the distance of the scored part from the set, nats per sample that counts."""
-        return float(saturated(self.test, self.kept).sum() - found.score) / max(self.n_test, 1.0)
+        """Return the distance of the scored part from the set beyond chance, nats per sample that counts."""
+        total = np.where(self.kept, self.test, 0).sum(axis=1, keepdims=True)
+        chance = chance_of_cells(np.where(self.kept, np.exp(found.log_masses), 0.0) * total)
+        # a fitted parameter costs half a nat on samples that were not fitted; the fixed total saves as much
+        chance += 0.5 * (3.0 * total.size + found.fit.shared.size)
+        return float(saturated(self.test, self.kept).sum() - found.score - chance) / max(self.n_test, 1.0)
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
         """Return candidates, each moved by a first-order step, by the rise that this step promises."""

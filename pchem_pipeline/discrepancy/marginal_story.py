@@ -211,7 +211,7 @@ class _Teller:
             candidates=candidates
             if alone
             else tuple(c for c in candidates if c.effect.tag in (member.tag, *named.equals)),
-            strength_stderr=named.stderr,
+            strength_stderr=_stderr(grown, member, named.apart),
             before=before,
             after=after,
             runner_up=runner_up,
@@ -263,6 +263,14 @@ class _Teller:
         return tuple(Pull(first.names[i], float(before[i]), float(after[i])) for i in telling)
 
 
+def _stderr(grown: FittedSet, member: Member, apart: float) -> float:
+    """Return the standard error of a strength: of the fit, and what the choice of the codes makes of it."""
+    if not member.effect.strength:
+        return float("nan")
+    value, error = (float(v[0]) for v in grown.coordinates(member.tag))
+    return float(np.hypot(member.coordinates[0].error(value, error), apart))
+
+
 def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
     """Return how far the parameters of the pixels moved: median, and in standard errors."""
     change = after.fit.parameters - before.fit.parameters
@@ -296,6 +304,9 @@ def _sentence(
 ) -> str:
     titles = [type(s.effect).title or s.effect.tag for s in steps if s.effect is not None]
     left = f"; what is left: {closing(residuals)}" if residuals else ""
+    if found is not None and found.unsteady:
+        stand_ins = ", ".join(m.tag for m in found.unsteady)
+        left += f"; {stand_ins} would describe a part of it, but not on all codes alike, and is not named"
     if verdict == "consistent":
         return "The histograms agree with the model in every statistic tested."
     if verdict == "unexplained":

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.marginal_sets import Arena, saturated
 
-__all__ = ["Interval", "electrons_of", "find_cut_peak", "inside", "valleys"]
+__all__ = ["Interval", "doubtful_peaks", "electrons_of", "inside", "valleys"]
 
 FloatArray = NDArray[np.float64]
 
@@ -23,7 +23,6 @@ _RESOLVED = 0.3  # e-: read noise above which there are no valleys
 _HALF_PEAK = 0.25  # e-: half width of what counts as a peak
 _MOST_SHARE = 0.3  # of the samples that may be set aside
 _LEAST_SHARE = 1e-3
-_PAYS = 0.5  # share of the gap that must go with a peak
 
 
 @dataclass(frozen=True)
@@ -57,30 +56,25 @@ def inside(intervals: tuple[Interval, ...], electrons: FloatArray) -> NDArray[np
     return found
 
 
-def find_cut_peak(arena: Arena, electrons: FloatArray) -> tuple[Interval, ...]:
-    """Return the peak without which the plain law fits far better, if there is one of few samples.
+def doubtful_peaks(arena: Arena, electrons: FloatArray) -> list[Interval]:
+    """Return peaks of few samples, those first without which the plain law fits best.
 
     Args:
         arena: with all codes.
         electrons: place of every code, e-, shape (n, B).
     """
     total = float(arena.train.sum())
-    whole = _gap(arena, arena.kept)
     cumulative = [float(arena.train[electrons < k + 0.5].sum()) / total for k in range(_last(electrons) + 1)]
-    best = (1.0 - _PAYS) * whole
-    found: tuple[Interval, ...] = ()
+    ranked: list[tuple[float, Interval]] = []
     for k, below in enumerate(cumulative):
         before = cumulative[k - 1] if k else 0.0
         candidates = {Interval(None if k == 0 else k - 0.5, k + 0.5): below - before}
-        if k and before < 1.0 - _LEAST_SHARE:
+        if k:
             candidates[Interval(k - 0.5, None)] = 1.0 - before
         for interval, share in candidates.items():
-            if not _LEAST_SHARE < share < _MOST_SHARE:
-                continue
-            left = _gap(arena, arena.kept & ~interval.holds(electrons))
-            if left < best:
-                best, found = left, (interval,)
-    return found
+            if _LEAST_SHARE < share < _MOST_SHARE:
+                ranked.append((_gap(arena, arena.kept & ~interval.holds(electrons)), interval))
+    return [interval for _, interval in sorted(ranked, key=lambda pair: pair[0])]
 
 
 def valleys(arena: Arena, electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:

@@ -17,13 +17,22 @@ from scipy.special import chdtrc, chdtri
 
 from pchem_pipeline.model import grown_numba, grown_scan_numba, grown_tile_numba
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
+from pchem_pipeline.model.grown_cells_numba import EXACT, NEAR
 from pchem_pipeline.model.grown_inputs import HasParameters, Parameters, columns_of, lobes_of, pack
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.pchem import FitResult
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.model.start import kernel_counts, starting_points
 
-__all__ = ["GrownFit", "HasParameters", "fit_grown", "lobe_threshold", "log_likelihood", "marginal_mass"]
+__all__ = [
+    "GrownFit",
+    "HasParameters",
+    "fit_grown",
+    "lobe_threshold",
+    "log_likelihood",
+    "marginal_mass",
+    "marginal_slopes",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -169,6 +178,7 @@ def marginal_mass(
     codes: ArrayLike,
     *,
     lobes: tuple[ArrayLike, ArrayLike] | None = None,
+    far_tails: bool = True,
 ) -> FloatArray:
     """Return the probability of each code in each pixel, exact to the ends of the tails.
 
@@ -177,6 +187,7 @@ def marginal_mass(
         maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
         lobes: as in :func:`log_likelihood`.
+        far_tails: also what is below 1e-50, which takes several times as long.
 
     Returns:
         P(x), shape (n, n_codes); NaN where a parameter is.
@@ -192,8 +203,31 @@ def marginal_mass(
     out = np.full((n, wanted.shape[1]), np.nan)
     if out.size:
         first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
-        grown_tile_numba.mass_tile(first, columns, lobes_of(maps, lobes, n), pack(model, n), out)
+        stage = EXACT if far_tails else NEAR
+        grown_tile_numba.mass_tile(first, columns, lobes_of(maps, lobes, n), pack(model, n), stage, out)
     return out
+
+
+def marginal_slopes(
+    model: MarginalModel, maps: Parameters, first: NDArray[np.integer], n_codes: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the probability of successive codes down to 1e-50, and its slopes.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels.
+        first: first code of each pixel, DN, shape (n,).
+        n_codes: number of codes.
+
+    Returns:
+        P(x), shape (n, n_codes), and its derivatives in log H, 1/g, mu and log sigma_R^2, (n, 4, n_codes).
+    """
+    columns = columns_of(maps)
+    n = columns.shape[0]
+    mass, slopes = np.full((n, n_codes), np.nan), np.full((n, 4, n_codes), np.nan)
+    start = np.ascontiguousarray(first, np.int64)
+    grown_tile_numba.slope_tile(start, columns, lobes_of(maps, None, n), pack(model, n), NEAR, mass, slopes)
+    return mass, slopes
 
 
 class _Found(NamedTuple):

@@ -40,6 +40,8 @@ from pchem_pipeline.model.grown_types_numba import (
 _REACH = (8.5, 15.0, FARTHEST)
 _CUT = (1e-17, 1e-50, 1e-305)
 _OUTLIER = (1e-9, 1e-40, 0.0)
+#: Stages that :func:`all_masses` goes to at once.
+NEAR, EXACT = 1, 2
 _LEAST_MASS = 1e-300
 _LEAST_VARIANCE = 1e-6  # DN^2
 
@@ -205,9 +207,9 @@ def near_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) 
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def all_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> None:
-    """Fill mass and slopes of the cells, to the ends of the tails."""
-    _add_masses(theta, cells, law, _REACH[2], _CUT[2], room)
+def all_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room, stage: int) -> None:
+    """Fill mass and slopes of the cells, to the ends of the tails (stage 2) or as far as 1e-50 (stage 1)."""
+    _add_masses(theta, cells, law, _REACH[stage], _CUT[stage], room)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")

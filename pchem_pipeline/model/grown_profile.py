@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model import grown_tile_numba
 from pchem_pipeline.model.grown import GrownFit, fit_grown, marginal_mass
+from pchem_pipeline.model.grown_cells_numba import EXACT
 from pchem_pipeline.model.grown_inputs import Parameters, columns_of, lobes_of, pack
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.settings import FitSettings
@@ -196,7 +197,7 @@ def _own_slopes(
     columns = np.ascontiguousarray(columns_of(fit)[keep])
     lobes = np.ascontiguousarray(lobes_of(fit, None, fit.bias.size)[keep])
     first = np.ascontiguousarray(codes[:, 0])
-    grown_tile_numba.slope_tile(first, columns, lobes, pack(model, keep.size), mass, slopes)
+    grown_tile_numba.slope_tile(first, columns, lobes, pack(model, keep.size), EXACT, mass, slopes)
     return mass, slopes
 
 

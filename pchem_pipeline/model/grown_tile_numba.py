@@ -221,6 +221,7 @@ def mass_tile(
     parameters: NDArray[np.float64],
     lobes: NDArray[np.float64],
     law: Law,
+    stage: int,
     out: NDArray[np.float64],
 ) -> None:
     """Fill the mass of successive codes of every pixel whose parameters are finite.
@@ -230,6 +231,7 @@ def mass_tile(
         parameters: (H, g, mu, sigma), shape (n, 4).
         lobes: amplitude (e-) and weight of each pixel's free lobes, shape (n, 2).
         law: grown model.
+        stage: how far the tails go, see ``all_masses``.
         out: out, shape (n, n_codes); comes as NaN.
     """
     n_codes = out.shape[1]
@@ -243,7 +245,7 @@ def mass_tile(
         cells = make_cells(law, pixel, lobes[pixel, 0], first[pixel], centre, n_codes, space)
         to_theta(parameters[pixel], centre, cells, law, True, theta)
         theta[LOBE] = lobes[pixel, 1]
-        all_masses(theta, cells, law, room)
+        all_masses(theta, cells, law, room, stage)
         for i in range(n_codes):
             out[pixel, i] = room.mass[i]
 
@@ -254,6 +256,7 @@ def slope_tile(
     parameters: NDArray[np.float64],
     lobes: NDArray[np.float64],
     law: Law,
+    stage: int,
     out: NDArray[np.float64],
     slopes: NDArray[np.float64],
 ) -> None:
@@ -264,6 +267,7 @@ def slope_tile(
         parameters: (H, g, mu, sigma), shape (n, 4).
         lobes: amplitude (e-) and weight of each pixel's free lobes, shape (n, 2).
         law: grown model.
+        stage: how far the tails go, see ``all_masses``.
         out: out, shape (n, n_codes); comes as NaN.
         slopes: out, shape (n, 4, n_codes); comes as NaN.
     """
@@ -276,7 +280,7 @@ def slope_tile(
         cells = make_cells(law, pixel, lobes[pixel, 0], first[pixel], first[pixel], n_codes, space)
         to_theta(parameters[pixel], first[pixel], cells, law, True, theta)
         theta[LOBE] = lobes[pixel, 1]
-        all_masses(theta, cells, law, room)
+        all_masses(theta, cells, law, room, stage)
         for i in range(n_codes):
             out[pixel, i] = room.mass[i]
             for j in range(4):

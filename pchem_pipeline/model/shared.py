@@ -1,9 +1,9 @@
 """Maximum likelihood of the pixels' four parameters together with parameters that all pixels share.
 
 Scoring steps (Fisher 1935) with a damping (Levenberg 1944) on the exact masses of the codes
-(:func:`~pchem_pipeline.model.grown.marginal_mass`); derivatives are differences of masses, so any law will
-do. The information matrix has an arrow shape, a 4 x 4 block per pixel and one border for what they share, so
-a step costs no more than the pixels' own.
+(:func:`~pchem_pipeline.model.grown.marginal_mass`); derivatives in what the pixels share are differences of
+masses, so any law will do. The information matrix has an arrow shape, a 4 x 4 block per pixel and one border
+for what they share, so a step costs no more than the pixels' own.
 
 Codes may be left out, pixel by pixel: the likelihood is then conditional on the other codes, so that what is
 not understood in one place (a cut, a contamination) does not bend the parameters found in another.
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.grown import marginal_mass
+from pchem_pipeline.model.grown import marginal_mass, marginal_slopes
 from pchem_pipeline.model.marginal import MarginalModel
 
 __all__ = ["SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared", "to_parameters", "to_theta"]
@@ -27,9 +27,10 @@ FloatArray = NDArray[np.float64]
 Law = Callable[[FloatArray, FloatArray], MarginalModel]
 
 _ROUNDING = 1.0 / 12.0
-_LEAST_MASS = 1e-300
+_LEAST_MASS = 1e-60
 _STEP = 1e-5  # of the differences, in units of the parameters' natural scale
 _REACH_EXPOSURE, _REACH_STEP = 2.0, 0.3  # logarithms
+_LOG_16 = float(np.log(16.0))  # a read noise of a quarter of a step
 _LOWEST_LOG_VARIANCE = float(np.log(1e-4))
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e8
 
@@ -63,7 +64,7 @@ class SharedProblem:
         """Return the mass of every code, those left out included, shape (n, B)."""
         own = to_parameters(theta)
         codes = self.origin[:, None] + np.arange(self.counts.shape[1])
-        return marginal_mass(self.law(shared, own), list(own.T), codes)
+        return marginal_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
 
     def log_masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the logarithm of the mass given that the code is kept, shape (n, B); 0 where it is not."""
@@ -155,7 +156,9 @@ def fit_shared(
         if not active.any():
             break
         trial = np.where(active[:, None], np.clip(theta + step, *limits), theta)
-        shared_trial = np.clip(shared + shared_step, problem.bounds[:, 0], problem.bounds[:, 1])
+        reach = np.abs(shared) + problem.scale
+        shared_trial = shared + np.clip(shared_step, -reach, reach)
+        shared_trial = np.clip(shared_trial, problem.bounds[:, 0], problem.bounds[:, 1])
         found = problem.log_likelihood(trial, shared_trial)
         better = np.full(theta.shape[0], found.sum() > loglik.sum()) if together else found > loglik
         better &= active
@@ -285,7 +288,8 @@ def _limits(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         [np.full_like(step, _REACH_EXPOSURE), np.full_like(step, _REACH_STEP), 1.2 * step], axis=1
     )
     low = np.concatenate([theta[:, :3] - reach, np.full((step.size, 1), _LOWEST_LOG_VARIANCE)], axis=1)
-    high = np.concatenate([theta[:, :3] + reach, 2.0 * theta[:, 1:2]], axis=1)
+    widest = np.maximum(2.0 * theta[:, 1:2] - _LOG_16, theta[:, 3:] + 1.0)
+    high = np.concatenate([theta[:, :3] + reach, widest], axis=1)
     low[:, 0] -= _REACH_EXPOSURE
     return low, np.maximum(high, theta)
 
@@ -296,12 +300,14 @@ def _differences(
     """Return the derivatives of the log masses, own parameters first, shape (n, 4 + d, B)."""
     n, width = base.shape
     slopes = np.zeros((n, 4 + problem.n_shared, width))
-    sigma = np.exp(0.5 * theta[:, 3])
-    for index in range(4):
-        moved = theta.copy()
-        scale = _STEP * (sigma if index == 2 else np.ones(n))
-        moved[:, index] += scale
-        slopes[:, index] = (problem.log_masses(moved, shared) - base) / scale[:, None]
+    own = to_parameters(theta)
+    mass, found = marginal_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
+    found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
+    kept = problem.kept[:, None, :]
+    inside = np.where(problem.kept, mass, 0.0).sum(axis=1)
+    change = np.where(kept, found, 0.0).sum(axis=2) / np.maximum(inside, _LEAST_MASS)[:, None]
+    relative = found / np.maximum(mass, _LEAST_MASS)[:, None, :] - change[:, :, None]
+    slopes[:, :4] = np.where(kept & (mass > _LEAST_MASS)[:, None, :], relative, 0.0)
     for index in range(problem.n_shared):
         moved = shared.copy()
         step = _STEP * problem.scale[index]
