@@ -19,13 +19,14 @@ __all__ = ["Table", "provenance_tables", "result_tables", "size_words"]
 
 @dataclass(frozen=True)
 class Table:
-    """A table: the first cell of each row is its heading."""
+    """A table: the first cell of each row is its heading; ``section`` is the id of the one that shows it."""
 
     id: str
     title: str
     caption: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    section: str = "tables"
 
 
 def result_tables(data: ReportData) -> list[Table]:
@@ -189,6 +190,7 @@ def _rmse(data: ReportData) -> Table:
         "Root mean square difference of densities, and what sampling noise alone would give.",
         ("prediction", "RMSE", "sampling noise", "ratio"),
         tuple(rows),
+        section="ensemble",
     )
 
 
@@ -220,6 +222,7 @@ def _moments(data: ReportData) -> Table:
         "the standard error of the data.",
         ("moment", "from the maps", "from the data", "difference / standard error"),
         tuple(rows),
+        section="ensemble",
     )
 
 
@@ -258,6 +261,7 @@ def _electrons(data: ReportData) -> Table:
         f"Share of each estimated electron number, and its predictions.{words}",
         ("k", "estimated", "predicted p(k)", "estimator should show"),
         tuple(rows),
+        section="electrons",
     )
 
 
@@ -281,6 +285,7 @@ def _status(data: ReportData) -> Table:
         "A pixel can have several reasons and then counts for each.",
         ("reason", "pixels", "share", "value kept"),
         tuple(rows),
+        section="status",
     )
 
 

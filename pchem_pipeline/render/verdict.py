@@ -52,10 +52,11 @@ class KeyNumber:
 
 @dataclass(frozen=True)
 class Flag:
-    """One remark on whether the results can be believed."""
+    """One remark on whether the results can be believed, or about the sensor itself."""
 
     level: Level
     text: str
+    about: Literal["results", "sensor"] = "results"
 
 
 @dataclass(frozen=True)
@@ -169,10 +170,10 @@ def _failed_pixels(data: ReportData) -> list[Flag]:
     text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
         allowed = percent(data.allowed_failed, 1.0)
-        return [Flag("serious", f"{text}, more than the {allowed} that is allowed.")]
+        return [Flag("serious", f"{text}, more than the {allowed} that is allowed.", "sensor")]
     if pixels.failed:
-        return [Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}.")]
-    return [Flag("good", f"Every {data.noun} has a value.")]
+        return [Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}.", "sensor")]
+    return [Flag("good", f"Every {data.noun} has a value.", "sensor")]
 
 
 def _unfitted(data: ReportData) -> list[Flag]:

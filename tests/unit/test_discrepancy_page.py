@@ -30,6 +30,7 @@ from pchem_pipeline.render.discrepancy_tables import discrepancy_tables
 from pchem_pipeline.render.discrepancy_text import remarks
 from pchem_pipeline.render.exhibits import Exhibit
 from pchem_pipeline.render.findings import findings, headline
+from pchem_pipeline.render.pictures import Picture
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.style import COLUMN_MM
@@ -75,9 +76,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
     def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> object:
-        return report_module._Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
+        return Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
 
-    monkeypatch.setattr(report_module, "_picture", dot)
+    monkeypatch.setattr(report_module, "draw_picture", dot)
 
 
 def rendered(base: ReportData, data: DiscrepancyData | None) -> RenderedReport:

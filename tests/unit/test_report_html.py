@@ -14,6 +14,7 @@ from pchem_pipeline.model.fit_status import FitStatus
 from pchem_pipeline.render import report as report_module
 from pchem_pipeline.render.data import MAP_NAMES, ReportData
 from pchem_pipeline.render.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
+from pchem_pipeline.render.pictures import Picture
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.verdict import flags, sentence
@@ -145,9 +146,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
     def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> object:
-        return report_module._Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
+        return Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
 
-    monkeypatch.setattr(report_module, "_picture", dot)
+    monkeypatch.setattr(report_module, "draw_picture", dot)
 
 
 HOSTILE = (
