@@ -15,6 +15,8 @@ A stage is a module of this package with
   unit is set, in the worker, after its task returned;
 * optionally ``identity(context)``: JSON data that joins its fingerprint (the content of the camera files).
 
+The first four, and ``identity``, are declared in :mod:`pchem_pipeline.stages.declared`, which is light.
+
 A unit is anything picklable with ``key``, the words for messages, and ``keys``, the markers that it sets: a
 :class:`~pchem_pipeline.store.tiles.Tile`, a band of tiles, or a block of frames. A stage without
 parallel units has one: ``WHOLE``.
@@ -26,7 +28,6 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.compute.executor import Executor, Outcome, Stop
@@ -315,7 +316,7 @@ class StageModule(Protocol):
         """Do the stage."""
 
 
-def identity_of(stage: ModuleType, context: StageContext) -> Any:
+def identity_of(stage: object, context: StageContext) -> Any:
     """Return what the stage adds to its fingerprint, if anything."""
     identity = getattr(stage, "identity", None)
     return None if identity is None else identity(context)

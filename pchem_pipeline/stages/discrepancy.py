@@ -25,18 +25,17 @@ from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.settings import ModelSettings
 from pchem_pipeline.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.discrepancy_arrays import evidence_arrays
 from pchem_pipeline.stages.frame_source import FrameSource, open_source
 from pchem_pipeline.store.files import write_atomic
 
 __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "Window", "choose_window", "run"]
 
-NAME = "discrepancy"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("ingest",)
-SETTINGS: tuple[str, ...] = ("discrepancy",)
-READS: tuple[str, ...] = ("frames",)
-WRITES: tuple[str, ...] = ("discrepancy",)
+_THIS = DECLARED["discrepancy"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
 
 _RESULT = "discrepancy.json"
 # frames tell more than pixels about what happens in time; pixels more about what is rare
@@ -72,15 +71,6 @@ class _Unit:
     def keys(self) -> tuple[str, ...]:
         """Its marker."""
         return (self.replicate.key,)
-
-
-def identity(context: StageContext) -> dict[str, Any]:
-    """Return the model that the search starts from: what it adds itself makes it no staler."""
-    present = _dump(context.config.model.effects)
-    kept = context.store.attributes(NAME) if context.store.has(NAME) else {}
-    if kept.get("model_after") == present:
-        present = kept["model_before"]
-    return {"model": present, "roi": list(context.options.roi or kept.get("roi") or ())}
 
 
 def choose_window(

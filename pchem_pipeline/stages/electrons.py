@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.errors import InputError
 from pchem_pipeline.model.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.fitted_model import deciding_maps, fitted_effects
 from pchem_pipeline.stages.frame_source import open_source, read_ahead
 from pchem_pipeline.stages.tile_bands import tile_bands
@@ -29,12 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "electrons_tile", "run"]
 
-NAME = "electrons"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("ingest", "fit")
-SETTINGS: tuple[str, ...] = ("run.tile",)
-READS: tuple[str, ...] = ("frames", "fit")
-WRITES: tuple[str, ...] = ("electrons",)
+_THIS = DECLARED["electrons"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
 
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128

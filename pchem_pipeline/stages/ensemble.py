@@ -22,6 +22,7 @@ from pchem_pipeline.model.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.histogram_numba import count_frames
 from pchem_pipeline.model.pixels import PixelParameters
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.ensemble_result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble_tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
 from pchem_pipeline.stages.fitted_model import deciding_maps, fitted_effects
@@ -37,12 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "ensemble_tile", "run"]
 
-NAME = "ensemble"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("histogram", "fit")
-SETTINGS: tuple[str, ...] = ("ensemble", "run.tile")
-READS: tuple[str, ...] = ("frames", "histogram", "fit", "truth")
-WRITES: tuple[str, ...] = ("ensemble", "ensemble_tiles")
+_THIS = DECLARED["ensemble"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
 
 #: Frames read at a time, and bytes of histograms of a band.
 _BLOCK_FRAMES = 64

@@ -19,6 +19,7 @@ from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
 
 if TYPE_CHECKING:
@@ -26,21 +27,13 @@ if TYPE_CHECKING:
 
 __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "fit_tile", "identity", "run"]
 
-NAME = "fit"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("histogram",)
-SETTINGS: tuple[str, ...] = ("fit", "model", "run.tile")
-READS: tuple[str, ...] = ("histogram/counts", "histogram/origin", "histogram/under", "histogram/over")
-WRITES: tuple[str, ...] = ("fit",)
+_THIS = DECLARED["fit"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
 
 #: Pixels of which effects are told nothing: no value, or one electron off.
 _UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
-
-
-def identity(context: StageContext) -> dict[str, Any]:
-    """Return what the files may say and the settings do not: the limits of the ADC."""
-    limits = context.adc_limits
-    return {"adc_limits": None if limits is None else list(limits)}
 
 
 def fit_tile(

@@ -40,6 +40,7 @@ from pchem_pipeline.stages.bands import (
     row_frames,
 )
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.frame_source import FrameSource, open_source, read_ahead
 
 if TYPE_CHECKING:
@@ -59,19 +60,9 @@ __all__ = [
     "run",
 ]
 
-NAME = "histogram"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("ingest",)
-#: band_memory is not among them: it changes no result
-SETTINGS: tuple[str, ...] = (
-    "histogram.block_frames",
-    "histogram.window_frames",
-    "histogram.max_bins",
-    "histogram.summaries",
-    "run.tile",
-)
-READS: tuple[str, ...] = ("frames",)
-WRITES: tuple[str, ...] = ("histogram", "summary")
+_THIS = DECLARED["histogram"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
 
 _MAPS = ("origin", "under", "over", "minimum", "maximum")
 _COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
-from pchem_pipeline.frames.identity import digest_of
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.stages.base import WHOLE, StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.input_identity import known_identity, shortened
 from pchem_pipeline.stages.sensor import SensorInfo
 
@@ -38,30 +38,10 @@ __all__ = [
     "run",
 ]
 
-NAME = "ingest"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ()
-#: not files: their content counts, see `identity`; not integration_time: it changes no frame
-SETTINGS: tuple[str, ...] = tuple(
-    f"input.{name}"
-    for name in (
-        "format",
-        "mode",
-        "shape",
-        "dtype",
-        "byte_order",
-        "header_bytes",
-        "frame_padding_bytes",
-        "dataset",
-        "bit_shift",
-        "bit_depth",
-        "roi",
-        "frame_range",
-        "on_bad_file",
-    )
-)
-READS: tuple[str, ...] = ()
-WRITES: tuple[str, ...] = ("frames",)
+_THIS = DECLARED["ingest"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
 
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)
@@ -87,19 +67,6 @@ class CopyUnit:
     def keys(self) -> tuple[str, ...]:
         """The one marker that it sets."""
         return (self.key,)
-
-
-def identity(context: StageContext) -> dict[str, Any]:
-    """Return what the content of the input is, for the fingerprint.
-
-    The files are hashed once; afterwards names, sizes and times of change are compared first, and they are
-    hashed again only where these differ. Where the files are gone, the last known content counts: what was
-    made of them stays valid.
-
-    Raises:
-        InputError: files are missing or bad, and nothing is known of them from before.
-    """
-    return {"content": digest_of([file["xxh3_128"] for file in known_identity(context, _inspect)["files"]])}
 
 
 def frames_tile(reader: FrameReader, unit: CopyUnit) -> NDArray[Any]:
@@ -131,7 +98,7 @@ def run(context: StageContext) -> None:
         bit_depth=reader.bit_depth,
         integration_time=reader.stated_integration_time,
         mode=settings.mode,
-        identity=shortened(known_identity(context, _inspect)),
+        identity=shortened(known_identity(context)),
     )
     sensor.write(context.store)
     if settings.mode == "reference":
@@ -168,15 +135,6 @@ def _copy(unit: CopyUnit, *, store: Path, reader: FrameReader) -> dict[str, Any]
     region = (slice(unit.t0, unit.t1), slice(unit.y0, unit.y1), slice(None))
     open_store(store).write("frames/dn", region, frames_tile(reader, unit))
     return {}
-
-
-def _inspect(context: StageContext) -> None:
-    """Look at the input for mistakes, without reading it."""
-    settings = context.config.input
-    if is_histogram_input(settings, context.base_dir):
-        read_histograms(settings, context.base_dir)
-    else:
-        open_frames(settings, context.base_dir).close()
 
 
 def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
@@ -217,7 +175,7 @@ def _record_histograms(context: StageContext) -> None:
         bit_depth=context.config.input.bit_depth,
         integration_time=None,
         mode="reference",
-        identity=shortened(known_identity(context, _inspect)),
+        identity=shortened(known_identity(context)),
         names=given.names,
     ).write(context.store)
     _run_whole(context)

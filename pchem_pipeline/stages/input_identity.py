@@ -12,21 +12,17 @@ from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.store.files import read_json, write_json
 
-__all__ = ["known_identity", "shortened"]
+__all__ = ["inspect_input", "known_identity", "shortened"]
 
 _LISTED_FILES = 64
 
 
-def known_identity(context: StageContext, inspect: Callable[[StageContext], None]) -> dict[str, Any]:
+def known_identity(context: StageContext) -> dict[str, Any]:
     """Return the content identity of the input, see `content_identity`.
 
     It is kept in the store with names, sizes and times of change; where these are as they were, it is not
-    taken
-    again. Where the files cannot be found any more, the last known identity is returned.
-
-    Args:
-        context: of the stage.
-        inspect: looks at the input for mistakes before it is hashed for the first time.
+    taken again. Where the files cannot be found any more, the last known identity is returned. Before the
+    files are hashed for the first time, they are looked at for mistakes.
 
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
@@ -45,12 +41,28 @@ def known_identity(context: StageContext, inspect: Callable[[StageContext], None
     if known.get("quick") == quick:
         return dict(known["identity"])
     if not same_files:
-        inspect(context)
+        inspect_input(context)
     with context.reporter.progress("ingest: hash", _mebibytes(quick["files"]), "MiB") as advance:
         identity = content_identity(paths, _Advance(context, advance))
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         write_json(place, {"files": list(settings.files), "quick": quick, "identity": identity})
     return identity
+
+
+def inspect_input(context: StageContext) -> None:
+    """Look at the input for mistakes, without reading it.
+
+    Raises:
+        InputError: files are missing or bad.
+    """
+    from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
+    from pchem_pipeline.frames.open import open_frames
+
+    settings = context.config.input
+    if is_histogram_input(settings, context.base_dir):
+        read_histograms(settings, context.base_dir)
+    else:
+        open_frames(settings, context.base_dir).close()
 
 
 def shortened(identity: dict[str, Any]) -> dict[str, Any]:

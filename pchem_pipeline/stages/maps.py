@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps import derived_maps, quality_map, status_counts, summarise
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.plain import plain
 from pchem_pipeline.variables import PARAMETERS
 
@@ -20,20 +21,13 @@ if TYPE_CHECKING:
 
 __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "identity", "maps_tile", "run"]
 
-NAME = "maps"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("fit",)
-SETTINGS: tuple[str, ...] = ("maps", "run.tile")
-READS: tuple[str, ...] = ("fit",)
-WRITES: tuple[str, ...] = ("maps",)
+_THIS = DECLARED["maps"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
 
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")
 _NO_TIME = "integration time is not known: no dark current; give input.integration_time, s"
-
-
-def identity(context: StageContext) -> dict[str, Any]:
-    """Return what the files may say and the settings do not: the integration time."""
-    return {"integration_time": context.integration_time}
 
 
 def maps_tile(fit: Mapping[str, NDArray[Any]], integration_time: float | None) -> dict[str, NDArray[Any]]:

@@ -17,10 +17,20 @@ from pchem_pipeline.config.load import setting_of
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import StoreError, quoted
 from pchem_pipeline.stages.base import StageContext, StageModule, identity_of
+from pchem_pipeline.stages.declared import DECLARED, Declaration
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["OPTIONAL_STAGES", "STAGES", "StageState", "execute", "load_stage", "pipeline_of", "status"]
+__all__ = [
+    "OPTIONAL_STAGES",
+    "STAGES",
+    "StageState",
+    "declaration_of",
+    "execute",
+    "load_stage",
+    "pipeline_of",
+    "status",
+]
 
 #: Every stage of a run, in the order of the data.
 STAGES = ("simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report")
@@ -60,12 +70,17 @@ def load_stage(name: str) -> StageModule:
     return cast("StageModule", importlib.import_module(f"pchem_pipeline.stages.{name}"))
 
 
+def declaration_of(name: str) -> Declaration:
+    """Return what a stage declares, without the libraries of its module."""
+    return DECLARED[name]
+
+
 def pipeline_of(config: RunConfig) -> tuple[str, ...]:
     """Return the stages that a configuration has: ``simulate`` only where it is asked for."""
     return STAGES if config.simulate is not None else STAGES[1:]
 
 
-def fingerprint_content(stage: StageModule, context: StageContext) -> dict[str, Any]:
+def fingerprint_content(stage: StageModule | Declaration, context: StageContext) -> dict[str, Any]:
     """Return all that decides the result of a stage, as JSON data."""
     upstream: dict[str, str | None] = {}
     for name in stage.UPSTREAM:
@@ -76,7 +91,7 @@ def fingerprint_content(stage: StageModule, context: StageContext) -> dict[str, 
         "version": stage.VERSION,
         "settings": {key: setting_of(context.config, key) for key in stage.SETTINGS},
         "upstream": upstream,
-        "input": identity_of(cast("Any", stage), context),
+        "input": identity_of(stage, context),
     }
 
 
@@ -88,7 +103,7 @@ def _state_of_record(store: RunStore, record: StageRecord) -> str:
     return f"{record.fingerprint}+{hashlib.sha256(' '.join(sorted(done)).encode()).hexdigest()[:16]}"
 
 
-def status(stage: StageModule, context: StageContext) -> StageState:
+def status(stage: StageModule | Declaration, context: StageContext) -> StageState:
     """Return how far a stage is under the present configuration and input."""
     record = context.store.records.read(stage.NAME)
     if record is None:

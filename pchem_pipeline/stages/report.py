@@ -22,7 +22,8 @@ from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE
 from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
-from pchem_pipeline.stages.discrepancy_result import discrepancy_state, read_discrepancy
+from pchem_pipeline.stages.declared import DECLARED
+from pchem_pipeline.stages.discrepancy_result import read_discrepancy
 from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
 
@@ -47,12 +48,10 @@ __all__ = [
     "run",
 ]
 
-NAME = "report"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ("histogram", "fit", "maps", "ensemble")
-SETTINGS: tuple[str, ...] = ("report", "maps", "run.title", "run.allowed_failed_pixels")
-READS: tuple[str, ...] = ("histogram", "fit", "maps", "ensemble", "truth")
-WRITES: tuple[str, ...] = ()
+_THIS = DECLARED["report"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
 
 _FIT_MAPS = ("fit_status", "goodness_p")
 _TRUTH = (*PARAMETERS, "read_noise_e")
@@ -114,12 +113,6 @@ def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def report_tile(data: ReportData, settings: ReportSettings) -> RenderedReport:
     """Return the files of the report; pure."""
     return render_report(data, settings)
-
-
-def identity(context: StageContext) -> dict[str, str] | None:
-    """Return what the report depends on beside its upstream stages: a verdict, where there is one."""
-    state = discrepancy_state(context.store)
-    return None if state is None else {"discrepancy": state}
 
 
 def run(context: StageContext) -> None:

@@ -17,8 +17,8 @@ from pchem_pipeline.stages.interrupt import StopRequest, stop_on_signals
 from pchem_pipeline.stages.pipeline import (
     OPTIONAL_STAGES,
     StageState,
+    declaration_of,
     execute,
-    load_stage,
     pipeline_of,
     status,
 )
@@ -183,7 +183,7 @@ def run_status(target: Target) -> list[StageState]:
     states: list[StageState] = []
     stale: set[str] = set()
     for name in stages:
-        stage = load_stage(name)
+        stage = declaration_of(name)
         state = status(stage, context)
         # what a simulation writes, ingest reads
         above = [upstream for upstream in stage.UPSTREAM or ("simulate",) if upstream in stale]

@@ -27,6 +27,7 @@ from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.store.files import storage_error, write_atomic
 
 if TYPE_CHECKING:
@@ -34,12 +35,9 @@ if TYPE_CHECKING:
 
 __all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "frames_tile", "run"]
 
-NAME = "simulate"
-VERSION = 1
-UPSTREAM: tuple[str, ...] = ()
-SETTINGS: tuple[str, ...] = ("simulate",)
-READS: tuple[str, ...] = ()
-WRITES: tuple[str, ...] = ("truth",)
+_THIS = DECLARED["simulate"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
 
 TRUTH_FILE = "truth.npz"
 # memory for the frames in the making, over all workers

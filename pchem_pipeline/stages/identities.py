@@ -1,0 +1,57 @@
+"""What stages add to their fingerprints beside settings and upstream stages; light, for ``pchem status``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pchem_pipeline.stages.input_identity import known_identity
+
+if TYPE_CHECKING:
+    from pchem_pipeline.stages.base import StageContext
+
+__all__ = ["adc_limits", "input_content", "integration_time", "search_start", "verdict"]
+
+
+def input_content(context: StageContext) -> dict[str, Any]:
+    """Return what the content of the input is.
+
+    The files are hashed once; afterwards names, sizes and times of change are compared first, and they are
+    hashed again only where these differ. Where the files are gone, the last known content counts: what was
+    made of them stays valid.
+
+    Raises:
+        InputError: files are missing or bad, and nothing is known of them from before.
+    """
+    from pchem_pipeline.frames.identity import digest_of
+
+    identity = known_identity(context)
+    return {"content": digest_of([file["xxh3_128"] for file in identity["files"]])}
+
+
+def adc_limits(context: StageContext) -> dict[str, Any]:
+    """Return what the files may say and the settings of the fit do not: the limits of the ADC."""
+    limits = context.adc_limits
+    return {"adc_limits": None if limits is None else list(limits)}
+
+
+def integration_time(context: StageContext) -> dict[str, Any]:
+    """Return what the files may say and the settings of the maps do not: the integration time."""
+    return {"integration_time": context.integration_time}
+
+
+def verdict(context: StageContext) -> dict[str, str] | None:
+    """Return what the report depends on beside its upstream stages: a verdict, where there is one."""
+    from pchem_pipeline.stages.discrepancy_result import discrepancy_state
+
+    state = discrepancy_state(context.store)
+    return None if state is None else {"discrepancy": state}
+
+
+def search_start(context: StageContext) -> dict[str, Any]:
+    """Return the model that a search starts from: what it adds itself makes it no staler."""
+    name = "discrepancy"
+    present = [effect.model_dump(mode="json") for effect in context.config.model.effects]
+    kept = context.store.attributes(name) if context.store.has(name) else {}
+    if kept.get("model_after") == present:
+        present = kept["model_before"]
+    return {"model": present, "roi": list(context.options.roi or kept.get("roi") or ())}
