@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pchem_pipeline.render import discrepancy_gap, discrepancy_maps, discrepancy_series
 from pchem_pipeline.render.discrepancy_data import CHANNELS, DiscrepancyData
 from pchem_pipeline.render.discrepancy_text import CAPTIONS, gap_words
-from pchem_pipeline.render.exhibits import Exhibit
+from pchem_pipeline.render.exhibits import Exhibit, drawing
 from pchem_pipeline.render.findings import Findings, Pull
 from pchem_pipeline.render.ranges import finite
 from pchem_pipeline.render.style import PAGE_MM
@@ -98,9 +98,7 @@ def _maps(data: DiscrepancyData) -> list[Exhibit]:
         "where",
         "On the sensor",
         "Maps in standard deviations of chance. " + "; ".join(words).replace("-", "−") + ".",
-        lambda width_mm: discrepancy_maps.pixel_maps(
-            maps, flagged=flagged, origin=data.found.origin, width_mm=width_mm
-        ),
+        drawing(discrepancy_maps.pixel_maps, maps, flagged=flagged, origin=data.found.origin),
         raster=True,
     )
 
@@ -127,7 +125,7 @@ def _codes(data: DiscrepancyData) -> list[Exhibit]:
         "where",
         "Along the digital numbers",
         alt,
-        lambda width_mm: discrepancy_series.codes(data.arrays, marked=data.found.where, width_mm=width_mm),
+        drawing(discrepancy_series.codes, data.arrays, marked=data.found.where),
     )
 
 
@@ -152,7 +150,7 @@ def _frames(data: DiscrepancyData) -> list[Exhibit]:
         "where",
         "Along time",
         f"Means of {count(int(arrays['frame_number'].size), 'frame')}. {'; '.join(words)}{path}.",
-        lambda width_mm: discrepancy_series.frame_strip(arrays, marked=data.found.where, width_mm=width_mm),
+        drawing(discrepancy_series.frame_strip, arrays, marked=data.found.where),
     )
 
 
@@ -166,9 +164,7 @@ def _lines(data: DiscrepancyData) -> list[Exhibit]:
         "where",
         "Rows and columns",
         "Scatter of the means over the frames, relative to chance (1). " + "; ".join(words) + ".",
-        lambda width_mm: discrepancy_maps.line_pictures(
-            data.arrays, origin=data.found.origin, width_mm=width_mm
-        ),
+        drawing(discrepancy_maps.line_pictures, data.arrays, origin=data.found.origin),
         raster=True,
     )
 
@@ -191,7 +187,7 @@ def _pulls(data: DiscrepancyData) -> list[Exhibit]:
         "shown",
         "The most telling statistics, before and after",
         f"Standard deviations of chance. {_pull_words(rows)}.",
-        lambda width_mm: discrepancy_gap.pulls(rows, width_mm=width_mm),
+        drawing(discrepancy_gap.pulls, rows),
     )
 
 
@@ -213,7 +209,7 @@ def _gap(data: DiscrepancyData) -> list[Exhibit]:
         "shown",
         "The gap against its floor",
         f"Gap in 10⁻⁶ nats per sample: {_gap_alt(found)}.",
-        lambda width_mm: discrepancy_gap.gap(found, width_mm=width_mm),
+        drawing(discrepancy_gap.gap, found),
     )
 
 

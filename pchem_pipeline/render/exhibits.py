@@ -19,7 +19,7 @@ from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM
 from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol
 
-__all__ = ["EXHIBIT_NAMES", "Exhibit", "exhibits"]
+__all__ = ["EXHIBIT_NAMES", "Drawing", "Exhibit", "drawing", "exhibits"]
 
 #: Names of all figures that a report can have, in their order.
 EXHIBIT_NAMES = (
@@ -66,10 +66,20 @@ def exhibits(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
     return [exhibit for make in makers for exhibit in make(data, settings)]
 
 
-def _at(draw: Callable[..., Figure], *args: object, **kwargs: object) -> Callable[[float], Figure]:
-    """Return a drawing that waits only for its width."""
-    bound = partial(draw, *args, **kwargs)
-    return lambda width_mm: bound(width_mm=width_mm)
+@dataclass(frozen=True)
+class Drawing:
+    """A drawing that waits only for its width; another process can be sent it."""
+
+    call: Callable[..., Figure]
+
+    def __call__(self, width_mm: float) -> Figure:
+        """Draw it at a width in mm."""
+        return self.call(width_mm=width_mm)
+
+
+def drawing(draw: Callable[..., Figure], *args: object, **kwargs: object) -> Drawing:
+    """Return the drawing of a function of a module with these arguments, all but its width."""
+    return Drawing(partial(draw, *args, **kwargs))
 
 
 def _edges_text(parameters: Mapping[str, float]) -> str:
@@ -88,7 +98,7 @@ def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             CAPTIONS["cluster_edges_example"],
             "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
             f"{_edges_text(example)} e⁻.",
-            _at(pixel_figures.cluster_edges, example),
+            drawing(pixel_figures.cluster_edges, example),
         )
     ]
     fitted = [pixel for pixel in data.pixels if pixel_figures.has_fit(pixel.parameters)]
@@ -102,7 +112,7 @@ def _cells(data: ReportData, _: ReportSettings) -> list[Exhibit]:
                 CAPTIONS["cluster_edges_pixel"],
                 f"Histogram and density of {pixel.place}; first cell edges at "
                 f"{_edges_text(pixel.parameters)} DN.",
-                _at(
+                drawing(
                     pixel_figures.cluster_edges,
                     dict(pixel.parameters),
                     counts=pixel.counts,
@@ -135,7 +145,7 @@ def _pixels(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Histograms of single pixels with their fits",
             CAPTIONS["pixel_fits"],
             "Histograms with fitted densities. " + "; ".join(words) + ".",
-            _at(pixel_figures.pixel_fits, data.pixels),
+            drawing(pixel_figures.pixel_fits, data.pixels),
             PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
         )
     ]
@@ -167,7 +177,9 @@ def _read_noise(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
             CAPTIONS["read_noise_histogram"].format(below=below, noun=data.noun),
             _map_alt(data, "read_noise_e", "Histogram")
             + f" {below} of the {data.noun}s with a value lie below 0.4 e⁻.",
-            _at(map_figures.read_noise_histogram, data.maps["read_noise_e"], bins=settings.histogram_bins),
+            drawing(
+                map_figures.read_noise_histogram, data.maps["read_noise_e"], bins=settings.histogram_bins
+            ),
         )
     ]
 
@@ -185,7 +197,7 @@ def _maps(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
                 symbol(name)[1].capitalize(),
                 CAPTIONS[f"map_{name}"],
                 _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
-                _at(
+                drawing(
                     map_figures.map_and_histogram,
                     data.maps[name],
                     name,
@@ -212,7 +224,9 @@ def _ensemble(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             CAPTIONS["ensemble"],
             "Ensemble histogram before and after non-uniformity correction with predictions. "
             f"RMSE: {numbers}.",
-            _at(ensemble_figures.ensemble, data.ensemble, rmse, n_frames=data.ensemble_facts.get("n_frames")),
+            drawing(
+                ensemble_figures.ensemble, data.ensemble, rmse, n_frames=data.ensemble_facts.get("n_frames")
+            ),
             PAGE_MM,
         )
     ]
@@ -231,7 +245,7 @@ def _electrons(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Estimated electron numbers",
             CAPTIONS["electron_numbers"],
             f"Share of each electron number among the estimates against the prediction; {first}.",
-            _at(
+            drawing(
                 ensemble_figures.electron_numbers,
                 arrays["k"],
                 mass,
@@ -258,7 +272,7 @@ def _components(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Standard deviation of the ensemble's component k, nothing held constant: "
             f"{short(float(width[0]))} DN at k = 0, "
             f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
-            _at(
+            drawing(
                 ensemble_figures.component_widths,
                 np.arange(variance.shape[1]),
                 variance,
@@ -285,7 +299,7 @@ def _status(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Fit status of the pixels",
             CAPTIONS["fit_status"],
             "Map of the fit status. " + "; ".join(parts) + ".",
-            _at(map_figures.fit_status_map, status, data.status_words, unfitted=data.unfitted),
+            drawing(map_figures.fit_status_map, status, data.status_words, unfitted=data.unfitted),
             raster=not map_figures.is_strip(status.shape),
         )
     ]

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import jinja2
 
 from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.discrepancy_exhibits import discrepancy_exhibits
 from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
-from pchem_pipeline.render.exhibits import exhibits
-from pchem_pipeline.render.pictures import Picture, draw_picture
+from pchem_pipeline.render.exhibits import Exhibit, exhibits
+from pchem_pipeline.render.pictures import DrawAll, Picture, draw_picture, longest_first, ready_picture
 from pchem_pipeline.render.report_json import report_json
 from pchem_pipeline.render.sections import Material, page_sections
 from pchem_pipeline.render.settings import ReportSettings
@@ -39,19 +40,31 @@ class RenderedReport:
     pages: dict[str, str] = field(default_factory=dict)
 
 
-def render_report(data: ReportData, settings: ReportSettings | None = None) -> RenderedReport:
+def render_report(
+    data: ReportData, settings: ReportSettings | None = None, draw: DrawAll | None = None
+) -> RenderedReport:
     """Draw everything and return the files of the report; nothing is written.
 
     Args:
         data: what the run found.
         settings: section ``report``; None for the defaults.
+        draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
     settings = settings or ReportSettings()
     figures: dict[str, bytes] = {}
-    pictures = [draw_picture(exhibit, settings, figures) for exhibit in exhibits(data, settings)]
+    shown = exhibits(data, settings)
+    others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
+    drawn = {} if draw is None else draw(longest_first([*shown, *others]), settings)
+
+    def picture(exhibit: Exhibit) -> Picture:
+        if exhibit.name in drawn:
+            return ready_picture(exhibit, drawn[exhibit.name], figures)
+        return draw_picture(exhibit, settings, figures)
+
+    pictures = [picture(exhibit) for exhibit in shown]
     view: DiscrepancyView[Picture] | None = None
     if data.discrepancy is not None:
-        view = discrepancy_view(data.discrepancy, lambda exhibit: draw_picture(exhibit, settings, figures))
+        view = discrepancy_view(data.discrepancy, picture)
     page = _template("report.html.j2").render(
         title=data.title,
         data=data,

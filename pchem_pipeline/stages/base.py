@@ -19,7 +19,7 @@ The first four, and ``identity``, are declared in :mod:`pchem_pipeline.stages.de
 
 A unit is anything picklable with ``key``, the words for messages, and ``keys``, the markers that it sets: a
 :class:`~pchem_pipeline.store.tiles.Tile`, a band of tiles, or a block of frames. A stage without
-parallel units has one: ``WHOLE``.
+parallel units has one, ``WHOLE``, which is done in this process.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from pchem_pipeline.compute.executor import Executor, Outcome, Stop
+from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import InputError, PchEmError, StoreError
 from pchem_pipeline.stages.interrupt import StopRequest
@@ -249,7 +249,12 @@ class StageContext:
         marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
         fatal: list[BaseException] = []
         shown = len(self.selected(units) if by_tiles else units)
-        with self.reporter.progress(self.stage, shown, unit_name, shown - len(todo)) as advance:
+        undivided = list(units) == [WHOLE]
+        # what is not divided is done here, and tells its own steps
+        executor = SerialExecutor() if undivided else self.executor
+        with self.reporter.progress(
+            self.stage, shown, unit_name, shown - len(todo), hidden=undivided
+        ) as advance:
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
                 advance()
@@ -260,7 +265,7 @@ class StageContext:
 
             self.stop.check()
             try:
-                self.executor.map(marked, todo, on_result)
+                executor.map(marked, todo, on_result)
             except Stop:
                 if fatal:
                     raise fatal[0] from fatal[0].__cause__

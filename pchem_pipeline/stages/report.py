@@ -24,12 +24,14 @@ from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.discrepancy_result import read_discrepancy
+from pchem_pipeline.stages.drawing import draw_by_workers
 from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.effects.base import Effect
+    from pchem_pipeline.render.pictures import DrawAll
     from pchem_pipeline.render.settings import ReportSettings
     from pchem_pipeline.stages.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
@@ -110,9 +112,9 @@ def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return ranks
 
 
-def report_tile(data: ReportData, settings: ReportSettings) -> RenderedReport:
-    """Return the files of the report; pure."""
-    return render_report(data, settings)
+def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
+    """Return the files of the report; pure. ``draw`` draws all figures at once."""
+    return render_report(data, settings, draw)
 
 
 def run(context: StageContext) -> None:
@@ -130,7 +132,12 @@ def run(context: StageContext) -> None:
                 f"choose y below {ny} and x below {nx}"
             )
     task = functools.partial(
-        _write, context.store.path, context.config, context.integration_time, _stage_rows(context)
+        _write,
+        context.store.path,
+        context.config,
+        context.integration_time,
+        _stage_rows(context),
+        draw_by_workers(context.executor.workers, context.reporter, NAME),
     )
     context.run_units([WHOLE], task, unit_name="report")
 
@@ -140,12 +147,13 @@ def _write(
     config: RunConfig,
     integration_time: float | None,
     stages: list[dict[str, Any]],
+    draw: DrawAll | None,
     unit: Unit,
 ) -> dict[str, Any]:
     """Gather, draw and write; files of figures that this run does not have any more are removed."""
     store = open_store(path)
     data = gather(store, config, integration_time, stages)
-    rendered = report_tile(data, config.report)
+    rendered = report_tile(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):

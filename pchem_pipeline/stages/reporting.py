@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO
 
 from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.store.beacon import Beacon
 
-__all__ = ["Advance", "Reporter"]
+__all__ = ["Advance", "Reporter", "paced"]
 
 ProgressMode = Literal["auto", "on", "off"]
 
@@ -25,12 +26,45 @@ class Advance(Protocol):
         """Advance the bar by ``n`` units."""
 
 
+def paced(label: str, unit: str, done: int, total: int, new: int, seconds: float) -> dict[str, Any]:
+    """Return how far a stage is, for machines.
+
+    Args:
+        label: the stage, or a part of one.
+        unit: what is counted.
+        done: units finished.
+        total: units of the whole.
+        new: units finished in this run.
+        seconds: time that those took.
+
+    Returns:
+        ``stage``, ``unit``, ``done``, ``total``, ``elapsed`` (s), ``rate`` (units per s), ``remaining`` (s);
+        the last two are None before the first unit.
+    """
+    known = new > 0 and seconds > 0
+    return {
+        "stage": label,
+        "unit": unit,
+        "done": done,
+        "total": total,
+        "elapsed": round(seconds, 3),
+        "rate": new / seconds if known else None,
+        "remaining": round((total - done) * seconds / new, 3) if known else None,
+    }
+
+
 class Reporter:
     """Progress bars, messages and the JSON log of one command; stdout stays untouched."""
 
     def __init__(
-        self, progress: ProgressMode = "auto", *, quiet: bool = False, log: Path | None = None
+        self,
+        progress: ProgressMode = "auto",
+        *,
+        quiet: bool = False,
+        log: Path | None = None,
+        beacon: Beacon | None = None,
     ) -> None:
+        self._beacon = beacon
         self._disable = {"auto": None, "on": False, "off": True}[progress] if not quiet else True
         self._quiet = quiet
         self._log: TextIO | None = None
@@ -59,34 +93,52 @@ class Reporter:
             self._log.flush()
 
     @contextmanager
-    def progress(self, label: str, total: int, unit: str = "tile", done: int = 0) -> Iterator[Advance]:
-        """Show a bar from ``done`` to ``total``; yields the function that advances it."""
+    def progress(
+        self, label: str, total: int, unit: str = "tile", done: int = 0, *, hidden: bool = False
+    ) -> Iterator[Advance]:
+        """Show a bar from ``done`` to ``total``; yields the function that advances it.
+
+        Rate and remaining time are means over this run. A ``hidden`` one shows and tells nothing.
+        """
+        if hidden:
+            yield lambda n=1: None
+            return
         from tqdm import tqdm
 
         with tqdm(
             total=total,
             initial=done,
             desc=label,
-            unit=unit,
+            unit=f" {unit}",
+            smoothing=0.0,
             disable=self._disable,
             file=sys.stderr,
             leave=False,
         ) as bar:
-            count, last = done, time.monotonic()
+            count, start, last = done, time.monotonic(), -1.0
+
+            def tell() -> None:
+                nonlocal last
+                last = time.monotonic()
+                pace = paced(label, unit, count, total, count - done, last - start)
+                self.event("progress", **pace)
+                if self._beacon is not None:
+                    self._beacon.show(pace)
 
             def advance(n: int = 1) -> None:
-                nonlocal count, last
+                nonlocal count
                 count += n
                 bar.update(n)
-                now = time.monotonic()
-                if now - last > 1 or count == total:
-                    last = now
-                    self.event("progress", stage=label, done=count, total=total)
+                if time.monotonic() - last > 1 or count == total:
+                    tell()
 
+            tell()
             yield advance
 
     def close(self) -> None:
-        """Close the log file."""
+        """Close the log file, and take back what others could see."""
+        if self._beacon is not None:
+            self._beacon.remove()
         if self._log is not None:
             self._log.close()
 

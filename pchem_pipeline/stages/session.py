@@ -23,6 +23,7 @@ from pchem_pipeline.stages.pipeline import (
     status,
 )
 from pchem_pipeline.stages.reporting import ProgressMode, Reporter
+from pchem_pipeline.store.beacon import Beacon
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
 
@@ -146,7 +147,8 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
     """
     target = with_overrides(target, command)
     store = RunStore.create(target.store)
-    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
+    beacon = Beacon(store.path)
+    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json, beacon=beacon)
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(store.locked())

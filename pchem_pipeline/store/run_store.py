@@ -5,7 +5,8 @@ run.zarr/
   zarr.json              schema version in the attributes
   frames/ histogram/ summary/ fit/ maps/ ensemble/ electrons/ truth/
   report.html, report.json, figures/
-  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock
+  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock,
+                         progress.json while a command works on it
 ```
 """
 

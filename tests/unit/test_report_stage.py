@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +84,7 @@ def folder(base: Path, tmp_path: Path) -> Path:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write without drawing: fast."""
     monkeypatch.setattr(
-        report, "report_tile", lambda data, settings: RenderedReport("page", "{}", {"new.svg": b"x"})
+        report, "report_tile", lambda data, settings, draw: RenderedReport("page", "{}", {"new.svg": b"x"})
     )
 
 
@@ -177,10 +175,19 @@ def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
     assert (counted["n_unfitted"], counted["n_failed"]) == (64, 3 + 64)
 
 
-def test_the_task_can_go_to_another_process(folder: Path) -> None:
-    context = make_context(folder)
-    task = partial(report._write, context.store.path, context.config, 4.87, report._stage_rows(context))
-    assert pickle.loads(pickle.dumps(task)).func is report._write
+def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(exhibit: object, settings: object) -> None:
+        raise MemoryError("no room to draw")
+
+    monkeypatch.setattr("pchem_pipeline.stages.drawing.draw_exhibit", fail)
+    state = execute("report", make_context(folder))
+    assert (state.state, state.why) == (
+        "failed",
+        "1 of 1 units failed, first all: MemoryError: no room to draw",
+    )
+    assert not (folder / "run.zarr" / "report.html").exists()
 
 
 def test_four_pixels_lie_in_the_corners_of_noise_and_exposure() -> None:

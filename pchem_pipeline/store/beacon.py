@@ -1,0 +1,65 @@
+"""How far a running command is, in a small file of the run that other processes may read."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Beacon", "read_beacon"]
+
+
+class Beacon:
+    """The file ``.pchem/progress.json`` of a run; it is there while a command works on the run.
+
+    A disk that cannot take it stops nothing: progress is not a result.
+    """
+
+    def __init__(self, store: Path) -> None:
+        self._path = _place(store)
+        self._shown = False
+
+    def show(self, pace: Mapping[str, Any]) -> None:
+        """Write how far the work is."""
+        content = {
+            **pace,
+            "time": datetime.now(UTC).isoformat(timespec="seconds"),
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+        }
+        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
+        with contextlib.suppress(OSError):
+            temporary.write_text(json.dumps(content) + "\n", encoding="utf-8")
+            temporary.replace(self._path)
+            self._shown = True
+
+    def remove(self) -> None:
+        """Remove the file, if this process wrote it."""
+        if self._shown:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+
+
+def read_beacon(store: Path) -> dict[str, Any] | None:
+    """Return what the command that works on a run tells, or None where none does.
+
+    A file that a killed process of this machine left counts as none.
+    """
+    try:
+        content: dict[str, Any] = dict(json.loads(_place(store).read_text(encoding="utf-8")))
+        if content.get("host") == socket.gethostname():
+            os.kill(int(content["pid"]), 0)
+    except PermissionError:  # it is there, and somebody else's
+        return content
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content
+
+
+def _place(store: Path) -> Path:
+    return store / ".pchem" / "progress.json"

@@ -1,0 +1,82 @@
+"""What a run says while it works: bars on terminals, JSON lines, and a file for ``pchem status``."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pchem_pipeline.stages.reporting import Reporter, paced
+from pchem_pipeline.store.beacon import Beacon, read_beacon
+
+
+def test_rate_and_remaining_time_are_means_of_this_run() -> None:
+    pace = paced("fit", "tile", done=30, total=64, new=10, seconds=5.0)
+    assert (pace["rate"], pace["remaining"]) == (2.0, 17.0)
+    assert paced("fit", "tile", done=20, total=64, new=0, seconds=0.1)["remaining"] is None
+
+
+def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
+    reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
+    with reporter.progress("fit", 4, "tile", done=1) as advance:
+        for _ in range(3):
+            advance()
+    with reporter.progress("report", 1, hidden=True) as advance:
+        advance()
+    reporter.close()
+    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    assert {event["stage"] for event in events} == {"fit"}
+    first, last = events[0], events[-1]
+    assert (first["done"], first["rate"], first["remaining"]) == (1, None, None)
+    assert (last["done"], last["total"], last["unit"], last["remaining"]) == (4, 4, "tile", 0.0)
+    assert last["rate"] > 100
+
+
+def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = Reporter("on")
+    with reporter.progress("fit", 3, "tile") as advance:
+        advance()
+    shown = capsys.readouterr().err
+    assert "fit:   0%" in shown
+    assert "0/3 [00:00<?, ? tile/s]" in shown
+
+
+def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
+    store = tmp_path / "run.zarr"
+    (store / ".pchem").mkdir(parents=True)
+    assert read_beacon(store) is None
+    reporter = Reporter("off", quiet=True, beacon=Beacon(store))
+    with reporter.progress("fit", 2) as advance:
+        advance()
+        advance()
+        seen = read_beacon(store)
+        assert seen is not None
+        assert (seen["stage"], seen["done"], seen["total"], seen["pid"]) == ("fit", 2, 2, os.getpid())
+    Beacon(store).remove()  # not its own file
+    assert read_beacon(store) is not None
+    reporter.close()
+    assert list((store / ".pchem").iterdir()) == []
+
+
+def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
+    place = tmp_path / ".pchem" / "progress.json"
+    place.parent.mkdir()
+    child = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
+    dead = {"stage": "fit", "pid": int(child.stdout), "host": socket.gethostname()}
+    place.write_text(json.dumps(dead))
+    assert read_beacon(tmp_path) is None
+    place.write_text(json.dumps({**dead, "host": "another machine"}))
+    assert read_beacon(tmp_path) is not None
+    for text in ("", "[1]", "{", json.dumps({"host": socket.gethostname(), "pid": "x"})):
+        place.write_text(text)
+        assert read_beacon(tmp_path) is None
+
+
+def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
+    Beacon(tmp_path / "nowhere").show({"stage": "fit"})
+    Beacon(tmp_path / "nowhere").remove()
