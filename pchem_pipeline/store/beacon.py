@@ -52,13 +52,20 @@ def read_beacon(store: Path) -> dict[str, Any] | None:
     """
     try:
         content: dict[str, Any] = dict(json.loads(_place(store).read_text(encoding="utf-8")))
-        if content.get("host") == socket.gethostname():
-            os.kill(int(content["pid"]), 0)
-    except PermissionError:  # it is there, and somebody else's
-        return content
+        here = content["host"] == socket.gethostname()
+        return content if not here or _lives(int(content["pid"])) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return content
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # somebody else's
+        return True
+    return True
 
 
 def _place(store: Path) -> Path:
