@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS
 from pchem_pipeline.render.discrepancy_data import DiscrepancyData
+from pchem_pipeline.render.inspector_data import InspectorData
 
 __all__ = ["FEW_CHANNELS", "MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
 
@@ -97,6 +98,7 @@ class ReportData:
             ``peak_memory_bytes``, ``units``, ``notes``.
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
+        inspector: maps and pixels to look at in the browser, or None.
     """
 
     title: str
@@ -123,6 +125,7 @@ class ReportData:
     stages: Sequence[Mapping[str, Any]] = ()
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
+    inspector: InspectorData | None = None
 
     @property
     def noun(self) -> str:

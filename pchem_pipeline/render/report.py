@@ -11,6 +11,7 @@ from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.discrepancy_exhibits import discrepancy_exhibits
 from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
 from pchem_pipeline.render.exhibits import Exhibit, exhibits
+from pchem_pipeline.render.inspector import content_policy, embedded, script
 from pchem_pipeline.render.pictures import DrawAll, Picture, draw_picture, longest_first, ready_picture
 from pchem_pipeline.render.report_json import report_json
 from pchem_pipeline.render.sections import Material, page_sections
@@ -65,11 +66,14 @@ def render_report(
     view: DiscrepancyView[Picture] | None = None
     if data.discrepancy is not None:
         view = discrepancy_view(data.discrepancy, picture)
+    inspector = embedded(data)
     page = _template("report.html.j2").render(
         title=data.title,
         data=data,
         flag_words=_FLAG_WORDS,
         flag_signs=_FLAG_SIGNS,
+        inspector=inspector,
+        policy=content_policy(script() if inspector else None),
         sections=page_sections(Material(data, settings, pictures, result_tables(data), view)),
     )
     pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}

@@ -80,6 +80,13 @@ def _summary(material: Material) -> Section:
     return Section("summary", "Is this sensor all right, and can I believe it?", "summary", content)
 
 
+def _inspector(material: Material) -> Section:
+    """Say where the inspector is; what it shows lies at the end of the page."""
+    shown = material.data.inspector is not None
+    content = {"shown": shown, "why": "No pixel was fitted; there is nothing to look at."}
+    return Section("inspector", "Look at pixels", "inspector", content)
+
+
 def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> Section:
     """Put figures and tables into their section; one without any says why."""
     id_, title, intro, parts = row
@@ -125,6 +132,7 @@ def _configuration(material: Material) -> Section:
 #: The page from top to bottom.
 PAGE: tuple[Maker, ...] = (
     _summary,
+    _inspector,
     *(partial(_figures, row) for row in SECTIONS),
     _discrepancy,
     _tables,

@@ -96,10 +96,10 @@ _ALL = (
     ),
     Declaration(
         "report",
-        1,
+        2,
         ("histogram", "fit", "maps", "ensemble"),
         ("report", "maps", "run.title", "run.allowed_failed_pixels"),
-        ("histogram", "fit", "maps", "ensemble", "truth"),
+        ("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "truth"),
         (),
         identities.verdict,
     ),

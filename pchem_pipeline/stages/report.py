@@ -26,6 +26,7 @@ from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.discrepancy_result import read_discrepancy
 from pchem_pipeline.stages.drawing import draw_by_workers
 from pchem_pipeline.stages.fitted_model import fitted_effects
+from pchem_pipeline.stages.inspector import gather_inspector
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
 
 if TYPE_CHECKING:
@@ -188,6 +189,9 @@ def gather(
     sensor = SensorInfo.read(store)
     maps = _group(store, "maps", skip=("quality",))
     fit = {name: store.read(f"fit/{name}") for name in _FIT_MAPS if store.has(f"fit/{name}")}
+    pixels = _pixels(store, config, sensor, maps, fit)
+    discrepancy = read_discrepancy(store)
+    suspects = [place for each in discrepancy.found.where for place in each.pixels] if discrepancy else []
     ensemble = _group(store, "ensemble")
     facts = dict(store.attributes("ensemble"))
     moments, _ = facts.pop("moments", []), facts.pop("missing", {})
@@ -201,7 +205,7 @@ def gather(
         fit=fit,
         status_words={int(bit): text for bit, text in MEANINGS.items()},
         failed_mask=int(FAILED),
-        pixels=_pixels(store, config, sensor, maps, fit),
+        pixels=pixels,
         ensemble=ensemble,
         ensemble_facts=facts,
         component_cases=[case_name(case) for case in cases],
@@ -219,7 +223,8 @@ def gather(
         ],
         stages=list(stages),
         missing=_missing(maps, ensemble),
-        discrepancy=read_discrepancy(store),
+        discrepancy=discrepancy,
+        inspector=gather_inspector(store, sensor, maps, fit, [(p.y, p.x) for p in pixels], suspects),
     )
 
 

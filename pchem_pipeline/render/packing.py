@@ -1,0 +1,159 @@
+"""Maps and histograms in few bytes, for the inspector of the report: quantised, split into planes, gzipped.
+
+A map becomes one code of 16 bits per pixel: 0 for no value, 2 to 65534 for ``low + step * (code - 2)`` (its
+power of ten where the map is logarithmic), and 1 and 65535 for the few values below and above that range,
+which follow as they are. The order of the codes is the order of the values, so that ranks and percentiles
+can be counted on codes. Histograms are stored without their empty ends, small counts in one byte.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["PackedMap", "Scale", "choose_scale", "pack_counts", "pack_map", "unpack_map", "varints"]
+
+FloatArray = NDArray[np.float64]
+
+#: Codes with a meaning of their own, and the last one of the regular range.
+_NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
+#: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
+_TAIL = 1e-3
+#: Positive values that spread over more than this factor are stored as logarithms.
+_DECADES = 30.0
+#: Step of logarithmic maps: 2.3 %.
+_LOG_STEP = 0.01
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How codes stand for values: ``low + step * (code - 2)``, a power of ten of it where ``log``."""
+
+    low: float
+    step: float
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class PackedMap:
+    """A map in few bytes.
+
+    Attributes:
+        scale: meaning of the codes.
+        n_odd: values outside the range of the codes, at the end of ``data`` as indices and float32.
+        data: gzip of the low bytes, the high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian.
+    """
+
+    scale: Scale
+    n_odd: int
+    data: bytes
+
+
+def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:
+    """Choose the range and the step of a map's codes.
+
+    Args:
+        values: any shape; NaN and infinities are left out. Integers keep a step of 1.
+        step: wanted step, in the unit of the map; 0: a 64th of the robust standard deviation.
+        coarse: factor on the step, for maps that must be smaller.
+    """
+    known = np.asarray(values)[np.isfinite(values)].astype(np.float64)
+    if known.size == 0:
+        return Scale(0.0, 1.0)
+    if np.asarray(values).dtype.kind in "iub":
+        low, high = float(known.min()), float(known.max())
+        return Scale(low, max(1.0, np.ceil((high - low) / (_LAST - _FIRST))))
+    log = False
+    if known.min() >= 0 and (known > 0).any():
+        bulk = np.quantile(known[known > 0], [0.01, 0.99])
+        log = bool(bulk[1] > _DECADES * bulk[0]) or bool((known == 0).any() and bulk[1] > bulk[0])
+        known = np.log10(known[known > 0]) if log else known
+    low, q25, middle, q75, high = np.quantile(known, [_TAIL, 0.25, 0.5, 0.75, 1.0 - _TAIL])
+    margin = 3.0 * (high - low)
+    first, last = max(float(known.min()), low - margin), min(float(known.max()), high + margin)
+    fine = _LOG_STEP if log else step or float(q75 - q25) / 1.35 / 64.0
+    smallest = max((last - first) / (_LAST - _FIRST - 257), abs(float(middle)) * 1e-9, 1e-300)
+    wide = float(max(fine * coarse, smallest))
+    # the median in the middle of 256 codes: where these hold the bulk, the high bytes cost next to nothing
+    shift = (128 - _FIRST - round((float(middle) - first) / wide)) % 256
+    return Scale(float(first) - shift * wide, wide, log)
+
+
+def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
+    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7.
+
+    Args:
+        values: shape (ny, nx); NaN where there is no value.
+        scale: from :func:`choose_scale`.
+    """
+    flat = np.asarray(values, dtype=np.float64).ravel()
+    known = np.isfinite(flat)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        work = np.log10(flat) if scale.log else flat
+        place = np.rint((work - scale.low) / scale.step) + _FIRST
+    place = np.where(place < _FIRST, _BELOW, np.where(place > _LAST, _ABOVE, place))
+    codes = np.where(known & np.isfinite(place), place, _NONE).astype("<u2")
+    odd = np.flatnonzero((codes == _BELOW) | (codes == _ABOVE))
+    planes = [codes & 255, codes >> 8]
+    content = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
+    content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
+    return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0))
+
+
+def unpack_map(packed: PackedMap, shape: tuple[int, int]) -> FloatArray:
+    """Return the values of a packed map, as the page does it."""
+    content, n = gzip.decompress(packed.data), shape[0] * shape[1]
+    planes = np.frombuffer(content, np.uint8, 2 * n).astype(np.uint16)
+    codes = planes[:n] | planes[n:] << 8
+    values = packed.scale.low + packed.scale.step * (codes.astype(np.float64) - _FIRST)
+    values = 10.0**values if packed.scale.log else values
+    values[codes == _NONE] = np.nan
+    odd = np.frombuffer(content, "<u4", packed.n_odd, 2 * n)
+    values[odd] = np.frombuffer(content, "<f4", packed.n_odd, 2 * n + 4 * packed.n_odd)
+    return values.reshape(shape)
+
+
+def varints(values: NDArray[Any]) -> bytes:
+    """Return whole numbers >= 0 with seven bits to a byte, the lowest first; the last byte is below 128."""
+    rest = np.asarray(values, dtype=np.uint64).ravel()
+    length = np.ones(rest.size, dtype=np.int64)
+    for power in range(1, 10):
+        length += rest >= np.uint64(1 << 7 * power)
+    start = np.cumsum(length) - length
+    out = np.zeros(int(length.sum()), dtype=np.uint8)
+    for i in range(int(length.max(initial=0))):
+        more = length > i
+        last = length == i + 1
+        digits = (rest & np.uint64(127)).astype(np.uint8)
+        out[(start + i)[more]] = np.where(last, digits, digits | 128)[more]
+        rest = rest >> np.uint64(7)
+    return out.tobytes()
+
+
+def pack_counts(
+    origin: NDArray[np.integer[Any]], counts: Sequence[NDArray[np.integer[Any]]]
+) -> tuple[NDArray[np.int32], NDArray[np.uint32], bytes]:
+    """Cut the empty ends off histograms and join them.
+
+    Args:
+        origin: DN of the first bin of each, shape (n,).
+        counts: n histograms, each of its own length.
+
+    Returns:
+        DN of the first occupied bin, number of bins from there to the last occupied one, and all counts one
+        after the other as variable-length numbers.
+    """
+    first = np.zeros(len(counts), dtype=np.int32)
+    size = np.zeros(len(counts), dtype=np.uint32)
+    kept = []
+    for i, each in enumerate(counts):
+        occupied = np.flatnonzero(each)
+        if occupied.size:
+            first[i], size[i] = origin[i] + occupied[0], occupied[-1] - occupied[0] + 1
+            kept.append(each[occupied[0] : occupied[-1] + 1])
+    return first, size, varints(np.concatenate(kept) if kept else np.empty(0))
