@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -141,7 +142,7 @@ def gather_inspector(
     chosen = choose_inspected(maps, fit, shown, suspects, everything=_ALL_PIXELS, most=_SOME_PIXELS)
     here = [entry.path for entry in entries if entry.packed is not None or entry.same_as is not None]
     sample = read_sample(store, chosen, here, sensor.shape)
-    return InspectorData(tuple(entries), sample, f"pchem view {quoted(store.path)}")
+    return InspectorData(tuple(entries), sample, f"pchem view {quoted(Path(store.path.name))}")
 
 
 def _packed(store: RunStore, listed: Sequence[_Listed], shape: tuple[int, int]) -> list[MapEntry]:
