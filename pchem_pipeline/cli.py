@@ -244,6 +244,36 @@ def export(
 
 
 @app.command()
+def figures(
+    target: Target,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("figures"),
+    formats: Annotated[str, typer.Option("--format", help="pdf, svg and png, separated by commas")] = "pdf",
+    width: Annotated[
+        str | None, typer.Option(help="width such as 88mm, 18cm or 3.5in [default: each figure's own]")
+    ] = None,
+    style: Annotated[
+        str | None, typer.Option(help="matplotlib style sheet, a file or a name, over the style of pchem")
+    ] = None,
+    only: Annotated[str, typer.Option(help="names of figures, separated by commas [default: all]")] = "",
+    dpi: Annotated[
+        int, typer.Option(min=72, max=1200, help="resolution of PNG and of maps, dots per inch")
+    ] = 600,
+    workers: Workers = None,
+    progress: Progress = "auto",
+) -> None:
+    """Write every figure for a paper, its numbers beside it as CSV."""
+    from pchem_pipeline.stages.figures import Wanted, figures_of_run
+
+    wanted = Wanted(_listed(formats), width, style, _listed(only), dpi, workers, progress)
+    for path in figures_of_run(target, output, wanted):
+        typer.echo(path)
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,

@@ -24,7 +24,6 @@ from pchem_pipeline.render.style import (
     COLUMN_MM,
     GRAY,
     GREEN,
-    MAP_COLOURS,
     NO_VALUE,
     ORANGE,
     PURPLE,
@@ -38,7 +37,14 @@ from pchem_pipeline.render.style import (
 )
 from pchem_pipeline.render.wording import count, percent, short, symbol
 
-__all__ = ["fit_status_map", "is_strip", "map_and_histogram", "read_noise_histogram", "status_counts"]
+__all__ = [
+    "fit_status_map",
+    "is_strip",
+    "map_and_histogram",
+    "map_bins",
+    "read_noise_histogram",
+    "status_counts",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -108,8 +114,7 @@ def _histogram(axes: Axes, values: FloatArray, label: str, unit: str, bins: int)
         return shown
     if shown.logarithmic:
         axes.set_xscale("log")
-    edges = histogram_edges(values, shown, most=bins)
-    axes.stairs(np.histogram(known, edges)[0], edges, fill=True, color=GRAY)
+    axes.stairs(*map_bins(values, bins), fill=True, color=GRAY)
     median = float(np.median(known))
     axes.axvline(median, color=BLUE, linewidth=1.0)
     axes.set_xlim(shown.low, shown.high)
@@ -120,11 +125,22 @@ def _histogram(axes: Axes, values: FloatArray, label: str, unit: str, bins: int)
     return shown
 
 
+def map_bins(values: NDArray[Any], most: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the histogram of a map as it is drawn: pixels in each bin, and the edges of the bins.
+
+    Args:
+        values: any shape; values that are not finite, or off the axis, are left out.
+        most: largest number of bins.
+    """
+    edges = histogram_edges(values, robust_range(values), most=most)
+    return np.histogram(finite(values), edges)[0], edges
+
+
 def _image(
     figure: Figure, axes: Axes, values: FloatArray, label: str, stretch: Literal["beta", "linear"]
 ) -> None:
     drawn = stretch_map(values, stretch)
-    image = _show(figure, axes, drawn.colour, cmap=MAP_COLOURS, vmin=0.0, vmax=1.0)
+    image = _show(figure, axes, drawn.colour, vmin=0.0, vmax=1.0)
     n_missing = int(np.isnan(drawn.colour).sum())
     if n_missing:
         patch = Patch(facecolor=NO_VALUE, edgecolor="#888888", label=f"no value: {count(n_missing, 'pixel')}")

@@ -29,7 +29,7 @@ from pchem_pipeline.render.style import (
 )
 from pchem_pipeline.render.wording import measured, symbol
 
-__all__ = ["PAPER_EXAMPLE", "cluster_edges", "has_fit", "pixel_fits", "shown_bins"]
+__all__ = ["PAPER_EXAMPLE", "cell_range", "cluster_edges", "has_fit", "pixel_fits", "shown_bins"]
 
 FloatArray = NDArray[np.float64]
 
@@ -83,8 +83,7 @@ def cluster_edges(
     exposure, gain, bias, sigma = _theta(parameters)
     in_electrons = gain == 1.0 and bias == 0.0
     unit = "e⁻" if in_electrons else "DN"
-    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
-    low, high = bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma
+    low, high, last = cell_range(exposure, gain, bias, sigma)
     if counts is not None and counts.sum() > 0:
         _bars(axes, counts, origin)
     x = np.linspace(low, high, 1200)
@@ -113,6 +112,19 @@ def cluster_edges(
     axes.set(xlim=(low, high), ylim=(0.0, top), xlabel=f"signal ({unit})", ylabel=f"density (1/{unit})")
     figure.legend(loc="outside lower center", ncols=3)
     return figure
+
+
+def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple[float, float, int]:
+    """Return the signals between which cells are drawn (DN), and the last electron number among them.
+
+    Args:
+        exposure: H, e-.
+        gain: g, e-/DN.
+        bias: mu, DN.
+        sigma: read noise, DN.
+    """
+    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
+    return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last
 
 
 def _bars(axes: Axes, counts: NDArray[Any], origin: int, label: str = "frames") -> None:

@@ -10,7 +10,8 @@ import contextlib
 import functools
 import io
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
@@ -19,6 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+
+from pchem_pipeline.render.recolour import recolour
 
 __all__ = [
     "BLACK",
@@ -40,6 +43,7 @@ __all__ = [
     "note",
     "plain",
     "small_png",
+    "style_sheet",
     "styled",
 ]
 
@@ -102,6 +106,22 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 P = ParamSpec("P")
 
+_SHEET: ContextVar[Mapping[str, Any] | None] = ContextVar("sheet", default=None)
+
+
+@contextlib.contextmanager
+def style_sheet(parameters: Mapping[str, Any] | None) -> Iterator[None]:
+    """Let matplotlib parameters of the user prevail over the style of this package.
+
+    Args:
+        parameters: name to value, as a style sheet has them; None for none.
+    """
+    token = _SHEET.set(parameters)
+    try:
+        yield
+    finally:
+        _SHEET.reset(token)
+
 
 @contextlib.contextmanager
 def _style() -> Iterator[None]:
@@ -109,7 +129,8 @@ def _style() -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE)
+        sheet: Any = _SHEET.get() or {}
+        mpl.rcParams.update({**_STYLE, **sheet})
         yield
 
 
@@ -123,11 +144,26 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with _style():
             figure = draw(*args, **kwargs)
+            if "axes.prop_cycle" in (_SHEET.get() or {}):
+                recolour(figure, PALETTE, mpl.rcParams["axes.prop_cycle"].by_key().get("color", []))
             figure.draw_without_rendering()
             figure.set_layout_engine("none")
             return figure
 
     return wrapper
+
+
+class StyledFigure(Figure):
+    """A figure that is saved in the style of this package, and that notebooks show."""
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        """Save the figure, fonts embedded; see :meth:`matplotlib.figure.Figure.savefig`."""
+        with _style():
+            super().savefig(*args, **kwargs)
+
+    def _repr_png_(self) -> bytes:
+        """Return the figure as a notebook shows it."""
+        return figure_bytes(self, "png", dpi=150)
 
 
 def plain(text: str) -> str:
@@ -142,7 +178,7 @@ def inches(millimetres: float) -> float:
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
     """Return an empty figure of that size with a canvas of its own."""
-    figure = Figure(figsize=(inches(width_mm), inches(height_mm)), layout="constrained")
+    figure = StyledFigure(figsize=(inches(width_mm), inches(height_mm)), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

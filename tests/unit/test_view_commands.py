@@ -1,0 +1,51 @@
+"""The commands that look at runs translate and call once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pchem_pipeline import cli
+from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.stages import figures
+from pchem_pipeline.stages.figures import Wanted, figures_of_run
+
+
+def invoke(*arguments: str) -> str:
+    return CliRunner().invoke(cli.app, list(arguments), catch_exceptions=False).stdout
+
+
+def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+
+    def call(*arguments: object) -> list[Path]:
+        seen.append(arguments)
+        return [Path("out/ensemble.pdf")]
+
+    monkeypatch.setattr(figures, "figures_of_run", call)
+    options = ["--format", "pdf, svg", "--width", "88mm", "--style", "my.mplstyle", "--dpi", "300"]
+    shown = invoke("figures", "run.zarr", "-o", "out", *options, "--only", "ensemble", "--workers", "2")
+    assert shown == "out/ensemble.pdf\n"
+    wanted = Wanted(("pdf", "svg"), "88mm", "my.mplstyle", ("ensemble",), 300, 2, "auto")
+    assert seen == [(Path("run.zarr"), Path("out"), wanted)]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        (Wanted(("pdf", "jpg")), "--format: jpg cannot be drawn; choose from pdf, svg, png"),
+        (Wanted(()), "--format: nothing cannot be drawn"),
+        (Wanted(width="88 px"), "--width '88 px': write a length such as 88mm"),
+        (Wanted(style="none.mplstyle"), "--style none.mplstyle: no such file"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted: Wanted, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        figures_of_run(Path("nowhere.zarr"), Path("out"), wanted)
+
+
+def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="there is no run at"):
+        figures_of_run(tmp_path, tmp_path / "out", Wanted())
