@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.model.beside import Interval, fit_beside
+from pchem_pipeline.model.exact import LARGEST_BIAS, biased_by_rounding, refine
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.grown import fit_grown
 from pchem_pipeline.model.marginal import MarginalModel
@@ -59,7 +60,10 @@ def fit_tile(
     flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
     rows = counts.reshape(-1, counts.shape[2])
     plain: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits)
-    result = _grown(rows, flat["origin"], plain, settings, effects) if effects else plain
+    if effects:
+        result = _grown(rows, flat["origin"], plain, settings, effects)
+    else:
+        result = refine(rows, flat["origin"], plain, settings, adc_limits)
     if set_aside:
         law = functools.partial(_law, effects=effects)
         result = fit_beside(rows, flat["origin"], plain, result, law, set_aside, settings)
@@ -116,7 +120,13 @@ def run(context: StageContext) -> None:
         effects=effects,
         set_aside=context.config.model.set_aside_e,
     )
-    context.run_units(context.tiles(), task, needs="histogram")
+    done = context.run_units(context.tiles(), task, needs="histogram")
+    biased, pixels = (sum(tile.get(key, 0) for tile in done.values()) for key in ("rounded", "pixels"))
+    if biased:
+        context.note(
+            f"rounding to whole DN biases {biased / pixels:.1%} of the pixels by more than {LARGEST_BIAS:g} "
+            "standard errors; set fit.likelihood: auto"
+        )
 
 
 def _compile(dtype: np.dtype[Any], effects: Sequence[Effect]) -> None:
@@ -141,4 +151,9 @@ def _do_tile(
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]
-    return {"pixels": int(words.size), "failed": int(np.count_nonzero(words & np.uint16(int(FAILED))))}
+    summary = {"pixels": int(words.size), "failed": int(np.count_nonzero(words & np.uint16(int(FAILED))))}
+    if settings.likelihood == "density" and not effects:
+        counts = histogram["counts"].sum(axis=2, dtype=np.float64)
+        biased = biased_by_rounding([arrays[name].ravel() for name in PARAMETERS], counts.ravel())
+        summary["rounded"] = int(np.count_nonzero(biased))
+    return summary
