@@ -94,4 +94,4 @@ def _rescaling(exposure: FloatArray, fitted: FloatArray) -> FloatArray:
     """Return the factor from the variance at the estimates to that at the line."""
     least = np.maximum(1e-6, 1e-3 * exposure.max(axis=1, keepdims=True))
     ratio = np.maximum(fitted, least) / np.maximum(exposure, least)
-    return np.clip(ratio, 1.0 / _MOST_RESCALED, _MOST_RESCALED)
+    return np.asarray(np.clip(ratio, 1.0 / _MOST_RESCALED, _MOST_RESCALED))
