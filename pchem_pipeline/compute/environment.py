@@ -9,7 +9,7 @@ import tempfile
 import zlib
 from pathlib import Path
 
-__all__ = ["available_workers", "peak_rss_bytes", "prepare_environment"]
+__all__ = ["available_memory", "available_workers", "peak_rss_bytes", "prepare_environment"]
 
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLOSC_NTHREADS", "NUMBA_NUM_THREADS")
 
@@ -68,6 +68,24 @@ def available_workers() -> int:
     except (OSError, ValueError):
         pass
     return count
+
+
+def available_memory() -> int | None:
+    """Return the bytes that this process may still take: free memory and cgroup limit; None if not known."""
+    free: list[int] = []
+    try:
+        facts = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        free.append(int(facts["MemAvailable"].split()[0]) << 10)
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        group = Path("/sys/fs/cgroup")
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            free.append(int(limit) - int((group / "memory.current").read_text()))
+    except (OSError, ValueError):
+        pass
+    return max(0, min(free)) if free else None
 
 
 def peak_rss_bytes() -> int:

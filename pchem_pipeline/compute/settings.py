@@ -30,6 +30,12 @@ class ComputeSettings(Section):
     workers: int | Literal["auto"] = Field(
         default="auto", description="number of workers; auto: the processors that this process may use"
     )
+    max_memory: int | None = Field(
+        default=None,
+        ge=64,
+        description="memory that a run may take on this machine, MiB; null: half of what is free. Too little "
+        "for the whole sensor at once: the camera files are read twice, by bands of rows",
+    )
     scheduler: str | None = Field(
         default=None,
         description="distributed: tcp://host:8786 or the path of a scheduler file; null: a local cluster",

@@ -6,7 +6,7 @@ Names are recorded without folders, so that a run can be moved together with its
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,16 @@ import xxhash
 
 from pchem_pipeline.errors import InputError
 
-__all__ = ["content_identity", "digest_of", "file_size", "hash_file", "quick_identity", "sample_hash"]
+__all__ = [
+    "FileHasher",
+    "content_identity",
+    "digest_of",
+    "file_size",
+    "hash_file",
+    "identity_of_hashes",
+    "quick_identity",
+    "sample_hash",
+]
 
 _BLOCK = 1 << 22
 
@@ -24,6 +33,75 @@ def _parts(path: Path) -> list[Path]:
     if path.is_dir():
         return sorted(part for part in path.rglob("*") if part.is_file())
     return [path]
+
+
+class FileHasher:
+    """The hash of `hash_file`, taken piece by piece in the order of the bytes.
+
+    Attributes:
+        path: the file or folder.
+        done: bytes hashed so far; of a file: the offset of the next one.
+    """
+
+    def __init__(self, path: Path, advance: Callable[[int], None] | None = None) -> None:
+        self.path = path
+        self.done = 0
+        self._hasher = xxhash.xxh3_128()
+        self._advance = advance
+        self._parts: list[Path] | None = None
+        self._begun = False
+        self._offset = 0
+
+    def feed(self, data: memoryview) -> None:
+        """Hash the next bytes of a file (no folder), which the caller has read."""
+        self._hasher.update(data)
+        self._count(len(data))
+
+    def read_to(self, count: int | None = None) -> None:
+        """Read and hash until ``count`` bytes are hashed in all, or everything.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
+        try:
+            if self._parts is None:
+                self._parts = _parts(self.path)
+            while self._parts and (count is None or self.done < count):
+                if self._read_part(self._parts[0], count):
+                    del self._parts[0]
+                    self._begun, self._offset = False, 0
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be read ({error.strerror}); check the path and its permissions"
+            ) from error
+
+    def hexdigest(self) -> str:
+        """Hash what is left, and return the hash of all."""
+        self.read_to()
+        return self._hasher.hexdigest()
+
+    def _read_part(self, part: Path, count: int | None) -> bool:
+        """Hash one file from where it was left; tell whether it came to its end."""
+        size = part.stat().st_size
+        if part is not self.path and not self._begun:
+            self._hasher.update(f"{part.relative_to(self.path).as_posix()}\0{size}\0".encode())
+        self._begun = True
+        view = memoryview(bytearray(max(1, min(_BLOCK, size - self._offset))))
+        with part.open("rb", buffering=0) as stream:
+            stream.seek(self._offset)
+            while count is None or self.done < count:
+                got = stream.readinto(view if count is None else view[: count - self.done])
+                if not got:
+                    return True
+                self._hasher.update(view[:got])
+                self._count(got)
+        return False
+
+    def _count(self, n_bytes: int) -> None:
+        self.done += n_bytes
+        self._offset += n_bytes
+        if self._advance is not None:
+            self._advance(n_bytes)
 
 
 def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:
@@ -36,23 +114,7 @@ def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:
     Raises:
         InputError: the file cannot be read.
     """
-    hasher = xxhash.xxh3_128()
-    buffer = bytearray(_BLOCK)
-    view = memoryview(buffer)
-    try:
-        for part in _parts(path):
-            if part is not path:
-                hasher.update(f"{part.relative_to(path).as_posix()}\0{part.stat().st_size}\0".encode())
-            with part.open("rb", buffering=0) as stream:
-                while count := stream.readinto(buffer):
-                    hasher.update(view[:count])
-                    if advance is not None:
-                        advance(count)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
-        ) from error
-    return hasher.hexdigest()
+    return FileHasher(path, advance).hexdigest()
 
 
 def sample_hash(path: Path) -> str:
@@ -87,7 +149,12 @@ def content_identity(paths: Iterable[Path], advance: Callable[[int], None] | Non
     Raises:
         InputError: a file cannot be read.
     """
-    files = [{"name": path.name, "size": _size(path), "xxh3_128": hash_file(path, advance)} for path in paths]
+    return identity_of_hashes({path: hash_file(path, advance) for path in paths})
+
+
+def identity_of_hashes(hashes: Mapping[Path, str]) -> dict[str, Any]:
+    """Return the identity of `content_identity` from the hash of each file, in reading order."""
+    files = [{"name": path.name, "size": _size(path), "xxh3_128": text} for path, text in hashes.items()]
     return {"files": files, "digest": digest_of(files)}
 
 

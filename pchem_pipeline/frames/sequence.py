@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -99,15 +99,25 @@ class FrameSequence(FrameReader):
         """
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         rows = (y0 + self._y0, y1 + self._y0)
+        for reader, first, end, offset in self.pieces(t0, t1):
+            part = buffer[offset : offset + end - first]
+            self._read_part(reader, part, first, end, rows)
+            self.check_bits(reader, part)
+
+    @property
+    def whole_frames(self) -> bool:
+        """All rows and columns of the files are wanted."""
+        return (self._y0, self._x0, *self.shape[1:]) == (0, 0, *self._readers[0].shape[1:])
+
+    def pieces(self, t0: int, t1: int) -> Iterator[tuple[FrameReader, int, int, int]]:
+        """Yield for each file of frames t0..t1: reader, first frame and end in it, frames before it."""
         t, end = t0 + self._first, t1 + self._first
         while t < end:
             number = bisect_right(self._ends, t)
             reader = self._readers[number]
             start = self._ends[number] - reader.shape[0]
             stop = min(end, self._ends[number])
-            part = buffer[t - self._first - t0 : stop - self._first - t0]
-            self._read_part(reader, part, t - start, stop - start, rows)
-            self._check_bits(reader, part)
+            yield reader, t - start, stop - start, t - self._first - t0
             t = stop
 
     def _read_part(
@@ -125,7 +135,7 @@ class FrameSequence(FrameReader):
             reader.read_into(scratch[: stop - t], t, stop, *rows)
             part[t - t0 : stop - t0] = scratch[: stop - t, :, self._x0 : self._x1]
 
-    def _check_bits(self, reader: FrameReader, part: NDArray[Any]) -> None:
+    def check_bits(self, reader: FrameReader, part: NDArray[Any]) -> None:
         """Shift left-justified samples, refusing to lose bits; check that values fit the bit depth."""
         size = 8 * self.dtype.itemsize
         depth = size - self.bit_shift if self.bit_depth is None else self.bit_depth

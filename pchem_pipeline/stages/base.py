@@ -28,7 +28,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
 from pchem_pipeline.config.tree import RunConfig
@@ -41,7 +41,10 @@ from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid
 from pchem_pipeline.variables import VARIABLES
 
-__all__ = ["WHOLE", "Options", "StageContext", "Unit", "open_store"]
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.sequence import FrameSequence
+
+__all__ = ["WHOLE", "Options", "StageContext", "Swept", "Unit", "nothing_left", "open_store"]
 
 
 class Unit(Protocol):
@@ -104,6 +107,26 @@ class MarkedTask:
         return summary
 
 
+@dataclass(frozen=True)
+class Swept:
+    """What one pass over the input did for several stages at once; they have but to mark their units.
+
+    Attributes:
+        stages: the stages whose arrays are written.
+        frames: the opened camera files.
+        clock: wall and CPU time when the pass began.
+    """
+
+    stages: frozenset[str]
+    frames: FrameSequence
+    clock: tuple[float, float]
+
+
+def nothing_left(unit: Any) -> dict[str, Any]:
+    """Be the task of units whose work is done."""
+    return {}
+
+
 @dataclass
 class StageContext:
     """All that a stage is given.
@@ -123,6 +146,7 @@ class StageContext:
         n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
         config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
+        swept: what the one pass over the input has done, where there was one.
     """
 
     config: RunConfig
@@ -139,6 +163,12 @@ class StageContext:
     n_keys: int = 0
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
+    swept: Swept | None = None
+
+    @property
+    def is_swept(self) -> bool:
+        """The arrays of the running stage were made beforehand, by the one pass over the input."""
+        return self.swept is not None and self.stage in self.swept.stages
 
     @property
     def sensor(self) -> SensorInfo:

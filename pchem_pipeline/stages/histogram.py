@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.model.histogram import (
-    HistogramAccumulator,
     RangeAccumulator,
     RowHistograms,
     choose_bins,
@@ -26,10 +25,8 @@ from pchem_pipeline.model.histogram import (
 from pchem_pipeline.model.summaries import (
     ROW_GROUP,
     CovarianceMaps,
-    SummaryAccumulator,
     block_starts,
     frame_statistics,
-    line_sums,
 )
 from pchem_pipeline.stages.bands import (
     CHUNK_BLOCKS,
@@ -39,7 +36,8 @@ from pchem_pipeline.stages.bands import (
     plan_bands,
     row_frames,
 )
-from pchem_pipeline.stages.base import StageContext, open_store
+from pchem_pipeline.stages.base import StageContext, nothing_left, open_store
+from pchem_pipeline.stages.counting import BandCounter, Emit, TileCounter
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.frame_source import FrameSource, open_source, read_ahead
 
@@ -69,8 +67,6 @@ _COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covarian
 #: samples that one process looks through in a second or so
 _FEW_SAMPLES = 1 << 31
 
-Emit = Callable[[str, NDArray[Any]], None]
-
 
 def histogram_tile(
     blocks: Iterable[NDArray[Any]],
@@ -97,26 +93,10 @@ def histogram_tile(
     Raises:
         InputError: DN of more than 24 bits.
     """
-    tell: Emit = emit or (lambda name, part: None)
-    histograms = HistogramAccumulator(shape, bins, n_frames)
-    summaries = SummaryAccumulator(shape, settings.block_frames) if settings.summaries else None
+    counter = TileCounter(shape, bins, n_frames, settings, emit)
     for frames in blocks:
-        histograms.add(frames)
-        if summaries is not None:
-            for sums in summaries.add(frames):
-                _tell_all(tell, {name: part[None] for name, part in vars(sums).items()})
-            _tell_all(tell, vars(line_sums(frames)))
-    if summaries is None:
-        return histograms.finish(), None
-    rest, covariances = summaries.finish()
-    for sums in rest:
-        _tell_all(tell, {name: part[None] for name, part in vars(sums).items()})
-    return histograms.finish(), covariances
-
-
-def _tell_all(emit: Emit, parts: dict[str, NDArray[Any]]) -> None:
-    for name, part in parts.items():
-        emit(name, part)
+        counter.add(frames)
+    return counter.finish()
 
 
 # -- the stage ----------------------------------------------------------------------------------
@@ -150,13 +130,17 @@ def run(context: StageContext) -> None:
     if context.sensor.kind == "histograms":
         _copy_histograms(context)
         return
+    if context.is_swept:
+        context.run_units(context.tiles(), nothing_left)
+        _end(context, context.tiles())
+        return
     source = open_source(context)
     settings = context.config.histogram
     if context.fresh or not context.store.has("histogram/counts"):
         bins = _decide_bins(context, source)
     else:
         bins = context.store.array("histogram/counts").shape[2]
-    _create_arrays(context, source, bins)
+    create_arrays(context, source.shape, bins)
     bands = _bands(context, source, bins)
     task = functools.partial(
         _do_band,
@@ -167,18 +151,23 @@ def run(context: StageContext) -> None:
         threads=max(1, context.executor.workers // max(1, len(context.pending(bands)))),
     )
     done = context.run_units(bands, task, unit_name="band")
-    if len(done) < context.n_keys:
-        return
-    if number := sum(_pixels_outside(context, band) for band in bands):
+    if len(done) == context.n_keys:
+        _end(context, bands)
+
+
+def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
+    """Do what needs the whole sensor."""
+    if number := sum(_pixels_outside(context, area) for area in areas):
+        bins = context.store.array("histogram/counts").shape[2]
         context.note(
             f"{number} pixels have DN outside of their {bins} bins; they are counted as under or over"
         )
-    if settings.summaries:
-        _write_frame_statistics(context, source.shape)
+    if context.config.histogram.summaries:
+        _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
 
 
-def _pixels_outside(context: StageContext, band: Band) -> int:
-    region = (slice(band.y0, band.y1), slice(None))
+def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
+    region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
     under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
     return int(np.count_nonzero(under | over))
 
@@ -216,8 +205,9 @@ def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: i
     return ranges.finish(max_bins)
 
 
-def _create_arrays(context: StageContext, source: FrameSource, bins: int) -> None:
-    n_frames, ny, nx = source.shape
+def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
+    """Make the arrays of the stage for a stack of some shape (frames, rows, columns)."""
+    n_frames, ny, nx = shape
     settings, tile = context.config.histogram, context.config.run.tile
     context.create(
         "histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
@@ -243,61 +233,15 @@ def _create_arrays(context: StageContext, source: FrameSource, bins: int) -> Non
         context.store.write_array("summary/block_start", starts, {"frames": n_frames})
 
 
-class _AlongTime:
-    """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
-
-    def __init__(self, store: Path, name: str, rows: slice) -> None:
-        self._store, self._name, self._rows = open_store(store), name, rows
-        self._length = self._store.array(name).chunks[0]
-        self._parts: list[NDArray[Any]] = []
-        self._held = self._written = 0
-
-    def add(self, part: NDArray[Any]) -> None:
-        """Take the next piece."""
-        while part.shape[0]:
-            piece = part[: self._length - self._held]
-            self._parts.append(piece)
-            self._held += piece.shape[0]
-            part = part[piece.shape[0] :]
-            if self._held == self._length:
-                self.flush()
-
-    def flush(self) -> None:
-        """Write what is held."""
-        if self._held:
-            data = np.concatenate(self._parts)
-            end = self._written + self._held
-            rest = (slice(None),) * (data.ndim - 2)
-            self._store.write(self._name, (slice(self._written, end), self._rows, *rest), data)
-            self._parts, self._held, self._written = [], 0, end
-
-
 def _do_band(
     band: Band, *, store: Path, source: FrameSource, bins: int, settings: HistogramSettings, threads: int
 ) -> None:
     """Count a band and write its chunks."""
-    n_frames, _, columns = source.shape
-    rows = slice(band.y0, band.y1)
-    groups = slice(band.y0 // ROW_GROUP, -(-band.y1 // ROW_GROUP))
-    series: dict[str, _AlongTime] = {}
-
-    def emit(name: str, part: NDArray[Any]) -> None:
-        if name not in series:
-            series[name] = _AlongTime(store, f"summary/{name}", groups if name == "column_sum" else rows)
-        series[name].add(part)
-
-    blocks = read_ahead(source, (band.y0, band.y1), settings.window_frames, threads)
-    histograms, covariances = histogram_tile(
-        blocks, (band.y1 - band.y0, columns), bins, n_frames, settings, emit
-    )
-    for each in series.values():
-        each.flush()
-    opened = open_store(store)
-    for name, values in vars(histograms).items():
-        opened.write(f"histogram/{name}", (rows, *(slice(None),) * (values.ndim - 1)), values)
-    if covariances is not None:
-        for name, values in vars(covariances).items():
-            opened.write(f"summary/{name}", (rows, slice(None)), values)
+    rows = (band.y0, band.y1)
+    counter = BandCounter(store, rows, source.shape, bins, settings)
+    for frames in read_ahead(source, rows, settings.window_frames, threads):
+        counter.add(frames)
+    counter.finish()
 
 
 def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:

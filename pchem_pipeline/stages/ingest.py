@@ -7,7 +7,8 @@ with ready-made histograms, nothing is copied: the next stage reads the files th
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,13 +18,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.stages.base import WHOLE, StageContext, open_store
+from pchem_pipeline.stages.base import WHOLE, StageContext, nothing_left, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.input_identity import known_identity, shortened
 from pchem_pipeline.stages.sensor import SensorInfo
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.base import FrameReader
+    from pchem_pipeline.frames.sequence import FrameSequence
 
 __all__ = [
     "NAME",
@@ -85,11 +87,27 @@ def run(context: StageContext) -> None:
         _record_histograms(context)
         return
     settings = context.config.input
-    reader = open_frames(settings, context.base_dir)
+    swept = context.swept if context.is_swept else None
+    reader = open_frames(settings, context.base_dir) if swept is None else swept.frames
     if message := reader.report.message():
         context.note(message)
+    sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
+    if settings.mode == "reference":
+        _run_whole(context)
+        return
+    chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
+    units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
+    task: Callable[[CopyUnit], dict[str, Any]] = nothing_left
+    if swept is None:
+        create_frames(context, reader)
+        task = functools.partial(_copy, store=context.store.path, reader=reader)
+    context.run_units(units, task, unit_name="block", by_tiles=False)
+
+
+def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, Any]) -> SensorInfo:
+    """Return what the run is to know of the stack of camera files."""
     n_frames, ny, nx = reader.shape
-    sensor = SensorInfo(
+    return SensorInfo(
         kind="frames",
         n_frames=n_frames,
         ny=ny,
@@ -97,19 +115,16 @@ def run(context: StageContext) -> None:
         dtype=reader.dtype.name,
         bit_depth=reader.bit_depth,
         integration_time=reader.stated_integration_time,
-        mode=settings.mode,
-        identity=shortened(known_identity(context)),
+        mode=context.config.input.mode,
+        identity=identity,
     )
-    sensor.write(context.store)
-    if settings.mode == "reference":
-        _run_whole(context)
-        return
+
+
+def create_frames(context: StageContext, reader: FrameSequence) -> None:
+    """Make the array that the frames are copied to; say so where the disk may be too small."""
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
     context.create("frames/dn", reader.shape, chunks=chunk, dtype=reader.dtype)
-    _warn_of_a_small_disk(context, n_frames * ny * nx * reader.dtype.itemsize)
-    task = functools.partial(_copy, store=context.store.path, reader=reader)
-    units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
-    context.run_units(units, task, unit_name="block", by_tiles=False)
+    _warn_of_a_small_disk(context, math.prod(reader.shape) * reader.dtype.itemsize)
 
 
 def chunk_shape(shape: tuple[int, int, int], itemsize: int) -> tuple[int, int, int]:
@@ -147,13 +162,9 @@ def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
         )
 
 
-def _nothing(unit: Any) -> dict[str, Any]:
-    return {}
-
-
 def _run_whole(context: StageContext) -> None:
     """Finish the stage where nothing is copied."""
-    context.run_units([WHOLE], _nothing, unit_name="input", by_tiles=False)
+    context.run_units([WHOLE], nothing_left, unit_name="input", by_tiles=False)
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

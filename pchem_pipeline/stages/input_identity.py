@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.errors import InputError, StoreError
@@ -12,7 +13,7 @@ from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.store.files import read_json, write_json
 
-__all__ = ["inspect_input", "known_identity", "shortened"]
+__all__ = ["identity_is_new", "inspect_input", "keep_identity", "known_identity", "shortened"]
 
 _LISTED_FILES = 64
 
@@ -27,9 +28,8 @@ def known_identity(context: StageContext) -> dict[str, Any]:
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
-    place = context.store.path / ".pchem" / "input.json"
     settings = context.config.input
-    known: dict[str, Any] = read_json(place) or {}
+    known: dict[str, Any] = read_json(_place(context)) or {}
     same_files = known.get("files") == list(settings.files)
     try:
         paths = input_paths(settings, context.base_dir)
@@ -45,8 +45,27 @@ def known_identity(context: StageContext) -> dict[str, Any]:
     with context.reporter.progress("ingest: hash", _mebibytes(quick["files"]), "MiB") as advance:
         identity = content_identity(paths, _Advance(context, advance))
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
-        write_json(place, {"files": list(settings.files), "quick": quick, "identity": identity})
+        keep_identity(context, quick, identity)
     return identity
+
+
+def identity_is_new(context: StageContext) -> bool:
+    """Tell whether nothing is known of the input yet."""
+    return read_json(_place(context)) is None
+
+
+def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[str, Any]) -> None:
+    """Keep the content identity of the input, with names, sizes and times of change of its files.
+
+    Raises:
+        StoreError: the store cannot be written.
+    """
+    files = list(context.config.input.files)
+    write_json(_place(context), {"files": files, "quick": quick, "identity": identity})
+
+
+def _place(context: StageContext) -> Path:
+    return context.store.path / ".pchem" / "input.json"
 
 
 def inspect_input(context: StageContext) -> None:

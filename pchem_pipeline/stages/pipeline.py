@@ -25,6 +25,7 @@ __all__ = [
     "OPTIONAL_STAGES",
     "STAGES",
     "StageState",
+    "cpu_seconds",
     "declaration_of",
     "execute",
     "load_stage",
@@ -179,7 +180,7 @@ def execute(name: str, context: StageContext) -> StageState:
     Raises:
         PchEmError: the stage cannot be done.
     """
-    clock = time.perf_counter(), _cpu_seconds()
+    clock = time.perf_counter(), cpu_seconds()
     stage = load_stage(name)
     before = status(stage, context)
     chosen = context.options.tiles is not None or context.options.roi is not None
@@ -195,6 +196,8 @@ def execute(name: str, context: StageContext) -> StageState:
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
+    if name == "histogram" and context.swept is not None:
+        clock = context.swept.clock
     return _perform(stage, context, before, restart=not chosen, clock=clock)
 
 
@@ -219,7 +222,7 @@ def _perform(
         resumes = False
     context.stage, context.failed, context.notes, context.n_keys = stage.NAME, {}, [], 0
     context.fingerprint = old.fingerprint if resumes and old is not None else fingerprint_of(content)
-    context.fresh = not resumes
+    context.fresh = not resumes and not context.is_swept
     if context.fresh:
         records.forget(stage.NAME)
         for path in stage.WRITES:
@@ -244,7 +247,7 @@ def _perform(
             record,
             keys=context.n_keys or record.keys,
             seconds=time.perf_counter() - wall + (old.seconds if resumes and old is not None else 0.0),
-            cpu_seconds=_cpu_seconds() - cpu + (old.cpu_seconds if resumes and old is not None else 0.0),
+            cpu_seconds=cpu_seconds() - cpu + (old.cpu_seconds if resumes and old is not None else 0.0),
             peak_rss_bytes=peak_rss_bytes(),
             failed=context.failed,
             notes=tuple(context.notes),
@@ -271,7 +274,8 @@ def _finish(stage: StageModule, context: StageContext, record: StageRecord) -> S
     return StageState(stage.NAME, "failed", why, done, record.keys)
 
 
-def _cpu_seconds() -> float:
+def cpu_seconds() -> float:
+    """Return the CPU time of this process and its finished children."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
 

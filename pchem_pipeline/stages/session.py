@@ -127,7 +127,7 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     if command.options.dry_run:
         return _dry_run(target, stages, command)
     with working_run(target, command) as context:
-        states = [execute(name, context) for name in stages]
+        states = [_execute(name, context, stages) for name in stages]
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
         if failed:
@@ -135,6 +135,15 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         if "fit" in stages:
             _check_failed_pixels(context)
     return states
+
+
+def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageState:
+    """Bring a stage up to date; where the input and the histograms are wanted, by one pass over the files."""
+    if name == "ingest" and "histogram" in stages:
+        from pchem_pipeline.stages.onepass import sweep_input
+
+        sweep_input(context)
+    return execute(name, context)
 
 
 @contextlib.contextmanager
