@@ -14,6 +14,7 @@ __all__ = ["verdict_text"]
 _WIDTH = 100
 #: Longer lists end with a count.
 _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
+_LEAD = "where: "
 _PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
 
 
@@ -28,13 +29,12 @@ def verdict_text(result: Mapping[str, Any]) -> str:
     """
     found = findings(result)
     lines = [*_wrapped(f"{found.verdict.upper()}: {headline(found)}", "  ")]
-    lines += _where(found.where)
+    lines += _places("where: ", found.where, _MOST_PLACES)
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
     if found.unexplained:
-        names = [f"{place.statistic} ({_sd(place.z)})" for place in found.unexplained[:_MOST_LEFT]]
-        lines += _listed("left unexplained", names, len(found.unexplained) - len(names))
+        lines += _places("left unexplained: ", found.unexplained, _MOST_LEFT)
     lines += [line for tag, why in found.left_out.items() for line in _wrapped(f"left out: {tag}: {why}")]
     if found.untestable:
         lines += _listed("not testable with such frames", list(found.untestable), 0)
@@ -51,16 +51,19 @@ def _listed(words: str, items: Sequence[str], more: int) -> list[str]:
     return _wrapped(f"{words}: {', '.join(items)}{f' and {more} more' if more > 0 else ''}")
 
 
-def _where(places: Sequence[Place]) -> list[str]:
+def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
     lines = []
-    for i, place in enumerate(places[:_MOST_PLACES]):
-        lead = "where: " if i == 0 else "       "
+    indent = " " * len(_LEAD)
+    for i, place in enumerate(places[:most]):
         spots = _spots(place)
         words = f"{place.sentence or place.statistic} ({_sd(place.z)}{f'; {spots}' if spots else ''})"
         first, *rest = _wrapped(words)
-        lines += [lead + first, *("       " + line for line in rest)]
-    more = len(places) - _MOST_PLACES
-    return [*lines, f"       and {more} more"] if more > 0 else lines
+        if i == 0 and len(title) > len(indent):
+            lines.append(title.rstrip())
+        lead = title if i == 0 and len(title) == len(indent) else indent
+        lines += [lead + first, *(indent + line for line in rest)]
+    more = len(places) - most
+    return [*lines, f"{indent}and {more} more"] if more > 0 else lines
 
 
 def _spots(place: Place) -> str:

@@ -1,9 +1,12 @@
 """Real data: spectra of a silicon photomultiplier, on which the plain PCD must fail and has to say so."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
+import pytest
+from commands import Shell
 
 from pchem_pipeline.model.fit_status import FitStatus
 from pchem_pipeline.store.run_store import RunStore
@@ -11,9 +14,16 @@ from pchem_pipeline.store.run_store import RunStore
 SPECTRA = sorted((Path(__file__).parents[1] / "data" / "sipm").glob("*.csv"))
 
 
-def test_ready_made_histograms_go_through_every_stage(shell):
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory, kernels):
+    """The spectra, run through every stage."""
+    shell = Shell(tmp_path_factory.mktemp("measured"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    return shell, shell.ok("run", *SPECTRA, "--store", "sipm.zarr")
+
+
+def test_ready_made_histograms_go_through_every_stage(measured):
     assert len(SPECTRA) == 6
-    result = shell.ok("run", *SPECTRA, "--store", "sipm.zarr")
+    shell, result = measured
     assert "every channel counting the same" in result.stderr
     store = RunStore.open(shell.folder / "sipm.zarr")
     counts = store.read("histogram/counts")
@@ -33,6 +43,36 @@ def test_ready_made_histograms_go_through_every_stage(shell):
     html = (store.path / "report.html").read_text()
     assert "does not describe" in html
     assert "M11_LED_dark" in html
+
+
+def test_the_search_names_what_physics_says_and_describes_the_rest(measured):
+    shell, _ = measured
+    before = RunStore.open(shell.folder / "sipm.zarr").read("fit/read_noise_dn")
+    result = shell.ok("discrepancy", "sipm.yaml")
+    found = json.loads((shell.folder / "sipm.zarr" / "discrepancy.json").read_text())
+    assert found["verdict"] == "named"
+    assert found["effects"] == ["branching_counts", "signal_dependent_noise"]
+    branching, widening = (step["parameters"] for step in found["steps"])
+    # seen by eye: every photoelectron is followed by a further one in about a fifth of the cases
+    assert 0.1 < branching["branching"]["value"] < 0.3
+    assert widening["noise_e"]["value"] > 2 * widening["noise_e"]["stderr"] > 0
+    # the near twin of the first is told apart, and closes less
+    first = found["steps"][0]
+    assert first["runner_up"]["effect"] == "overdispersed_counts"
+    assert first["runner_up"]["gap_after"] > first["gap_after"]
+    gap = found["gap"]
+    assert gap["after"] < 0.7 * gap["before"]
+    assert gap["interval_after"][1] < gap["interval_before"][0]
+    # the library holds neither the trigger that cuts the 0-electron peak nor afterpulses in the valleys
+    left = [place["sentence"] for place in found["unexplained"]]
+    assert left[0].startswith("fewer samples than the model has at the 0-electron peak")
+    assert any("more samples than the model has between the 1- and the 2-electron peak" in s for s in left)
+    assert {"row_noise", "interpixel_capacitance", "bias_drift"} <= set(found["untestable"])
+    assert "left unexplained:" in result.stdout
+    # the fit that follows has the effects: one sigma no longer stands for peaks that widen
+    shell.ok("fit", "sipm.yaml")
+    after = RunStore.open(shell.folder / "sipm.zarr").read("fit/read_noise_dn")
+    assert (after < 0.9 * before).all()
 
 
 def test_electron_numbers_need_frames(shell):
