@@ -87,6 +87,7 @@ def _discrepancy() -> list[Variable]:
         ("code_dn", ("code",), "int32", "DN", "digital number of the code axis"),
         ("code_observed", ("code",), "float64", "1", "samples at each DN, all usable pixels"),
         ("code_expected", ("code",), "float64", "1", "samples expected at each DN from the fitted PCDs"),
+        ("code_grown", ("code",), "float64", "1", "samples expected at each DN from the grown model"),
         ("frame_number", ("frame",), "int64", "1", "frame number in the run"),
         ("frame_charge", ("frame",), "float64", "1", "relative deviation of the exposure of each frame"),
         ("frame_readout", ("frame",), "float64", "DN", "mean readout residual of each frame"),

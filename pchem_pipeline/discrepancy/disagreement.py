@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.catalogue import EXACT
 from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere, two_sided
 
-__all__ = ["Measured", "disagrees", "misfits"]
+__all__ = ["Measured", "disagrees", "misfits", "suspicious"]
 
 FloatArray = NDArray[np.float64]
 
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
+_SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
 
 
@@ -54,6 +55,17 @@ def disagrees(null: NullModel, z: Measured, significance: float, tolerance: Floa
     same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
     return bool(np.any(same & (p < limit)))
+
+
+def suspicious(null: NullModel, z: Measured) -> bool:
+    """Tell whether some statistic deviates so far that a candidate may explain it together with others.
+
+    An effect moves many statistics a little: where none is beyond chance by itself, all in the direction that
+    the effect asks for may be.
+    """
+    p = two_sided(null.pulls(z.both, 2), null.freedom)
+    same = (z.train - null.mean) * (z.test - null.mean) > 0
+    return bool(same.any()) and look_elsewhere(float(p[same].min()), null.effective_tests) < _SUSPICION
 
 
 def misfits(

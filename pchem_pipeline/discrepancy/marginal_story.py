@@ -78,9 +78,11 @@ def tell_histograms(measured: Measurements, found: Explanation | None) -> Discre
     steps: tuple[Step, ...] = ()
     final_fit, after = measured.plain, measured.before
     residuals: tuple[Residual, ...] = ()
+    code_grown = None
     if found is not None:
         teller = _Teller(measured, found)
         steps, after, final_fit = teller.steps()
+        code_grown = teller.codes(final_fit)
         if measured.still or after.value > after.floor:
             residuals = teller.residuals(final_fit)
     verdict = _verdict(steps, found, measured.before, after)
@@ -109,6 +111,7 @@ def tell_histograms(measured: Measurements, found: Explanation | None) -> Discre
         statistics=(measured.nulls[0].names, pulls[0], pulls[1]),
         residuals=residuals,
         set_aside=tuple((i.low, i.high) for i in found.set_aside) if found and named and keep else (),
+        code_grown=code_grown,
     )
 
 
@@ -158,9 +161,7 @@ class _Teller:
         """Return the codes that the model does not account for, a peak that was set aside first."""
         counts, kept = self.measured.both.astype(np.float64), self.found.kept
         problem = self._problem(fitted.members)
-        mass = problem.masses(fitted.fit.theta, fitted.fit.shared)
-        inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
-        expected = mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True)
+        expected = self._expected(fitted)
         parameters = fitted.fit.parameters
         electrons = electrons_of(self.found.arena.origin, counts.shape[1], parameters)
         found = find_residuals(
@@ -179,6 +180,26 @@ class _Teller:
             )
             found.insert(0, aside)
         return tuple(found)
+
+    def codes(self, fitted: FittedSet) -> FloatArray | None:
+        """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
+        code = self.measured.evidence.code
+        expected, origin = self._expected(fitted), self.found.arena.origin
+        if self.measured.evidence.maps.usable.sum() != expected.shape[0]:
+            return None
+        found = np.zeros(code.observed.size)
+        for row, first in zip(expected, origin - code.first, strict=True):
+            at = first + np.arange(row.size)
+            within = (at >= 0) & (at < found.size)
+            np.add.at(found, at[within], row[within])
+        return np.asarray(found * code.observed.sum() / max(float(self.measured.both.sum()), 1.0))
+
+    def _expected(self, fitted: FittedSet) -> FloatArray:
+        """Return the samples of train and test expected at each code given those in codes that are kept."""
+        counts, kept = self.measured.both.astype(np.float64), self.found.kept
+        mass = self._problem(fitted.members).masses(fitted.fit.theta, fitted.fit.shared)
+        inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
+        return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))
 
     def _arena(self) -> Arena:
         old = self.found.arena

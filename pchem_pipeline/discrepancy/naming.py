@@ -85,12 +85,14 @@ class Choice:
         rivals: for each of its effects, who could stand in its place, itself first.
         probability: of each of its effects.
         tried: all sets, the likeliest first.
+        advantage: held-out log score of the best set over no effect at all, less its price, nats.
     """
 
     best: ScoredSet
     rivals: tuple[tuple[Rival, ...], ...]
     probability: tuple[float, ...]
     tried: tuple[ScoredSet, ...]
+    advantage: float
 
     def present(self, certainty: float) -> tuple[Hypothesis, ...]:
         """Return the effects of the best set in whose place there is something, with that probability."""
@@ -148,7 +150,7 @@ def choose(
             float(sum(w for s, w in zip(sets, weights, strict=True) if hypothesis.tag in s.tags))
         )
         rivals.append(_rivals(hypothesis, others, best, sets, weights, noise))
-    return Choice(best, tuple(rivals), tuple(probabilities), tuple(sets))
+    return Choice(best, tuple(rivals), tuple(probabilities), tuple(sets), best.worth - base)
 
 
 def _rivals(

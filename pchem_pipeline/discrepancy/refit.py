@@ -13,10 +13,10 @@ from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.evidence import PixelMaps
 from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.model.grown import fit_grown
+from pchem_pipeline.model.grown import fit_grown, marginal_mass
 from pchem_pipeline.model.histogram import histogram_frames
 
-__all__ = ["Refit", "refit_maps"]
+__all__ = ["Refit", "expected_codes", "refit_maps"]
 
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
@@ -65,6 +65,30 @@ def refit_maps(frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Se
         for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
     }
     return Refit(PixelMaps(exposure, gain, bias, noise, good.reshape(shape)), moved)
+
+
+def expected_codes(
+    maps: PixelMaps, effects: Sequence[Effect], codes: NDArray[np.integer], n_samples: int
+) -> NDArray[np.float64] | None:
+    """Return the samples that a grown model expects at each code, all usable pixels together.
+
+    Args:
+        maps: parameters of the pixels under the model.
+        effects: of the model.
+        codes: successive DN, shape (c,).
+        n_samples: of each pixel.
+
+    Returns:
+        Shape (c,); None where the effects give no law.
+    """
+    usable = maps.usable.ravel()
+    every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    flat = tuple(values.ravel()[usable] for values in every)
+    try:
+        law = marginal_model(effects, pixel_maps(flat, usable[usable]))
+    except ConfigError:
+        return None
+    return np.asarray(n_samples * marginal_mass(law, flat, codes, far_tails=False).sum(axis=0))
 
 
 def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:

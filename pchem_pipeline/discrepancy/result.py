@@ -182,6 +182,8 @@ class Discrepancy:
         residuals: codes that the final model does not account for (ready-made histograms).
         set_aside: codes that its fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
             limit.
+        code_grown: samples expected at each code of ``evidence.code`` from the final model; None where
+            nothing was added or the model gives no law.
     """
 
     verdict: Verdict
@@ -202,6 +204,7 @@ class Discrepancy:
     statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
     residuals: tuple[Residual, ...] = ()
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
+    code_grown: NDArray[np.float64] | None = None
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -68,6 +68,7 @@ def tell(
     left_out: Mapping[str, str],
     n_replicates: int,
     examined: Mapping[str, Any],
+    code_grown: FloatArray | None = None,
 ) -> Discrepancy:
     """Put the verdict together; see :class:`~pchem_pipeline.discrepancy.result.Discrepancy`."""
     n_samples = int(examined["final"]) * int(train.maps.usable.sum())
@@ -99,6 +100,7 @@ def tell(
         maps=maps,
         evidence=train,
         statistics=(first.names, pulls[0], pulls[1]),
+        code_grown=code_grown,
     )
 
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
 from pchem_pipeline.discrepancy.catalogue import EXACT, STATISTICS
-from pchem_pipeline.discrepancy.disagreement import Measured, disagrees
+from pchem_pipeline.discrepancy.disagreement import Measured, disagrees, suspicious
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, correction, fit_set, tolerance
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
-from pchem_pipeline.discrepancy.refit import refit_maps
+from pchem_pipeline.discrepancy.refit import expected_codes, refit_maps
 from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.result import Discrepancy
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -43,6 +43,7 @@ _NEAR = 0.1  # relative: so little is not worth another simulation, but can be c
 _TELLING = (
     4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
 )
+_CONVINCING = 4.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
@@ -128,14 +129,15 @@ class _Search:
         limit = self.settings.significance
         places = locate(train, null, z.both, limit)
         still = disagrees(null, z, limit)
-        while still and len(rounds) < self.settings.max_rounds:
+        search = still or suspicious(null, z)
+        while search and len(rounds) < self.settings.max_rounds:
             number = len(rounds)
             laboratory = self._laboratory(maps, names, number)
             shifts = (z.train - null.mean, z.test - null.mean)
             hypotheses = self._hypotheses(laboratory, classes, (train, test), shifts, self._noise(null, 2, z))
             choice = choose(hypotheses, shifts, self._noise(null, 1, z)) if hypotheses else None
             self.left_out |= laboratory.left_out
-            if choice is None:
+            if choice is None or not (still or choice.advantage > _CONVINCING):
                 break
             added = self._added(laboratory, choice, shifts, self._noise(null, 2, z))
             before, self.model = self.model, (*self.model, *(h.effect for h in added.hypotheses))
@@ -149,7 +151,7 @@ class _Search:
             maps = refit.maps
             rounds.append(Round(choice, added, tuple(hypotheses), null, grown, refit.moved))
             null = grown
-            still = disagrees(null, z, limit, self._tolerance(rounds))
+            search = still = disagrees(null, z, limit, self._tolerance(rounds))
         return self._result(rounds, first, null, z, places, train, maps, still)
 
     # -- pieces ---------------------------------------------------------------------------------
@@ -318,8 +320,11 @@ class _Search:
         maps: PixelMaps,
         still: bool,
     ) -> Discrepancy:
+        codes = train.code.first + np.arange(train.code.observed.size)
+        grown = expected_codes(maps, self.model, codes, self.splits.train.size) if rounds else None
         return tell(
             rounds,
+            code_grown=grown,
             first=first,
             last=last,
             z=z,

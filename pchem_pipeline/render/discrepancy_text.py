@@ -83,7 +83,8 @@ CAPTIONS: dict[str, str] = {
     ),
     "discrepancy_codes": (
         "All usable pixels together. Top: samples at each DN (gray) and those that the fitted PCDs lead to "
-        "expect (line). Below: their difference in standard deviations, even and odd DN in two colours; the "
+        "expect (black; with the named effects: orange). Below: the difference from the plain model in "
+        "standard deviations, even and odd DN in two colours; the "
         "gray band is two standard deviations. A single tall line is a pile-up, alternating colours are a "
         "comb of the ADC, a slow wave is its nonlinearity. Yellow: what the verdict points to."
     ),

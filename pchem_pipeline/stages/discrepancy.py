@@ -213,6 +213,7 @@ def _write(
         [s.effect for s in found.steps if s.effect is not None],
         context.integration_time or 1.0,
         context.config.input.bit_depth or context.sensor.bit_depth or 16,
+        found.code_grown,
     )
     for name, array in arrays.items():
         context.store.write_array(f"{NAME}/{name}", array)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
 from pchem_pipeline.discrepancy.gap import GapMetric
 from pchem_pipeline.discrepancy.naming import choose, score_set
 from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.refit import expected_codes
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
+from pchem_pipeline.effects.evidence import PixelMaps
 from pchem_pipeline.effects.registry import effect_class
 from pchem_pipeline.errors import InputError
 
@@ -205,6 +208,25 @@ def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
         gap = GapMetric(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
         below.append(gap.at_floor)
     assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
+
+
+def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None:
+    h, g, mu, sigma = np.array([[1.0, 2.5], [0.1, 0.08], [100.0, 104.5], [3.1, 4.2]]).reshape(4, 1, 2)
+    maps = PixelMaps(h, g, mu, sigma, np.array([[True, True]]))
+    codes = np.arange(70, 260)
+    k = np.arange(40)[:, None]
+    by_hand = np.zeros(codes.size)
+    for pixel in range(2):
+        analog = np.sqrt(sigma[0, pixel] ** 2 - 1 / 12)  # without quantisation
+        edges = (np.append(codes, 260) - 0.5 - mu[0, pixel] - k / g[0, pixel]) / analog
+        cells = np.diff(stats.norm.cdf(edges), axis=1)
+        by_hand += 300 * (stats.poisson.pmf(k, h[0, pixel]) * cells).sum(axis=0)
+    found = expected_codes(maps, [], codes, 300)
+    assert found is not None
+    np.testing.assert_allclose(found, by_hand, rtol=1e-8, atol=1e-9)
+    one = expected_codes(PixelMaps(h, g, mu, sigma, np.array([[True, False]])), [], codes, 300)
+    assert one is not None
+    assert one.sum() == pytest.approx(300, rel=1e-6)
 
 
 def test_every_statistic_belongs_to_a_family() -> None:

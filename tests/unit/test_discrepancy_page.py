@@ -243,7 +243,8 @@ def test_ready_made_histograms_have_no_pictures_of_time() -> None:
 def test_the_arrays_are_those_of_the_registry() -> None:
     seen = evidence()
     z_after = dict.fromkeys(seen.z, 0.0)
-    arrays = evidence_arrays(seen, after=z_after, effects=[effect_class("exposure_drift")(drift=0.02)])
+    drift = effect_class("exposure_drift")(drift=0.02)
+    arrays = evidence_arrays(seen, after=z_after, effects=[drift], code_grown=seen.code.expected)
     known = {variable.name: variable for variable in variables_of("discrepancy")}
     assert set(arrays) == set(known)
     sizes: dict[str, int] = {}
