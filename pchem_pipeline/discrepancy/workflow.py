@@ -43,7 +43,7 @@ _NEAR = 0.1  # relative: so little is not worth another simulation, but can be c
 _TELLING = (
     4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
 )
-_CONVINCING = 4.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
+_CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
