@@ -274,6 +274,26 @@ def _listed(text: str) -> tuple[str, ...]:
 
 
 @app.command()
+def view(
+    target: Target,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = 0,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="open the browser")] = False,
+) -> None:
+    """Show the report with every pixel in the browser, from a server on this computer.
+
+    It reads the run and changes nothing. Ends with Ctrl-C.
+    """
+    from pchem_pipeline.stages.view import serve
+
+    def ready(address: str) -> None:
+        typer.echo(address)
+        if show:
+            typer.launch(address)
+
+    serve(target, port, ready)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,

@@ -12,7 +12,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.inspector_data import InspectorData, MapEntry, PixelSample
@@ -20,10 +20,10 @@ from pchem_pipeline.render.packing import pack_counts
 from pchem_pipeline.render.style import MAP_COLOURS
 from pchem_pipeline.render.wording import unit_text
 
-__all__ = ["CONNECT_NOWHERE", "PANEL_MAPS", "Embedded", "content_policy", "embedded", "map_facts", "script"]
+__all__ = ["PANEL_MAPS", "Embedded", "content_policy", "embedded", "map_facts", "script", "served_page"]
 
-#: The part of the policy that forbids every connection; ``pchem view`` allows its own server instead.
-CONNECT_NOWHERE = "connect-src 'none'"
+#: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
+_CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
 
 #: Values in the table of a pixel, in its order; the others follow below.
 PANEL_MAPS = (
@@ -82,9 +82,25 @@ def content_policy(text: str | None = None) -> str:
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
         scripts = f"script-src 'sha256-{digest}'; "
     return (
-        f"default-src 'none'; {scripts}{CONNECT_NOWHERE}; img-src data:; style-src 'unsafe-inline'; "
+        f"default-src 'none'; {scripts}{_CONNECT_NOWHERE}; img-src data:; style-src 'unsafe-inline'; "
         "base-uri 'none'; form-action 'none'"
     )
+
+
+def served_page(page: str) -> str | None:
+    """Return a report as ``pchem view`` serves it: it may ask its own server, and knows that there is one.
+
+    Args:
+        page: a ``report.html``.
+
+    Returns:
+        The page; None where it holds no inspector of this version.
+    """
+    before, found, after = page.partition(str(escape(_CONNECT_NOWHERE)))
+    if not found or 'id="inspector-app"' not in after:
+        return None
+    mark, told = '<meta name="color-scheme"', '<meta name="pchem-view" content="yes">'
+    return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{told}\n{mark}", 1)
 
 
 def _json_for_html(content: Any) -> Markup:

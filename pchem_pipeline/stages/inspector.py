@@ -30,7 +30,15 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.sensor import SensorInfo
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["gather_inspector", "grown_masses", "listed_maps", "map_entry", "packed_map", "read_sample"]
+__all__ = [
+    "Listed",
+    "gather_inspector",
+    "grown_masses",
+    "listed_maps",
+    "map_entry",
+    "packed_map",
+    "read_sample",
+]
 
 #: Sensors with fewer pixels have all of them in the file.
 _ALL_PIXELS = 4096
@@ -66,14 +74,14 @@ _WORDS = re.compile(r"(\d+) ([^,;:]+)")
 
 
 @dataclass(frozen=True)
-class _Listed:
+class Listed:
     """A stored map: its variable and the attributes of its array."""
 
     variable: Variable
     attributes: Mapping[str, Any]
 
 
-def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[_Listed]:
+def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[Listed]:
     """Return the stored arrays with the dimensions (y, x) and the shape of the sensor, in the order shown."""
     known = [variable for variable in VARIABLES.values() if variable.dims == ("y", "x")]
     groups = [*_GROUPS, *dict.fromkeys(v.group for v in known if v.group not in _GROUPS)]
@@ -83,11 +91,11 @@ def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[_Listed]:
     for variable in known:
         repeated = variable.group == "fit" and f"maps/{variable.name}" in VARIABLES
         if not repeated and store.has(variable.path) and store.array(variable.path).shape == shape:
-            found.append(_Listed(variable, store.attributes(variable.path)))
+            found.append(Listed(variable, store.attributes(variable.path)))
     return found
 
 
-def map_entry(listed: _Listed) -> MapEntry:
+def map_entry(listed: Listed) -> MapEntry:
     """Return the words of a stored map; the map itself is not read."""
     variable, attributes = listed.variable, listed.attributes
     # the sentences of these groups begin with the name of the quantity, those of others explain it
@@ -145,7 +153,7 @@ def gather_inspector(
     return InspectorData(tuple(entries), sample, f"pchem view {quoted(Path(store.path.name))}")
 
 
-def _packed(store: RunStore, listed: Sequence[_Listed], shape: tuple[int, int]) -> list[MapEntry]:
+def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
     """Pack maps, the important ones first, until the budget is spent."""
     n = shape[0] * shape[1]
     budget = _MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** 0.75

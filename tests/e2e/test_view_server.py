@@ -1,0 +1,228 @@
+"""``pchem view``: every pixel of one run, to this computer's browser only, and nothing else."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import http.client
+import json
+import signal
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.model.pcd import pcd
+from pchem_pipeline.render.packing import PackedMap, Scale, unpack_map
+from pchem_pipeline.stages.view import make_server
+from pchem_pipeline.store.run_store import RunStore
+
+
+class Client:
+    """Asks the server, with any header."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+    def ask(self, method: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        names = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, headers=names)
+        answer = connection.getresponse()
+        found = answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+        connection.close()
+        return found
+
+    def json(self, path: str) -> dict:
+        status, _, content = self.ask("GET", path)
+        assert status == 200, content
+        return json.loads(content)
+
+
+@pytest.fixture(scope="module")
+def client(finished):
+    server, address = make_server(finished)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    assert address == f"http://127.0.0.1:{server.server_port}/"
+    yield Client(server.server_port)
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def digest(folder) -> str:
+    found = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            found.update(str(path).encode() + path.read_bytes())
+    return found.hexdigest()
+
+
+def test_the_page_may_ask_its_own_server_and_no_other(client, finished):
+    status, headers, content = client.ask("GET", "/")
+    page, stored = content.decode(), (finished / "report.html").read_text()
+    assert status == 200
+    assert headers["content-type"] == "text/html; charset=utf-8"
+    assert "connect-src &#39;self&#39;" in page
+    assert "connect-src &#39;none&#39;" not in page
+    assert "connect-src &#39;none&#39;" in stored
+    assert '<meta name="pchem-view" content="yes">' in page
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["cross-origin-resource-policy"] == "same-origin"
+    assert headers["content-security-policy"] == "frame-ancestors 'none'"
+    assert "access-control-allow-origin" not in headers
+
+
+@pytest.mark.parametrize("place", [(0, 0), (19, 27), (7, 13)])
+def test_every_pixel_as_the_store_has_it(client, finished, place):
+    store, (y, x) = RunStore.open(finished), place
+    pixel = client.json(f"/api/pixel?y={y}&x={x}")
+    counts, origin = store.read("histogram/counts")[y, x], int(store.read("histogram/origin")[y, x])
+    seen = dict(
+        zip(range(pixel["origin"], pixel["origin"] + len(pixel["counts"])), pixel["counts"], strict=True)
+    )
+    assert {dn: n for dn, n in seen.items() if n} == {
+        origin + int(b): int(counts[b]) for b in np.flatnonzero(counts)
+    }
+    assert pixel["mass"] is None
+    assert pixel["deciding"] is None
+    assert len(pixel["values"]) >= 25
+    for path, value in pixel["values"].items():
+        stored = float(store.read(path)[y, x])
+        assert value == stored if np.isfinite(stored) else value is None, path
+
+
+def test_a_whole_map_as_the_store_has_it(client, finished):
+    store = RunStore.open(finished)
+    found = client.json("/api/map?path=maps/bias")
+    packed = PackedMap(
+        Scale(found["low"], found["step"], found["log"]), found["nOdd"], base64.b64decode(found["data"])
+    )
+    stored, error = store.read("maps/bias"), np.nanmedian(store.read("maps/bias_stderr"))
+    np.testing.assert_allclose(unpack_map(packed, stored.shape), stored, rtol=0, atol=error / 16 * 1.001)
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "CONNECT"])
+def test_other_methods_are_refused(client, method):
+    status, headers, _ = client.ask(method, "/")
+    assert status == 405
+    assert headers["allow"] == "GET, HEAD"
+
+
+def test_unknown_methods_are_refused(client):
+    assert client.ask("MOVE", "/")[0] == 501
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1", "evil.example:80", "127.0.0.1:1", "", "[::1]:80"]
+)
+def test_other_hosts_are_refused(client, host):
+    assert client.ask("GET", "/", Host=host)[0] == 403
+    assert client.ask("GET", "/api/pixel?y=0&x=0", Host=host)[0] == 403
+
+
+def test_this_host_is_not_refused(client):
+    assert client.ask("GET", "/report.json", Host=f"localhost:{client.port}")[0] == 200
+    assert client.ask("HEAD", "/report.json", Host=f"127.0.0.1:{client.port}")[2] == b""
+
+
+def test_pages_of_other_sites_are_refused(client):
+    assert client.ask("GET", "/api/pixel?y=0&x=0", Origin="http://evil.example")[0] == 403
+    assert client.ask("GET", "/api/pixel?y=0&x=0", Origin="null")[0] == 403
+    assert client.ask("GET", "/api/pixel?y=0&x=0", Sec_Fetch_Site="cross-site")[0] == 403
+    assert client.ask("GET", "/api/pixel?y=0&x=0", Sec_Fetch_Site="same-origin")[0] == 200
+    assert client.ask("GET", "/api/pixel?y=0&x=0", Origin=f"http://127.0.0.1:{client.port}")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/zarr.json",
+        "/fit/bias/zarr.json",
+        "/.pchem/config.yaml",
+        "/../run.yaml",
+        "/%2e%2e/run.yaml",
+        "/report.html/../zarr.json",
+        "//etc/passwd",
+        "/figures/ensemble.svg",
+        "/api/",
+        "/api/map?path=frames/dn",
+        "/api/map?path=../fit/bias",
+        "/api/map?path=fit/bias&path=fit/bias",
+        "/api/pixel?y=20&x=0",
+        "/api/pixel?y=0&x=28",
+        "/discrepancy.html",
+    ],
+)
+def test_other_paths_are_not_there(client, path):
+    assert client.ask("GET", path)[0] == 404
+
+
+@pytest.mark.parametrize("query", ["", "y=1", "y=-1&x=0", "y=1.5&x=0", "y=1&x=0&z=3", "y=a&x=0", "y=１&x=0"])
+def test_pixels_that_are_none(client, query):
+    query = query.encode().decode("latin-1")
+    connection_path = f"/api/pixel?{query}".encode("latin-1").decode("latin-1")
+    if any(ord(sign) > 127 for sign in connection_path):
+        connection_path = "/api/pixel?y=%EF%BC%91&x=0"
+    assert client.ask("GET", connection_path)[0] == 400
+
+
+def test_nothing_is_written(client, finished):
+    before = digest(finished)
+    client.ask("GET", "/")
+    client.json("/api/pixel?y=3&x=4")
+    client.json("/api/map?path=fit/goodness_p")
+    client.ask("POST", "/api/pixel?y=3&x=4")
+    assert digest(finished) == before
+
+
+def test_it_listens_on_this_computer_only(finished):
+    server, _ = make_server(finished)
+    with server:
+        assert server.server_address[0] == "127.0.0.1"
+
+
+def test_a_taken_port_is_said(finished):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(ConfigError, match="cannot listen there"):
+            make_server(finished, taken.getsockname()[1])
+
+
+def test_runs_without_a_report_are_said(finished, tmp_path):
+    bare = RunStore.create(tmp_path / "bare.zarr")
+    bare.write_config((finished / ".pchem" / "config.yaml").read_text())
+    with pytest.raises(StoreError, match="has no report yet; run: pchem report"):
+        make_server(bare.path)
+    (bare.path / "report.html").write_text("<html></html>")
+    with pytest.raises(StoreError, match="of an earlier version"):
+        make_server(bare.path)
+
+
+def test_the_command_ends_well_with_ctrl_c(shell, finished):
+    process = shell.start("view", finished)
+    address = process.stdout.readline().strip()
+    assert address.startswith("http://127.0.0.1:")
+    client = Client(int(address.rstrip("/").rsplit(":")[-1]))
+    assert client.ask("GET", "/")[0] == 200
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (0, "", "")
+
+
+def test_a_pixel_is_enough_to_draw_its_fit(client):
+    """The parameters predict the histogram: counts within five standard errors where many are expected."""
+    pixel = client.json("/api/pixel?y=5&x=5")
+    theta = [
+        pixel["values"][f"maps/{name}"]
+        for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+    ]
+    counts = np.array(pixel["counts"])
+    expected = counts.sum() * pcd(pixel["origin"] + np.arange(counts.size), *theta)
+    pull = (counts - expected)[expected > 20] / np.sqrt(expected[expected > 20])
+    assert pull.size > 5
+    assert np.abs(pull).max() < 5
