@@ -294,6 +294,26 @@ def view(
 
 
 @app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("compare"),
+    tolerance: Annotated[
+        float, typer.Option(help="same frames: relative difference that counts as rounding")
+    ] = 1e-12,
+    workers: Workers = None,
+    progress: Progress = "auto",
+) -> None:
+    """Compare runs; exit code 3 if something changed.
+
+    Runs on the same frames are compared value by value, others in standard errors.
+    """
+    from pchem_pipeline.stages.compare import compare_runs
+
+    for path in compare_runs(runs, output, tolerance=tolerance, workers=workers, progress=progress):
+        typer.echo(path)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,

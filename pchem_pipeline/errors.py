@@ -11,6 +11,7 @@ from enum import IntEnum
 from pathlib import Path
 
 __all__ = [
+    "ChangedError",
     "ConfigError",
     "ExitCode",
     "IncompleteRunError",
@@ -59,6 +60,12 @@ class MissingDependencyError(ConfigError):
 
 class IncompleteRunError(PchEmError):
     """The run ended with failed tiles, or with more failed pixels than allowed."""
+
+    exit_code = ExitCode.INCOMPLETE
+
+
+class ChangedError(PchEmError):
+    """A comparison of runs found that something changed."""
 
     exit_code = ExitCode.INCOMPLETE
 

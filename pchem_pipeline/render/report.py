@@ -18,7 +18,7 @@ from pchem_pipeline.render.sections import Material, page_sections
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.tables import result_tables
 
-__all__ = ["RenderedReport", "render_report"]
+__all__ = ["RenderedReport", "render_report", "template"]
 
 _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
@@ -67,7 +67,7 @@ def render_report(
     if data.discrepancy is not None:
         view = discrepancy_view(data.discrepancy, picture)
     inspector = embedded(data)
-    page = _template("report.html.j2").render(
+    page = template("report.html.j2").render(
         title=data.title,
         data=data,
         flag_words=_FLAG_WORDS,
@@ -84,12 +84,13 @@ def _discrepancy_page(data: ReportData, view: DiscrepancyView[Picture]) -> str:
     about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
     if data.n_frames:
         about += f"{', ' if about else ''}{data.n_frames:,} frames"
-    return _template("discrepancy.html.j2").render(
+    return template("discrepancy.html.j2").render(
         title=data.title, about=about, view=view, flag_words=_FLAG_WORDS, flag_signs=_FLAG_SIGNS
     )
 
 
-def _template(name: str) -> jinja2.Template:
+def template(name: str) -> jinja2.Template:
+    """Return a template of this package's pages."""
     folder = importlib.resources.files("pchem_pipeline.render") / "templates"
     environment = jinja2.Environment(
         autoescape=True,

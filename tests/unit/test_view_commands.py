@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from pchem_pipeline import cli
 from pchem_pipeline.errors import ConfigError, StoreError
-from pchem_pipeline.stages import figures
+from pchem_pipeline.stages import compare, figures
 from pchem_pipeline.stages.figures import Wanted, figures_of_run
 
 
@@ -49,3 +49,19 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted: Wanted,
 def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="there is no run at"):
         figures_of_run(tmp_path, tmp_path / "out", Wanted())
+
+
+def test_runs_are_compared_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+
+    def call(*arguments: object, **options: object) -> list[Path]:
+        seen.append((arguments, options))
+        return [Path("out/compare.html")]
+
+    monkeypatch.setattr(compare, "compare_runs", call)
+    shown = invoke(
+        "compare", "a.zarr", "b.zarr", "c.zarr", "-o", "out", "--tolerance", "1e-9", "--workers", "1"
+    )
+    assert shown == "out/compare.html\n"
+    options = {"tolerance": 1e-9, "workers": 1, "progress": "auto"}
+    assert seen == [(([Path("a.zarr"), Path("b.zarr"), Path("c.zarr")], Path("out")), options)]

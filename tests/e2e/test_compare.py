@@ -1,0 +1,147 @@
+"""Runs compared: a rerun is proven to be the same, and what changed is found and shown."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.errors import ChangedError, ConfigError, StoreError
+from pchem_pipeline.stages.compare import compare_runs, comparison_of
+from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.store.run_store import RunStore
+
+
+@pytest.fixture
+def copies(shell, finished):
+    for name in ("a", "b"):
+        shutil.copytree(finished, shell.folder / f"{name}.zarr")
+    return RunStore.open(shell.folder / "b.zarr", writable=True)
+
+
+def here(shell, *names):
+    """Compare in this process: the message where something changed, else nothing."""
+    try:
+        compare_runs(
+            [shell.folder / name for name in names], shell.folder / "compare", workers=1, progress="off"
+        )
+    except ChangedError as change:
+        return str(change)
+    return ""
+
+
+def whole(store, name):
+    return (slice(None),) * store.array(name).ndim
+
+
+def numbers(shell, folder="compare"):
+    return json.loads((shell.folder / folder / "compare.json").read_text())
+
+
+def test_nothing_changed_is_proven_by_digests(shell, copies):
+    result = shell.ok("compare", "a.zarr", "b.zarr")
+    assert result.stdout.split() == ["compare/compare.html", "compare/compare.json"]
+    [pair] = numbers(shell)["comparisons"]
+    assert (pair["same_data"], pair["changed"], pair["what"]) == (True, False, [])
+    rows = {row["name"]: row for row in pair["arrays"]}
+    assert {row["state"] for row in rows.values()} == {"identical"}
+    assert len(rows) > 60
+    for name in ("histogram/counts", "fit/covariance", "summary/row_sum", "ensemble/epcd_exact"):
+        values = np.ascontiguousarray(copies.read(name))
+        digest = hashlib.sha256(values.tobytes()).hexdigest()
+        assert rows[name]["sha256"] == [digest, digest]
+        assert rows[name]["n_values"] == values.size
+    page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")
+    assert "Nothing changed" in page
+    assert "identical to the bit" in page
+    for source in re.findall(r'(?:src|srcset|href)="([^"]*)"', page):
+        assert source.startswith(("data:image/", "#"))
+
+
+def test_one_value_that_moved_is_found(shell, copies):
+    bias = copies.read("maps/bias")
+    y, x = np.argwhere(np.isfinite(bias))[5]
+    bias[y, x] *= 1 + 1e-9
+    copies.write("maps/bias", whole(copies, "maps/bias"), bias)
+    result = shell("compare", "a.zarr", "b.zarr", "-o", "out")
+    assert result.code == 3
+    assert result.stdout == ""
+    assert "maps/bias: 1 value of 560 changed" in result.last
+    assert "out/compare.html" in result.last
+    [pair] = numbers(shell, "out")["comparisons"]
+    states = {row["name"]: row["state"] for row in pair["arrays"]}
+    assert [name for name, state in states.items() if state != "identical"] == ["maps/bias"]
+    pair = comparison_of([shell.folder / "a.zarr", shell.folder / "b.zarr"], 1e-6, Reporter("off")).pairs[0]
+    assert not pair.changed
+    assert "equal" in {row.state for row in pair.arrays}
+
+
+def test_lost_and_new_arrays_settings_and_versions(shell, copies):
+    copies.delete("fit/goodness_p")
+    copies.delete("fit/n_iterations")
+    shutil.rmtree(shell.folder / "a.zarr" / "ensemble" / "epcd_independent")
+    copies.write_config((copies.config_text() or "").replace("gap_threshold: 5.0", "gap_threshold: 7.0"))
+    assert "fit/goodness_p: is not there any more" in here(shell, "a.zarr", "b.zarr")
+    [pair] = numbers(shell)["comparisons"]
+    assert pair["what"] == [
+        "fit/goodness_p: is not there any more."
+    ]  # what is new, or no result, counts nothing
+    assert pair["settings"] == [
+        {"name": "fit.gap_threshold", "one": "5.0", "other": "7.0", "stages": ["fit"]}
+    ]
+    assert pair["versions"] == []
+
+
+def other_capture(store, *, exposure=1.0, seed=1):
+    """Make of a run what another capture would have given: noise of its standard errors, other frames."""
+    rng = np.random.default_rng(seed)
+    for name in (
+        "quanta_exposure",
+        "conversion_gain",
+        "bias",
+        "read_noise_dn",
+        "read_noise_e",
+        "dark_current",
+    ):
+        values, error = store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
+        factor = exposure if name in ("quanta_exposure", "dark_current") else 1.0
+        values = factor * values + np.sqrt(2) * error * rng.standard_normal(values.shape)
+        store.write(f"maps/{name}", whole(store, f"maps/{name}"), values)
+    store.delete("maps/analog_read_noise_e")
+    sensor = store.attributes("frames")["sensor"]
+    sensor["identity"]["digest"] = f"capture {seed}"
+    store.set_attributes("frames", {"sensor": sensor})
+
+
+def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
+    other_capture(copies)
+    shutil.copytree(finished, shell.folder / "warm <b>.zarr")
+    warm = RunStore.open(shell.folder / "warm <b>.zarr", writable=True)
+    other_capture(warm, exposure=1.2, seed=2)
+    assert "Against A (a.zarr), C changed; B did not." in here(shell, "a.zarr", "b.zarr", "warm <b>.zarr")
+    same, moved = numbers(shell)["comparisons"]
+    assert not same["changed"]
+    assert moved["maps"]["dark_current"]["reasons"]["shifted"]
+    assert not any(moved["maps"]["bias"]["reasons"].values())
+    # 20 % of the exposure is many standard errors: the test can fail
+    z = moved["maps"]["dark_current"]["median_z"] / np.sqrt(
+        np.pi / (2 * moved["maps"]["dark_current"]["n_counted"])
+    )
+    assert z > 20
+    page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")
+    assert "warm &lt;b&gt;.zarr" in page
+    assert "<b>.zarr" not in page
+
+
+def test_bad_input_gets_one_line(shell, finished):
+    result = shell("compare", finished)
+    assert (result.code, result.last) == (2, "pchem: compare: 1 runs given; give two or more, up to 26")
+    with pytest.raises(ConfigError, match=r"nothing\.zarr does not exist"):
+        here(shell, finished, "nothing.zarr")
+    RunStore.create(shell.folder / "empty.zarr")
+    with pytest.raises(StoreError, match=r"empty\.zarr"):
+        here(shell, finished, "empty.zarr")

@@ -1,0 +1,112 @@
+"""Differences of runs: value by value, and in standard errors with limits from theory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.model.differences import (
+    BlockDifference,
+    compare_blocks,
+    compare_maps,
+    reasons_of_change,
+)
+
+SHAPE = (100, 100)
+N = 10_000
+GOOD = np.ones(SHAPE, dtype=bool)
+
+
+def test_integers_are_equal_or_not() -> None:
+    a = np.array([[0, 5], [7, 65535]], dtype=np.uint16)
+    b = np.array([[1, 5], [7, 0]], dtype=np.uint16)
+    assert compare_blocks(a, a, scale=1, tolerance=0.5) == BlockDifference(4, 0, 0, 0.0)
+    # unsigned differences do not wrap round
+    assert compare_blocks(a, b, scale=65535, tolerance=0.5) == BlockDifference(4, 2, 2, 65535.0)
+    assert compare_blocks(a, b.astype(np.int64), scale=1, tolerance=0).n_beyond == 2
+
+
+def test_floats_are_equal_within_rounding_of_the_largest() -> None:
+    a = np.array([1.0, 100.0, np.nan, np.inf, 0.0])
+    b = np.array([1.0 + 5e-11, 100.0, np.nan, np.inf, -0.0])
+    assert compare_blocks(a, b, scale=100, tolerance=1e-12).n_beyond == 0
+    assert compare_blocks(a, b, scale=100, tolerance=1e-12).n_different == 1
+    found = compare_blocks(a, b, scale=100, tolerance=1e-13)
+    assert (found.n_beyond, found.largest) == (1, pytest.approx(5e-11, rel=1e-3))
+
+
+@pytest.mark.parametrize("odd", [(np.nan, 1.0), (1.0, np.nan), (np.inf, 1.0), (np.inf, -np.inf)])
+def test_a_value_that_came_or_went_is_beyond_rounding(odd: tuple[float, float]) -> None:
+    found = compare_blocks(np.array([odd[0]]), np.array([odd[1]]), scale=1e9, tolerance=0.1)
+    assert found.n_beyond == 1
+
+
+def test_blocks_add_up() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.normal(size=(60, 7))
+    b = a + rng.normal(size=a.shape) * (rng.random(a.shape) < 0.2)
+    whole = compare_blocks(a, b, scale=3, tolerance=1e-12)
+    parts = BlockDifference(0, 0, 0, 0.0)
+    for start in range(0, 60, 11):
+        parts += compare_blocks(a[start : start + 11], b[start : start + 11], scale=3, tolerance=1e-12)
+    assert parts == whole
+    assert 0 < whole.n_beyond == int((a != b).sum())
+
+
+def two_captures(seed: int, *, shift: float = 0.0, scatter: float = 1.0) -> tuple:
+    """Two measurements of one map, shift in standard errors of a difference."""
+    rng = np.random.default_rng(seed)
+    true, error = rng.normal(100, 5, SHAPE), rng.uniform(0.5, 2.0, SHAPE)
+    one = true + error * rng.standard_normal(SHAPE)
+    other = true + scatter * error * rng.standard_normal(SHAPE) + shift * np.sqrt(2) * error
+    return (one, error), (other, error)
+
+
+def test_two_captures_of_the_same_sensor_agree() -> None:
+    found = compare_maps(*two_captures(2), GOOD, same_data=False)
+    assert abs(found.median_z) < 5 * np.sqrt(np.pi / (2 * N))
+    assert abs(found.spread_z - 1) < 5 * 1.166 / np.sqrt(N)
+    assert not reasons_of_change(found)
+
+
+def test_a_shift_of_a_tenth_of_an_error_is_seen() -> None:
+    found = compare_maps(*two_captures(3, shift=0.3), GOOD, same_data=False)
+    # 0.3 errors are 24 standard errors of the median of 10,000 pixels: the test can fail
+    assert found.median_z / np.sqrt(np.pi / (2 * N)) > 20
+    reasons = reasons_of_change(found)
+    assert (reasons.shifted, reasons.spread, reasons.pixels) == (True, False, False)
+    assert found.median / found.median_stderr > 10
+
+
+def test_pixels_that_scatter_or_jump_are_seen() -> None:
+    reasons = reasons_of_change(compare_maps(*two_captures(4, scatter=2.5), GOOD, same_data=False))
+    assert reasons.spread
+    one, other = two_captures(5)
+    jumped = other[0].copy()
+    jumped[:2, :30] += 50 * other[1][:2, :30]
+    found = compare_maps(one, (jumped, other[1]), GOOD, same_data=False)
+    assert found.n_far == 60
+    reasons = reasons_of_change(found)
+    assert (reasons.shifted, reasons.spread, reasons.pixels) == (False, False, True)
+    # pixels without a good fit do not count
+    bad = GOOD.copy()
+    bad[:2, :30] = False
+    assert not reasons_of_change(compare_maps(one, (jumped, other[1]), bad, same_data=False))
+
+
+def test_missing_values_are_counted_and_the_unit_follows_the_data() -> None:
+    (one, error), (other, _) = two_captures(6)
+    lost, came = one.copy(), other.copy()
+    lost[0, :3], came[0, 2:7] = np.nan, np.nan
+    found = compare_maps((lost, error), (came, error), GOOD, same_data=False)
+    assert (found.n_both, found.n_only_one, found.n_only_other) == (N - 7, 4, 2)
+    np.testing.assert_allclose(found.z[5], (other - one)[5] / (np.sqrt(2) * error[5]), rtol=1e-12)
+    same = compare_maps((one, error), (other, error), GOOD, same_data=True)
+    np.testing.assert_allclose(same.z, (other - one) / error, rtol=1e-12)
+
+
+def test_nothing_to_compare_is_no_change() -> None:
+    empty = np.full((2, 2), np.nan)
+    found = compare_maps((empty, empty), (empty, empty), np.ones((2, 2), bool), same_data=False)
+    assert found.n_counted == 0
+    assert not reasons_of_change(found)
