@@ -8,7 +8,7 @@ whatever the model of the run.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,7 @@ from pchem_pipeline.errors import InputError, PchEmError
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.histogram import histogram_frames
 from pchem_pipeline.model.pchem import fit_histograms
-
-if TYPE_CHECKING:
-    from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.settings import FitSettings
 
 __all__ = ["MINIMUM_BLOCKS", "UNTRUSTWORTHY", "observe", "observe_histograms"]
 
@@ -156,7 +154,9 @@ def _marginal(
     if near is not None:
         known = (near.quanta_exposure, near.conversion_gain, near.bias, near.read_noise_dn)
         start = np.stack([values.ravel() for values in known], axis=1)
-    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=fit, start=start)
+    # every sample counts here: what the tail guard would leave out is what is looked for
+    settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
+    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
     parameters = np.stack(
         [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
     )

@@ -170,12 +170,13 @@ def refitted(
         The fitted PCDs; that of ``laws`` where the fit fails.
     """
     from pchem_pipeline.model.pchem import fit_histograms
+    from pchem_pipeline.model.settings import FitSettings
 
     origin = np.array([codes[0] for codes, _ in masses], np.int64)
     counts = np.zeros((len(masses), max(codes.size for codes, _ in masses)), np.uint32)
     for row, (_, mass) in zip(counts, masses, strict=True):
         row[: mass.size] = np.rint(mass * _SAMPLES)
-    fit = fit_histograms(counts, origin)
+    fit = fit_histograms(counts, origin, settings=FitSettings(tail_guard=0))
     good = np.isfinite(fit.quanta_exposure)
     maps = PixelMaps(fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn, good)
     return [PixelLaw(maps, i, n_frames) if good[i] else laws[i] for i in range(len(laws))]

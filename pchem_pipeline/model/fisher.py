@@ -5,10 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.model import estep_numba, fisher_numba, workspace_numba
+from pchem_pipeline.model import estep_numba, fisher_numba, information_numba, workspace_numba
 from pchem_pipeline.model.pcd import pcd
+from pchem_pipeline.model.start import kernel_counts
 
-__all__ = ["cramer_rao", "cramer_rao_stderr", "observed_covariance", "propagate"]
+__all__ = [
+    "CORRELATION_PAIRS",
+    "correlations",
+    "covariance_from",
+    "cramer_rao",
+    "cramer_rao_stderr",
+    "observed_covariance",
+    "propagate",
+    "sandwich_covariance",
+]
+
+#: Pairs of parameters, in the order of the axis ``parameter_pair``; numbers as in ``variables.PARAMETERS``.
+CORRELATION_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 _NODES_PER_SIGMA = 4.0  # the sum over nodes is then exact to rounding: the density is smooth
 
@@ -100,3 +113,75 @@ def propagate(covariance: NDArray[np.float64], gradient: NDArray[np.float64]) ->
         ``sqrt(gradient' covariance gradient)``, shape (...).
     """
     return np.asarray(np.sqrt(np.einsum("...i,...ij,...j->...", gradient, covariance, gradient)))
+
+
+def sandwich_covariance(
+    counts: NDArray[np.integer],
+    origin: NDArray[np.integer],
+    parameters: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    tail_guard: float = 0.0,
+) -> NDArray[np.float64]:
+    """Return the covariance of the estimates that holds even where the model does not (White 1982).
+
+    ``C (sum_i c_i s_i s_i') C`` with the inverse information C and the score s of each sample: it describes
+    how estimates scatter from one set of frames to the next whatever the samples' law is, about the
+    parameters of the nearest PCD. Where the model holds it agrees with C.
+
+    Args:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma) at the maximum, shape (n, 4); NaN where there is none.
+        covariance: inverse of the observed information, shape (n, 4, 4); NaN where a bound holds a parameter.
+        tail_guard: of the fit; samples that it left out do not count.
+
+    Returns:
+        Covariance of (H, g, mu, sigma), shape (n, 4, 4), NaN where ``covariance`` is.
+    """
+    middle = np.empty((counts.shape[0], 4, 4))
+    information_numba.outer_scores(
+        kernel_counts(counts),
+        np.ascontiguousarray(origin, np.int64),
+        np.ascontiguousarray(parameters, np.float64),
+        tail_guard,
+        middle,
+    )
+    bread = np.where(np.isfinite(covariance), covariance, 0.0)
+    with np.errstate(invalid="ignore"):
+        found = bread @ middle @ bread
+    return np.where(np.isfinite(covariance), found, np.nan)
+
+
+def correlations(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the six correlations of (H, g, mu, sigma), see :data:`CORRELATION_PAIRS`.
+
+    With the four standard errors they are the covariance, each number once.
+
+    Args:
+        covariance: shape (..., 4, 4).
+
+    Returns:
+        Correlations, shape (..., 6); NaN where a parameter has no standard error.
+    """
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    pairs = [
+        covariance[..., i, j] / np.sqrt(variances[..., i] * variances[..., j]) for i, j in CORRELATION_PAIRS
+    ]
+    return np.stack(pairs, axis=-1)
+
+
+def covariance_from(stderr: NDArray[np.float64], correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Put the covariance of (H, g, mu, sigma) together again; the opposite of :func:`correlations`.
+
+    Args:
+        stderr: standard errors, shape (..., 4).
+        correlation: shape (..., 6).
+
+    Returns:
+        Covariance, shape (..., 4, 4).
+    """
+    covariance = stderr[..., :, None] * stderr[..., None, :]
+    for place, (i, j) in enumerate(CORRELATION_PAIRS):
+        covariance[..., i, j] *= correlation[..., place]
+        covariance[..., j, i] *= correlation[..., place]
+    return covariance

@@ -120,8 +120,9 @@ def fit_grown(
         fit_status=status.astype(np.uint16),
         n_iterations=words[:, grown_numba.EVALUATIONS].astype(np.int32),
         goodness_chi2=chi2.copy(),
-        goodness_dof=dof.astype(np.int32),
+        goodness_dof=dof.astype(np.float64),
         goodness_p=probability,
+        outlier_share=np.zeros(chi2.size),
         lobe_amplitude_e=np.where(weight > 0, out[:, grown_numba.AMPLITUDE], np.nan),
         lobe_weight=weight,
     )

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtrc
 
-from pchem_pipeline.model import pchem_numba, polish_numba, workspace_numba
+from pchem_pipeline.model import (
+    fit_tile_numba,
+    information_numba,
+    pchem_numba,
+    polish_numba,
+    workspace_numba,
+)
+from pchem_pipeline.model.fisher import sandwich_covariance
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.model.start import kernel_counts
@@ -18,6 +25,9 @@ from pchem_pipeline.model.start_numba import regression_basis
 __all__ = ["EmTrace", "FitResult", "em_trace", "fit_histograms"]
 
 WARM_UP = 1  # EM steps before the first Newton step
+
+#: Frames below which merging bins for the chi-square test hides part of what the parameters know.
+_FEW_FRAMES = 5000
 
 
 @dataclass(frozen=True)
@@ -29,8 +39,8 @@ class FitResult:
         conversion_gain: g, e-/DN, shape (n,).
         bias: mu, DN, shape (n,).
         read_noise_dn: sigma, DN, quantisation included, shape (n,).
-        covariance: of (H, g, mu, sigma), the inverse of the observed information (Louis 1982), shape (n, 4,
-            4); NaN in the row and column of a parameter at its bound.
+        covariance: of (H, g, mu, sigma), the inverse of the observed information (Louis 1982), or the
+            sandwich (White 1982), shape (n, 4, 4); NaN in the row and column of a parameter at its bound.
         log_likelihood: ``sum_i c_i log f_X(x_i)``, nats, shape (n,).
         likelihood_gap: nats between the likelihood kept and the runner-up, shape (n,). Runners-up are the
             maxima reached from the neighbours (H -+ 1, mu +- 1/g), the other maxima found, and the best
@@ -42,8 +52,11 @@ class FitResult:
         fit_status: bits of :class:`~pchem_pipeline.model.fit_status.FitStatus`, uint16, shape (n,).
         n_iterations: evaluations of the likelihood, all starts and neighbours together, int32, shape (n,).
         goodness_chi2: Pearson chi-square, adjacent DN merged until 5 counts are expected, shape (n,).
-        goodness_dof: its degrees of freedom, groups - 5, int32, shape (n,); 0 if there are none.
+        goodness_dof: its degrees of freedom, groups - 5, shape (n,); 0 if there are none. With few frames
+            more, up to groups - 1: as far as the groups do not determine the four fitted parameters
+            (Chernoff and Lehmann 1954).
         goodness_p: probability of a larger chi-square, shape (n,); NaN without degrees of freedom.
+        outlier_share: share of the samples that the tail guard left out of the likelihood, shape (n,).
     """
 
     quanta_exposure: NDArray[np.float64]
@@ -56,8 +69,9 @@ class FitResult:
     fit_status: NDArray[np.uint16]
     n_iterations: NDArray[np.int32]
     goodness_chi2: NDArray[np.float64]
-    goodness_dof: NDArray[np.int32]
+    goodness_dof: NDArray[np.float64]
     goodness_p: NDArray[np.float64]
+    outlier_share: NDArray[np.float64]
 
 
 class EmTrace(NamedTuple):
@@ -92,6 +106,9 @@ def fit_histograms(
     what cannot be fitted holds NaN and a reason. The answer for a pixel does not depend on the others in the
     batch.
 
+    Samples that the model does not expect at all are left out (setting ``tail_guard``): a few outliers move
+    nothing, and a pixel without any has the very estimates that it would have without the guard.
+
     Args:
         counts: histograms, shape (n, B), any unsigned type.
         origin: DN of bin 0, shape (n,).
@@ -112,9 +129,10 @@ def fit_histograms(
     parameters, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
     out = np.full((n, pchem_numba.N_OUT), np.nan)
     words = np.zeros((n, pchem_numba.N_WORDS), np.int64)
-    pchem_numba.fit_tile(
+    first = np.ascontiguousarray(origin, np.int64)
+    fit_tile_numba.fit_tile(
         counts,
-        np.ascontiguousarray(origin, np.int64),
+        first,
         regression_basis(),
         _limits(settings),
         np.empty((0, 4)) if start is None else np.ascontiguousarray(start, np.float64),
@@ -123,12 +141,16 @@ def fit_histograms(
         out,
         words,
     )
-    chi2, dof = out[:, pchem_numba.CHI2], words[:, pchem_numba.FREEDOM]
+    frames = np.asarray(counts.sum(axis=1), np.float64)
+    outliers = np.nan_to_num(out[:, pchem_numba.OUTLYING])
+    chi2, dof = out[:, pchem_numba.CHI2], _freedom(words, frames - outliers, parameters, covariance)
     probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
     status = _status(words, probability, under, over, settings, adc_limits)
     failed = (status & FAILED) != 0
     parameters[failed] = np.nan
     covariance[failed] = np.nan
+    if settings.errors == "sandwich":
+        covariance = sandwich_covariance(counts, first, parameters, covariance, settings.tail_guard)
     exposure, gain, bias, sigma = np.ascontiguousarray(parameters.T)
     return FitResult(
         quanta_exposure=exposure,
@@ -141,9 +163,31 @@ def fit_histograms(
         fit_status=status.astype(np.uint16),
         n_iterations=words[:, pchem_numba.EVALUATIONS].astype(np.int32),
         goodness_chi2=chi2.copy(),
-        goodness_dof=dof.astype(np.int32),
+        goodness_dof=dof,
         goodness_p=probability,
+        outlier_share=outliers / np.maximum(frames, 1.0),
     )
+
+
+def _freedom(
+    words: NDArray[np.int64],
+    frames: NDArray[np.float64],
+    parameters: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the degrees of freedom of chi-square, those that merged bins leave to it included.
+
+    The estimates know every DN, the test only the groups: of the four parameters it loses as many as the
+    groups determine (Chernoff and Lehmann 1954). Many frames leave few DN merged, and that is all four.
+    """
+    freedom = words[:, pchem_numba.FREEDOM].astype(np.float64)
+    few = np.flatnonzero((freedom > 0) & (frames < _FEW_FRAMES))
+    if few.size:
+        known = np.empty(few.size)
+        ends = (words[few, pchem_numba.LOWEST_DN], words[few, pchem_numba.HIGHEST_DN])
+        information_numba.grouped_trace(*ends, frames[few], parameters[few], covariance[few], known)
+        freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
+    return freedom
 
 
 def _status(
@@ -178,6 +222,8 @@ def _limits(settings: FitSettings) -> NDArray[np.float64]:
     limits[polish_numba.ONLY_EM] = em
     limits[pchem_numba.GAP_THRESHOLD] = settings.gap_threshold
     limits[pchem_numba.NOISE_LIMIT] = settings.read_noise_limit
+    limits[pchem_numba.FLOOR] = settings.tail_guard
+    limits[pchem_numba.MOST_OUTLIERS] = settings.tail_guard_share
     return limits
 
 

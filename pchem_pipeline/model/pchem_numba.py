@@ -1,4 +1,4 @@
-"""The fit of one pixel and the loop over the pixels of a tile."""
+"""The fit of one pixel, from its starts to the likeliest maximum."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.candidates_numba import N_OTHERS, first_start, other_start
 from pchem_pipeline.model.estep_numba import LOG_2PI, evaluate
-from pchem_pipeline.model.fisher_numba import to_natural
 from pchem_pipeline.model.goodness_numba import normal_score, pearson
+from pchem_pipeline.model.outliers_numba import outlying
 from pchem_pipeline.model.polish_numba import (
     CONVERGED,
     DEGENERATE,
-    MAX_STEP,
     MIN_LOG_EXPOSURE,
     N_POLISH_LIMITS,
-    min_log_variance,
     polish,
     same_maximum,
 )
@@ -26,10 +24,6 @@ from pchem_pipeline.model.workspace_numba import (
     Histogram,
     Workspace,
     copy,
-    load,
-    make_rows,
-    make_workspace,
-    share_workspace,
 )
 
 # bits of fit_status; a test compares them with FitStatus
@@ -38,11 +32,12 @@ BIAS_AMBIGUOUS, NOT_INFORMATIVE, COARSE_STEPS = 32, 64, 1024
 
 # places in `limits`, after those of `polish`
 GAP_THRESHOLD, NOISE_LIMIT = N_POLISH_LIMITS, N_POLISH_LIMITS + 1
-N_LIMITS = N_POLISH_LIMITS + 2
+FLOOR, MOST_OUTLIERS = N_POLISH_LIMITS + 2, N_POLISH_LIMITS + 3  # of the tail guard; a floor of 0 is none
+N_LIMITS = N_POLISH_LIMITS + 4
 
 # columns of `out`
-LOG_LIKELIHOOD, GAP, CHI2 = 0, 1, 2
-N_OUT = 3
+LOG_LIKELIHOOD, GAP, CHI2, OUTLYING = 0, 1, 2, 3
+N_OUT = 4
 
 # columns of `words`
 STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN = range(5)
@@ -146,6 +141,15 @@ def _judge(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
+def _compare(
+    histogram: Histogram, at_best: Workspace, floor: float, out: NDArray[np.float64]
+) -> tuple[float, int]:
+    """Return chi-square and degrees of freedom; count the samples that are not expected in ``out``."""
+    out[OUTLYING] = outlying(histogram.weights, at_best.rows[0], histogram.n_bins, floor)
+    return pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
 def fit_pixel(
     histogram: Histogram,
     basis: NDArray[np.float64],
@@ -187,7 +191,7 @@ def fit_pixel(
         outcome, loglik, used = polish(histogram, trial, limits, -math.inf, trial, math.inf, space)
         if outcome == CONVERGED:
             evaluate(histogram, trial, at_best, histogram.n)
-            out[CHI2], freedom = pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
+            out[CHI2], freedom = _compare(histogram, at_best, limits[FLOOR], out)
             if normal_score(out[CHI2], freedom) < _SUSPICIOUS:
                 copy(trial, best)
                 out[LOG_LIKELIHOOD], out[GAP] = loglik, loglik - gaussian
@@ -215,7 +219,7 @@ def fit_pixel(
         used += count + 1
         runner_up = max(beside, runner_up)
         best_loglik = evaluate(histogram, best, at_best, histogram.n)
-        out[CHI2], freedom = pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
+        out[CHI2], freedom = _compare(histogram, at_best, limits[FLOOR], out)
         if normal_score(out[CHI2], freedom) < _SUSPICIOUS and side_lobe(histogram, best) > _CLEAR_LOBE:
             break
     if not best[1] > 0.0:
@@ -223,61 +227,3 @@ def fit_pixel(
     out[LOG_LIKELIHOOD] = best_loglik
     out[GAP] = best_loglik - max(runner_up, gaussian)
     return _judge(best, best_loglik, runner_up, gaussian, limits), used, freedom
-
-
-@nb.njit(nogil=True, cache=True, error_model="numpy")
-def fit_tile(
-    counts: NDArray[np.generic],
-    origin: NDArray[np.int64],
-    basis: NDArray[np.float64],
-    limits: NDArray[np.float64],
-    start: NDArray[np.float64],
-    parameters: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    out: NDArray[np.float64],
-    words: NDArray[np.int64],
-) -> None:
-    """Fit every row of ``counts``; pixels do not influence each other.
-
-    Args:
-        counts: shape (n, B).
-        origin: DN of bin 0, shape (n,).
-        basis: of the regression on the ECF.
-        limits: bounds and limits, shape (N_LIMITS,).
-        start: (H, g, mu, sigma) near the answer, shape (n, 4), NaN where not known; or shape (0, 4).
-        parameters: out, (H, g, mu, sigma), shape (n, 4); comes as NaN.
-        covariance: out, shape (n, 4, 4); comes as NaN.
-        out: out, shape (n, N_OUT); comes as NaN.
-        words: out, shape (n, N_WORDS); comes as 0.
-    """
-    n_most = counts.shape[1]
-    weights, cumulative = np.empty(n_most), np.empty(n_most + 1)
-    space = make_workspace(make_rows(n_most))
-    at_best = share_workspace(space)
-    theta, near = np.empty(4), np.empty(4)
-    held = np.zeros(4, np.bool_)
-    own_limits = limits.copy()
-    for pixel in range(counts.shape[0]):
-        histogram, centre, occupied = load(counts[pixel], weights, cumulative)
-        if occupied < 3:
-            words[pixel, STATUS] = NO_DATA if occupied == 0 else TOO_FEW_BINS
-        dn = origin[pixel] + centre + int(histogram.first)
-        words[pixel, LOWEST_DN], words[pixel, HIGHEST_DN] = dn, dn + histogram.n_bins - 1
-        if occupied < 3:
-            continue
-        near[1] = 0.0
-        if start.shape[0] > 0 and np.isfinite(start[pixel]).all():
-            near[0], near[1] = math.log(start[pixel, 0]), 1.0 / start[pixel, 1]
-            near[2] = start[pixel, 2] - float(origin[pixel] + centre)
-            near[3] = 2.0 * math.log(start[pixel, 3])
-        own_limits[MAX_STEP] = 4.0 * histogram.n_bins + 10.0
-        status, words[pixel, EVALUATIONS], words[pixel, FREEDOM] = fit_pixel(
-            histogram, basis, own_limits, space, near, theta, at_best, out[pixel]
-        )
-        if theta[1] > 0.0:
-            held[0] = status & EXPOSURE_AT_BOUND != 0
-            held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-9
-            middle = float(origin[pixel] + centre)
-            if not to_natural(theta, middle, at_best.information, held, parameters[pixel], covariance[pixel]):
-                status |= FIT_NOT_CONVERGED
-        words[pixel, STATUS] = status

@@ -54,6 +54,34 @@ class FitSettings(Section):
     goodness_limit: float = Field(
         default=1e-6, ge=0, lt=1, description="a goodness-of-fit probability below it is flagged"
     )
+    tail_guard: float = Field(
+        default=1e-3,
+        ge=0,
+        le=0.1,
+        description="expected frames per DN: samples where the fitted model expects fewer (cosmic rays, "
+        "glitches) leave the likelihood, their share is kept as outlier_share; 0: every sample counts",
+    )
+    tail_guard_share: float = Field(
+        default=0.01,
+        ge=0,
+        le=0.1,
+        description="largest share of a pixel's frames that the tail guard leaves out; where there would be "
+        "more the model is wrong, not a few samples, and all are kept",
+    )
+    errors: Literal["information", "sandwich"] = Field(
+        default="information",
+        description="information: standard errors from the observed information, right if the model holds. "
+        "sandwich: right for the nearest PCD even where it does not (not with model.effects)",
+    )
+    intervals: Literal["normal", "profile"] = Field(
+        default="normal",
+        description="normal: estimate -+ standard errors. profile: also the ends of profile-likelihood "
+        "intervals, for low quanta exposure or read noise above 0.45 e- (about 0.1 ms per pixel; not with "
+        "model.effects)",
+    )
+    interval_level: float = Field(
+        default=0.6827, gt=0.1, lt=0.9999, description="probability that a profile interval covers the truth"
+    )
     minimum_quanta_exposure: float = Field(
         default=1e-4, gt=0, le=0.1, description="e-: lower bound of the quanta exposure in the fit"
     )
