@@ -8,13 +8,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["FREE_LOBES", "PARAMETERS", "VARIABLES", "Variable", "variables_of"]
+__all__ = [
+    "FREE_LOBES",
+    "INTERVALS",
+    "LENGTHS",
+    "PARAMETERS",
+    "VARIABLES",
+    "Variable",
+    "interval_names",
+    "variables_of",
+]
 
 #: The four parameters of the PCD, in the order of every (…, parameter) axis.
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 
 #: Arrays of the group ``fit`` that exist only where the model holds effects.
 FREE_LOBES = ("lobe_amplitude_e", "lobe_weight")
+
+#: Quantities of the group ``fit`` that have profile intervals, where they were asked for.
+INTERVALS = (*PARAMETERS, "read_noise_e")
+
+#: Lengths of the dimensions of maps beside y and x.
+LENGTHS = {"parameter_pair": 6}
+
+
+def interval_names(name: str) -> tuple[str, str]:
+    """Return the names of the arrays that hold the lower and the upper end of a quantity's interval."""
+    return f"{name}_low", f"{name}_high"
 
 
 @dataclass(frozen=True)
@@ -73,6 +93,16 @@ def _stderr(group: str, name: str) -> Variable:
 
 def _both(group: str, names: tuple[str, ...]) -> list[Variable]:
     return [make(group, name) for name in names for make in (_parameter, _stderr)]
+
+
+def _ends(group: str, names: tuple[str, ...]) -> list[Variable]:
+    found = []
+    for name in names:
+        unit, sentence, _ = _PARAMETER_WORDS[name]
+        for end, path in zip(("lower", "upper"), interval_names(name), strict=True):
+            words = f"{end} end of the profile-likelihood interval of the {sentence}"
+            found.append(Variable(f"{group}/{path}", _MAP, "float64", unit, words))
+    return found
 
 
 def _discrepancy() -> list[Variable]:
@@ -163,25 +193,31 @@ _ALL: list[Variable] = [
     Variable("summary/frame_variance", ("frame",), "float64", "DN2", "variance over the pixels of a frame"),
     *_both("fit", PARAMETERS),
     Variable(
-        "fit/covariance",
-        ("y", "x", "parameter", "parameter_2"),
+        "fit/correlation",
+        ("y", "x", "parameter_pair"),
         "float64",
         "1",
-        "covariance of (H, g, mu, sigma) from the observed information",
+        "correlations of the estimates: (H, g), (H, mu), (H, sigma), (g, mu), (g, sigma), (mu, sigma)",
     ),
+    *_ends("fit", INTERVALS),
     Variable("fit/log_likelihood", _MAP, "float64", "nat", "log-likelihood at the estimate"),
     Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up"),
     Variable("fit/fit_status", _MAP, "uint16", "1", "reasons for caution or failure, as bits; 0 is fine"),
     Variable("fit/n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel"),
     Variable("fit/goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of the histogram, bins merged"),
-    Variable("fit/goodness_dof", _MAP, "int32", "1", "degrees of freedom of goodness_chi2"),
+    Variable("fit/goodness_dof", _MAP, "float64", "1", "degrees of freedom of goodness_chi2"),
     Variable("fit/goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds"),
+    Variable("fit/outlier_share", _MAP, "float64", "1", "share of the frames left out by the tail guard"),
     # where the model's effects look for levels in each pixel (random telegraph noise)
     Variable(
         "fit/lobe_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN without any"
     ),
     Variable("fit/lobe_weight", _MAP, "float64", "1", "probability to be off the quiet level; 0 without any"),
     *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")),
+    *_ends("maps", (*INTERVALS, "dark_current")),
+    Variable(
+        "maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is called misfit"
+    ),
     Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
     # raw ensemble (paper, Sec. II-C): axis `dn`
     Variable("ensemble/dn", ("dn",), "int32", "DN", "digital number"),
@@ -194,6 +230,13 @@ _ALL: list[Variable] = [
         "ensemble/density_all", ("dn",), "float64", "1/DN", "ensemble histogram of all frames, normalised"
     ),
     Variable("ensemble/epcd_exact", ("dn",), "float64", "1/DN", "EPCD: mean of the pixels' PCDs", "f_E"),
+    Variable(
+        "ensemble/epcd_stderr",
+        ("dn",),
+        "float64",
+        "1/DN",
+        "standard error of epcd_exact from those of the maps",
+    ),
     Variable(
         "ensemble/epcd_dependent", ("dn",), "float64", "1/DN", "EPCD: 4-D histogram of the parameters", "f_E"
     ),
@@ -215,6 +258,13 @@ _ALL: list[Variable] = [
     ),
     Variable(
         "ensemble/nuced_exact", ("electrons",), "float64", "1/e-", "NUCed EPCD: mean over the pixels", "f_E'"
+    ),
+    Variable(
+        "ensemble/nuced_stderr",
+        ("electrons",),
+        "float64",
+        "1/e-",
+        "standard error of nuced_exact from those of the maps",
     ),
     Variable(
         "ensemble/nuced_dependent",

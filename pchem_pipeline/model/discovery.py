@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["false_discovery"]
+__all__ = ["false_discovery", "misfit", "poorest"]
 
 
 def false_discovery(probability: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -39,3 +39,33 @@ def false_discovery(probability: NDArray[np.floating[Any]]) -> NDArray[np.float6
     q[order] = np.minimum(adjusted, 1.0)
     found[tested] = q
     return found
+
+
+def misfit(chi2: NDArray[np.float64], dof: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return chi-square as a standard normal deviate (Wilson and Hilferty 1931), large for a poor fit.
+
+    Unlike a p-value it does not run out of digits.
+
+    Args:
+        chi2: any shape.
+        dof: degrees of freedom, same shape; 0 where nothing was tested.
+
+    Returns:
+        Deviates, same shape; NaN where nothing was tested.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = 2.0 / (9.0 * np.where(dof > 0, dof, np.nan))
+        return np.asarray(((chi2 * 4.5 * spread) ** (1.0 / 3.0) - (1.0 - spread)) / np.sqrt(spread))
+
+
+def poorest(chi2: NDArray[np.float64], dof: NDArray[np.float64], n: int) -> list[tuple[int, int]]:
+    """Return (y, x) of the n pixels of the poorest fit, the poorest first.
+
+    Args:
+        chi2: map of chi-square, shape (y, x).
+        dof: map of its degrees of freedom.
+        n: how many; fewer where fewer were tested.
+    """
+    score = misfit(chi2, dof).ravel()
+    order = np.argsort(-score, kind="stable")[:n]
+    return [divmod(int(i), chi2.shape[1]) for i in order if np.isfinite(score[i])]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model import ensemble_numba
+from pchem_pipeline.model import ensemble_numba, information_numba
 from pchem_pipeline.model.pixels import FloatArray, PixelParameters
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "EnsembleSums",
     "NucedAxis",
     "Tally",
+    "curve_errors",
     "electron_pmf",
     "ensemble_sums",
     "epcd_exact",
@@ -181,6 +182,38 @@ def epcd_exact(pixels: PixelParameters, dn: DnAxis) -> FloatArray:
         f_E, 1/DN, shape (n_dn,). For pixels narrower than 1 DN it is the mass of the DN cell.
     """
     return ensemble_sums(pixels, dn).raw / len(pixels)
+
+
+def curve_errors(
+    pixels: PixelParameters, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
+) -> tuple[FloatArray, FloatArray]:
+    """Sum the pixels' variances of the two predicted densities that the errors of their parameters cause.
+
+    By the delta method, pixels being independent; the standard error of a mean over n pixels is
+    ``sqrt(sum) / n``. After correction only H and sigma_e- matter.
+
+    Args:
+        pixels: n pixels.
+        covariance: of (H, g, mu, sigma), shape (n, 4, 4); entries that are not known count as 0.
+        dn: axis of the raw prediction.
+        nuced: axis of the NUCed prediction.
+
+    Returns:
+        Sums of the variances of f_X, 1/DN^2, shape (n_dn,), and of the NUCed density, 1/e-^2, shape
+        (n_bins,).
+    """
+    raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
+    plain = np.stack(pixels.columns(), axis=1)
+    information_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
+    ones, zeros = np.ones(len(pixels)), np.zeros(len(pixels))
+    corrected = np.stack([pixels.quanta_exposure, ones, zeros, pixels.read_noise_e], axis=1)
+    slope = np.zeros((len(pixels), 4, 4))
+    slope[:, 0, 0] = 1.0
+    slope[:, 3, 1], slope[:, 3, 3] = pixels.read_noise_dn, pixels.conversion_gain
+    known = np.where(np.isfinite(covariance), covariance, 0.0)
+    moved = slope @ known @ np.swapaxes(slope, 1, 2)
+    information_numba.curve_variance(corrected, moved, nuced.start * nuced.width, nuced.width, bins)
+    return raw, bins
 
 
 def tally(

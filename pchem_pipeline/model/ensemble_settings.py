@@ -12,7 +12,7 @@ __all__ = ["EnsembleSettings", "MapsSettings"]
 
 
 class MapsSettings(Section):
-    """How the parameter maps are summarised; no setting changes a map."""
+    """How the maps are summarised, and which pixels are called misfits; no setting changes a parameter."""
 
     percentiles: tuple[float, ...] = Field(
         default=(1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0),
@@ -23,6 +23,17 @@ class MapsSettings(Section):
         gt=0,
         description="a pixel is an outlier beyond this many robust standard deviations (1.4826 MAD) "
         "from the median",
+    )
+
+    false_discovery_rate: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        description="share of false alarms accepted among the pixels whose histograms are said to disagree "
+        "with the model (Benjamini and Hochberg)",
+    )
+    worst_pixels: int = Field(
+        default=6, ge=0, le=16, description="pixels of the poorest fit that are listed and drawn"
     )
 
     @field_validator("percentiles")

@@ -18,6 +18,7 @@ from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.grown import fit_grown
 from pchem_pipeline.model.joint import JointFit, fit_joint
 from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.model.outliers import without_outliers
 from pchem_pipeline.model.pchem import FitResult
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.variables import PARAMETERS
@@ -84,7 +85,8 @@ def refine(
     """Fit again with the exact likelihood where the settings ask for it.
 
     With ``exact`` in all pixels that have data; with ``auto`` where rounding biases the density's estimates
-    by more than :data:`LARGEST_BIAS` standard errors or their fit failed; with ``density`` nowhere.
+    by more than :data:`LARGEST_BIAS` standard errors or their fit failed; with ``density`` nowhere. Samples
+    that the tail guard left out of the plain fit stay out.
 
     Args:
         counts: histograms, shape (n, B).
@@ -95,6 +97,8 @@ def refine(
     """
     if settings.likelihood == "density":
         return plain
+    estimates = np.stack([getattr(plain, name) for name in PARAMETERS], axis=1)
+    counts = without_outliers(counts, origin, estimates, plain.outlier_share, settings)
     chosen = (plain.fit_status & int(FitStatus.NO_DATA | FitStatus.TOO_FEW_BINS)) == 0
     if settings.likelihood == "auto":
         parameters = [getattr(plain, name) for name in PARAMETERS]
@@ -104,7 +108,7 @@ def refine(
     if pixels.size == 0:
         return plain
     again = _exact(counts[pixels], origin[pixels], _of(plain, pixels), settings, adc_limits)
-    return _with(plain, again, pixels)
+    return replace(_with(plain, again, pixels), outlier_share=plain.outlier_share)
 
 
 def _exact(
@@ -153,7 +157,8 @@ def _height(result: FitResult) -> FloatArray:
 
 def _single(joint: JointFit) -> FitResult:
     """Return a joint fit of one sample as the fit of a single sample."""
-    values = {each.name: getattr(joint, each.name) for each in fields(FitResult)}
+    nothing = np.zeros(joint.bias.size)
+    values = {each.name: getattr(joint, each.name, nothing) for each in fields(FitResult)}
     return FitResult(**{**values, "quanta_exposure": joint.quanta_exposure[:, 0].copy()})
 
 

@@ -86,6 +86,7 @@ def _fit_row(
         near[0], near[1] = math.log(room.near[0]), 1.0 / room.near[1]
         near[2], near[3] = room.near[2] - middle, 2.0 * math.log(room.near[3])
     room.limits[MAX_STEP] = 4.0 * histogram.n_bins + 10.0
+    status: int
     status, used, words[FREEDOM] = fit_pixel(
         histogram, room.basis, room.limits, room.space, near, room.theta, room.at_best, out
     )
@@ -145,7 +146,7 @@ def _fit_guarded(
     else:
         cut(row, 0, row.size, kept)
         _unexpected(row, origin, n, room, parameters, kept)
-    left_out = 0.0
+    left_out, status = 0.0, 0
     for _ in range(_MOST_PASSES):
         left_out = n - total(kept)
         if left_out > room.limits[MOST_OUTLIERS] * n:

@@ -1,7 +1,7 @@
 """The score of single samples: what sandwich errors, the calibration of chi-square and curves are made of.
 
-The score of a sample x is the posterior mean of the complete-data score (Louis 1982): with ``e = x - mu - k/g``
-it is ``(E[k] - H)``, ``E[k e]/s2``, ``E[e]/s2`` and ``-1/2 + E[e^2]/(2 s2)`` in (log H, 1/g, mu, log s2).
+The score of a sample x is the posterior mean of the complete-data score (Louis 1982): it is ``E[k] - H``,
+``E[k e]/s2``, ``E[e]/s2`` and ``-1/2 + E[e^2]/(2 s2)`` in (log H, 1/g, mu, log s2), ``e = x - mu - k/g``.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def sample_score(
     step, inverse = 1.0 / gain, 1.0 / (sigma * sigma)
     nearest = max(0, math.floor((x - bias) * gain + 0.5))
     noise = sigma * gain
-    half = int(math.ceil(_REACH * noise)) + 2
+    half = math.ceil(_REACH * noise) + 2
     if noise > 0.4:  # the Poisson factor moves the largest term away from the nearest component
-        half += int(math.ceil(noise * noise * abs(math.log(exposure / (nearest + 1.0)))))
+        half += math.ceil(noise * noise * abs(math.log(exposure / (nearest + 1.0))))
     low, high = max(0, nearest - half), min(log_weights.size - 1, nearest + half)
     low = min(low, high)
     top = -math.inf
@@ -142,7 +142,8 @@ def grouped_trace(
     :func:`~pchem_pipeline.model.goodness_numba.pearson`.
 
     Args:
-        first, last: first and last occupied DN, shape (n,).
+        first: first occupied DN, shape (n,).
+        last: last occupied DN, shape (n,).
         frames: samples fitted, shape (n,).
         parameters: (H, g, mu, sigma), shape (n, 4); NaN where there is none.
         covariance: of the estimates, shape (n, 4, 4); NaN for what a bound holds.
@@ -214,8 +215,8 @@ def curve_variance(
         spread = 9.0 * math.sqrt(exposure) + 9.0
         low = bias + max(exposure - spread, 0.0) / gain - 9.0 * sigma
         high = bias + (exposure + spread) / gain + 9.0 * sigma
-        start = max(0, int(math.floor((low - x0) / pitch)))
-        stop = min(out.size - 1, int(math.ceil((high - x0) / pitch)))
+        start = max(0, math.floor((low - x0) / pitch))
+        stop = min(out.size - 1, math.ceil((high - x0) / pitch))
         if start > stop:
             continue
         weights = log_poisson(exposure, _size(exposure, gain, x0 + stop * pitch - bias))

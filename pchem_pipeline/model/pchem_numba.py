@@ -146,7 +146,8 @@ def _compare(
 ) -> tuple[float, int]:
     """Return chi-square and degrees of freedom; count the samples that are not expected in ``out``."""
     out[OUTLYING] = outlying(histogram.weights, at_best.rows[0], histogram.n_bins, floor)
-    return pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
+    chi2, freedom = pearson(histogram.weights, at_best.rows[0], histogram.n_bins, histogram.n)
+    return chi2, freedom
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Ends of profile-likelihood intervals: where the best likelihood at a fixed parameter falls by a given drop."""
+"""Ends of profile-likelihood intervals: a fixed parameter where the best likelihood has fallen by a drop."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def to_theta(phi: NDArray[np.float64], target: int, theta: NDArray[np.float64]) 
     if not (theta[1] > 1.0 and theta[3] >= MIN_LOG_VARIANCE - 1e-9 and -25.0 < theta[0] < 11.0):
         return False
     noise = math.exp(0.5 * theta[3]) / theta[1]
-    return MIN_ELECTRON_NOISE <= noise <= MAX_ELECTRON_NOISE
+    inside: bool = MIN_ELECTRON_NOISE <= noise <= MAX_ELECTRON_NOISE
+    return inside
 
 
 @nb.njit(nogil=True, cache=True)
@@ -71,7 +72,7 @@ def maximise_others(
     matrix, lower = np.empty((4, 4)), np.empty((4, 4))
     if not to_theta(phi, target, theta):
         return math.nan
-    loglik = evaluate(histogram, theta, space, 0.0)
+    loglik: float = evaluate(histogram, theta, space, 0.0)
     for _ in range(_INNER):
         to_coordinates(space, phi, target)
         damping = 0.0
@@ -86,7 +87,7 @@ def maximise_others(
             damping = 4.0 * damping + 1e-3
             if damping > 1e3:
                 return math.nan
-        rise = 0.5 * back_substitute(lower, step)
+        rise: float = 0.5 * back_substitute(lower, step)
         if rise < _ENOUGH and damping == 0.0:
             return loglik + rise
         longest = max(max(abs(step[0]) / 0.5, abs(step[1]) / (0.1 * phi[1])),
@@ -143,7 +144,7 @@ def find_end(
         loglik = maximise_others(histogram, phi, target, held, space)
         drop = math.sqrt(max(0.0, 2.0 * (top - loglik))) if math.isfinite(loglik) else math.inf
         if abs(drop - root) < _CLOSE * root:
-            return phi[place]
+            return float(phi[place])
         if drop < root:
             inside, below = distance, drop
             copy(phi, good)
@@ -159,7 +160,7 @@ def find_end(
             share = (root - below) / (above - below)
             distance = inside + min(0.95, max(0.05, share)) * (outside - inside)
         if outside - inside < 1e-7 * root:
-            return math.nan if above == math.inf else phi[place]
+            return math.nan if above == math.inf else float(phi[place])
     return math.nan
 
 

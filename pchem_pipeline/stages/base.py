@@ -39,7 +39,7 @@ from pchem_pipeline.stages.sensor import SensorInfo
 from pchem_pipeline.store.files import is_fatal
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid
-from pchem_pipeline.variables import VARIABLES
+from pchem_pipeline.variables import LENGTHS, VARIABLES
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -218,10 +218,10 @@ class StageContext:
             self.store.create_array(name, shape, chunks=chunks, dtype=dtype, attributes=attributes)
 
     def create_maps(self, names: Sequence[str], **attributes: Any) -> None:
-        """Make arrays whose first dimensions are (y, x), one tile per chunk; further ones are 4 x 4."""
+        """Make arrays whose first dimensions are (y, x), one tile per chunk; further ones are whole."""
         tile = self.config.run.tile
         for name in names:
-            rest = (4,) * (len(VARIABLES[name].dims) - 2)
+            rest = tuple(LENGTHS[dim] for dim in VARIABLES[name].dims[2:])
             self.create(name, (*self.sensor.shape, *rest), chunks=(tile, tile, *rest), **attributes)
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:

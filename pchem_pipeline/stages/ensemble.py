@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.model.electrons import ErrorTally, compare_electron_numbers, electron_numbers
 from pchem_pipeline.model.ensemble import DnAxis, electron_pmf, nuced_axis
+from pchem_pipeline.model.fisher import covariance_from
 from pchem_pipeline.model.histogram_numba import count_frames
 from pchem_pipeline.model.pixels import PixelParameters
 from pchem_pipeline.stages.base import StageContext, open_store
@@ -193,6 +194,8 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     lobes = None
     if job.effects:
         lobes = tuple(store.read(f"fit/{name}", rows) for name in FREE_LOBES)
+    stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)
+    covariance = covariance_from(stderr, store.read("fit/correlation", (*rows, slice(None))))
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
@@ -209,6 +212,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             job.axes,
             job.effects,
             None if lobes is None else (lobes[0][part].ravel(), lobes[1][part].ravel()),
+            covariance[part].reshape(n, 4, 4),
         )
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size

@@ -77,6 +77,9 @@ def curves(
         "nuced_dependent": nuced_dependent(pixels, axes.nuced, choice),
         "nuced_independent": nuced_independent(pixels, axes.nuced, choice),
     }
+    if not axes.grown:
+        arrays["epcd_stderr"] = np.sqrt(totals.variance("pcd_error"))
+        arrays["nuced_stderr"] = np.sqrt(totals.variance("nuced_error"))
     for prefix, noise in (("", variance), ("nuced_", nuced_variance)):
         exact = arrays["nuced_exact" if prefix else "epcd_exact"]
         arrays[f"{prefix}residual"] = normalised_residuals(arrays[f"{prefix}density"], exact, noise)
@@ -108,11 +111,17 @@ def _agreement(
     found_all = {f"epcd_{way}": rmse(arrays["density_all"], arrays[f"epcd_{way}"], window) for way in _WAYS}
     n, n_all = totals.samples
     found_all["noise_floor"] = found["noise_floor"] * math.sqrt(n / n_all)
+    model_error = {
+        prefix: noise_floor(arrays[f"{prefix}_stderr"] ** 2, place)
+        for prefix, place in (("epcd", window), ("nuced", nuced_window))
+        if f"{prefix}_stderr" in arrays
+    }
     chi = chi_square(arrays["density"], arrays["epcd_exact"], variance, arrays["counts"])
     ends = [window.start, window.stop - 1], [nuced_window.start, nuced_window.stop - 1]
     return {
         "rmse": found,
         "rmse_all_frames": found_all,
+        "model_error": model_error,
         "chi_square": asdict(chi),
         "rmse_window_dn": [int(arrays["dn"][i]) for i in ends[0]],
         "rmse_window_electrons": [float(arrays["electrons"][i]) for i in ends[1]],

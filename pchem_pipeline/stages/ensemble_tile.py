@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
-from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, ensemble_sums, tally
+from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, curve_errors, ensemble_sums, tally
 from pchem_pipeline.model.grown_ensemble import grown_sums
 from pchem_pipeline.model.pixels import FloatArray, PixelParameters
 from pchem_pipeline.stages.fitted_model import deciding_maps
@@ -40,6 +40,8 @@ _INTEGERS = (
 _FLOATS = ("nuced_sum", "nuced_sum_square", "error", "error_variance")
 #: The same two, predicted; without effects they follow from the parameters.
 _GROWN_FLOATS = ("nuced_predicted_sum", "nuced_predicted_sum_square")
+#: Variances of the predictions by the errors of the maps; known without effects.
+_ERRORS = ("pcd_error", "nuced_error")
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,8 @@ class EnsembleAxes:
             lengths[name] = self.nuced.size
         for name in ("electron_share", "electron_expected"):
             lengths[name] = self.n_k
+        if not self.grown:
+            lengths |= dict(zip(_ERRORS, (self.dn.size, self.nuced.size), strict=True))
         return _places(lengths | dict.fromkeys((*_FLOATS, *(_GROWN_FLOATS if self.grown else ())), 1))
 
 
@@ -146,6 +150,7 @@ def ensemble_tile(
     axes: EnsembleAxes,
     effects: Sequence[Effect] = (),
     lobes: tuple[FloatArray, FloatArray] | None = None,
+    covariance: FloatArray | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return what some pixels add to the ensemble.
 
@@ -157,6 +162,7 @@ def ensemble_tile(
         axes: axes of the ensemble.
         effects: of the run's model, the axes being ``grown`` where there are any.
         lobes: amplitude (e-) and weight of the pixels' free lobes, shape (n,); None: none.
+        covariance: of the maps, shape (n, 4, 4); None: not known.
 
     Returns:
         A row of integers and a row of floats, in the places that ``axes`` gives.
@@ -168,6 +174,10 @@ def ensemble_tile(
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
     chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
+    if covariance is not None and not effects:
+        errors = curve_errors(pixels, covariance[mask], axes.dn, axes.nuced)
+        for name, variance in zip(_ERRORS, errors, strict=True):
+            floats[axes.floats[name]] = variance
     samples, samples_all = chosen.samples, everything.samples
     pairs = np.stack([samples, samples_all], axis=1)
     for n, n_all in np.unique(pairs, axis=0):

@@ -14,14 +14,17 @@ from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.model.beside import Interval, fit_beside
 from pchem_pipeline.model.exact import LARGEST_BIAS, biased_by_rounding, refine
+from pchem_pipeline.model.fisher import correlations
 from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.grown import fit_grown
+from pchem_pipeline.model.intervals import profile_intervals
 from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.model.outliers import without_outliers
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
-from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
+from pchem_pipeline.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
@@ -35,6 +38,12 @@ identity = _THIS.identity
 
 #: Pixels of which effects are told nothing: no value, or one electron off.
 _UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
+
+
+_PLAIN_ONLY = (
+    "fit.intervals: profile and fit.errors: sandwich need the plain model; with model.effects or "
+    "model.set_aside_e the errors are those of the observed information"
+)
 
 
 def fit_tile(
@@ -69,12 +78,31 @@ def fit_tile(
         result = fit_beside(rows, flat["origin"], plain, result, law, set_aside, settings)
     variances = np.diagonal(result.covariance, axis1=1, axis2=2)
     arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
+    arrays["correlation"] = correlations(result.covariance)
+    if settings.intervals == "profile" and not (effects or set_aside):
+        ends = _intervals(rows, flat["origin"], plain, settings)
+        other = result.bias != plain.bias  # fitted with the exact likelihood, whose profile this is not
+        arrays |= {name: np.where(other, np.nan, values) for name, values in ends.items()}
     arrays |= {
         v.name: getattr(result, v.name)
         for v in variables_of("fit")
         if v.name not in arrays and hasattr(result, v.name)
     }
     return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
+
+
+def _intervals(
+    counts: NDArray[Any], origin: NDArray[Any], fit: FitResult, settings: FitSettings
+) -> dict[str, NDArray[np.float64]]:
+    """Return the ends of the profile intervals of all quantities, by name."""
+    parameters = np.stack([getattr(fit, name) for name in PARAMETERS], axis=1)
+    kept = without_outliers(counts, origin, parameters, fit.outlier_share, settings)
+    ends = profile_intervals(kept, origin, parameters, settings.interval_level)
+    return {
+        path: ends[:, place, side]
+        for place, name in enumerate(INTERVALS)
+        for side, path in enumerate(interval_names(name))
+    }
 
 
 def _grown(
@@ -102,7 +130,12 @@ def run(context: StageContext) -> None:
         StoreError: the histograms are missing, or the store refuses.
     """
     effects = context.config.model.effects
-    left_out = ("fit_status",) if effects else ("fit_status", *FREE_LOBES)
+    left_out = {"fit_status", *(() if effects else FREE_LOBES)}
+    settings, plain = context.config.fit, not (effects or context.config.model.set_aside_e)
+    if settings.intervals == "normal" or not plain:
+        left_out |= {path for name in INTERVALS for path in interval_names(name)}
+    if not plain and (settings.intervals, settings.errors) != ("normal", "information"):
+        context.note(_PLAIN_ONLY)
     context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])
     context.create_maps(
         ["fit/fit_status"],

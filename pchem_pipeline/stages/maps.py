@@ -8,13 +8,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.discovery import false_discovery, poorest
+from pchem_pipeline.model.fisher import covariance_from
 from pchem_pipeline.model.maps import derived_maps, quality_map, status_counts, summarise
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.plain import plain
-from pchem_pipeline.variables import PARAMETERS
+from pchem_pipeline.variables import INTERVALS, PARAMETERS, interval_names
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
@@ -43,7 +46,14 @@ def maps_tile(fit: Mapping[str, NDArray[Any]], integration_time: float | None) -
     parameters = {name: fit[name] for name in PARAMETERS}
     maps: dict[str, NDArray[Any]] = dict(parameters)
     maps |= {f"{name}_stderr": fit[f"{name}_stderr"] for name in PARAMETERS}
-    maps |= derived_maps(parameters, fit["covariance"], integration_time)
+    stderr = np.stack([fit[f"{name}_stderr"] for name in PARAMETERS], axis=-1)
+    maps |= derived_maps(parameters, covariance_from(stderr, fit["correlation"]), integration_time)
+    for name in (path for each in INTERVALS for path in interval_names(each)):
+        if name in fit:
+            maps[name] = fit[name]
+    if integration_time is not None and "quanta_exposure_low" in fit:
+        ends = zip(interval_names("dark_current"), interval_names("quanta_exposure"), strict=True)
+        maps |= {name: fit[source] / integration_time for name, source in ends}
     maps["quality"] = quality_map(fit["fit_status"], fit["conversion_gain"])
     return maps
 
@@ -57,7 +67,10 @@ def run(context: StageContext) -> None:
     time = context.integration_time
     names = [name for name in _SUMMARISED if time is not None or name != "dark_current"]
     context.create_maps([f"maps/{name}" for each in names for name in (each, f"{each}_stderr")])
-    context.create_maps(["maps/quality"])
+    ends = [path for each in (*INTERVALS, *names[len(_SUMMARISED) - 1 :]) for path in interval_names(each)]
+    if context.store.has(f"fit/{ends[0]}"):
+        context.create_maps([f"maps/{name}" for name in ends])
+    context.create_maps(["maps/quality", "maps/goodness_q"])
     if time is None:
         context.note(_NO_TIME)
     task = functools.partial(_do_tile, store=context.store.path, integration_time=time)
@@ -67,11 +80,10 @@ def run(context: StageContext) -> None:
 
 def _do_tile(tile: Tile, *, store: Path, integration_time: float | None) -> dict[str, Any]:
     opened = open_store(store)
-    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "covariance", "fit_status"]
-    fit = {
-        name: opened.read(f"fit/{name}", (*tile.region, *(slice(None),) * (2 * (name == "covariance"))))
-        for name in needed
-    }
+    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "fit_status"]
+    needed += [path for name in INTERVALS for path in interval_names(name) if opened.has(f"fit/{path}")]
+    fit = {name: opened.read(f"fit/{name}", tile.region) for name in needed}
+    fit["correlation"] = opened.read("fit/correlation", (*tile.region, slice(None)))
     for name, values in maps_tile(fit, integration_time).items():
         opened.write(f"maps/{name}", tile.region, values)
     return {}
@@ -87,4 +99,33 @@ def _summarise(context: StageContext, names: list[str]) -> None:
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
         found[name] = plain(asdict(summary) | {"percentiles": percentiles})
     status = context.store.read("fit/fit_status")
-    context.store.set_attributes("maps", {"summary": found, "fit_status": status_counts(status)})
+    facts = {"summary": found, "fit_status": status_counts(status), "goodness": _misfits(context)}
+    context.store.set_attributes("maps", facts)
+
+
+def _misfits(context: StageContext) -> dict[str, Any]:
+    """Say which pixels disagree with the model: q-values of all, and the poorest fits with their numbers."""
+    store, settings = context.store, context.config.maps
+    chi2, dof, p = (store.read(f"fit/goodness_{name}") for name in ("chi2", "dof", "p"))
+    q = false_discovery(p)
+    store.write("maps/goodness_q", (slice(None), slice(None)), q)
+    worst = [
+        {
+            "y": y,
+            "x": x,
+            "chi2": float(chi2[y, x]),
+            "dof": float(dof[y, x]),
+            "p": float(p[y, x]),
+            "q": float(q[y, x]),
+        }
+        for y, x in poorest(chi2, dof, settings.worst_pixels)
+    ]
+    outliers = store.read("fit/outlier_share")
+    return {
+        "tested": int(np.count_nonzero(np.isfinite(p))),
+        "misfits": int(np.count_nonzero(q <= settings.false_discovery_rate)),
+        "false_discovery_rate": settings.false_discovery_rate,
+        "worst": worst,
+        "pixels_with_outliers": int(np.count_nonzero(outliers > 0)),
+        "largest_outlier_share": float(np.nanmax(outliers, initial=0.0)),
+    }

@@ -59,7 +59,7 @@ def mean_pulls(store: RunStore) -> dict[str, float]:
 
 
 def fitted(store: RunStore) -> dict[str, NDArray[Any]]:
-    return {name: store.read(f"fit/{name}") for name in (*PARAMETERS, "covariance", "fit_status")}
+    return {name: store.read(f"fit/{name}") for name in (*PARAMETERS, "correlation", "fit_status")}
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_tiles_do_not_change_the_grown_fit(both, tmp_path: Path) -> None:
     other = configured(tmp_path, EFFECTS, tile=32)
     run_stages(find_run(other), ["simulate", "ingest", "histogram", "fit"], QUIET)
     again = RunStore.open(tmp_path / "run.zarr")
-    for name in (*PARAMETERS, "covariance", "fit_status", *FREE_LOBES):
+    for name in (*PARAMETERS, "correlation", "fit_status", *FREE_LOBES):
         np.testing.assert_array_equal(again.read(f"fit/{name}"), store.read(f"fit/{name}"), err_msg=name)
 
 

@@ -80,8 +80,10 @@ def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: 
         values = np.where(bad | ~there, np.nan, store.read(f"truth/{name}", region))
         store.write_array(f"fit/{name}", values)
         store.write_array(f"fit/{name}_stderr", 0.01 * np.abs(values))
-    diagonal = [store.read(f"fit/{name}_stderr") ** 2 for name in PARAMETERS]
-    store.write_array("fit/covariance", np.stack(diagonal, axis=-1)[..., None] * np.eye(4))
+    store.write_array("fit/correlation", np.zeros((*shape, 6)))
+    for name, value in {"chi2": 50.0, "dof": 50.0, "p": 0.5}.items():
+        store.write_array(f"fit/goodness_{name}", np.where(bad | ~there, np.nan, value))
+    store.write_array("fit/outlier_share", np.zeros(shape))
     store.write_array("fit/fit_status", status)
     store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
     for tile in chosen:

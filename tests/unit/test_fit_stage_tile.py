@@ -8,7 +8,7 @@ from drawn_pixels import draw
 from pchem_pipeline.model.pchem import fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.fit import fit_tile
-from pchem_pipeline.variables import FREE_LOBES, variables_of
+from pchem_pipeline.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
 
 
 def test_tile_has_every_array_in_its_place() -> None:
@@ -19,8 +19,10 @@ def test_tile_has_every_array_in_its_place() -> None:
         "under": np.array([[0, 0, 0], [0, 7, 0]], np.uint32),
         "over": np.zeros((2, 3), np.uint32),
     }
+    ends = {path for name in INTERVALS for path in interval_names(name)}
+    absent = ends | set(FREE_LOBES)
     arrays = fit_tile(histogram, FitSettings(), None)
-    assert set(arrays) == {variable.name for variable in variables_of("fit")} - set(FREE_LOBES)
+    assert set(arrays) == {variable.name for variable in variables_of("fit")} - absent
     expected = fit_histograms(
         pixels.counts, pixels.origin, histogram["under"].ravel(), histogram["over"].ravel()
     )
@@ -29,7 +31,7 @@ def test_tile_has_every_array_in_its_place() -> None:
     np.testing.assert_array_equal(arrays["bias_stderr"][1, 0], np.sqrt(expected.covariance[3, 2, 2]))
     assert arrays["fit_status"][1, 1] == 256
     for variable in variables_of("fit"):
-        if variable.name in FREE_LOBES:
+        if variable.name in absent:
             continue
         assert arrays[variable.name].shape[:2] == (2, 3), variable.name
         assert arrays[variable.name].dtype == np.dtype(variable.dtype), variable.name

@@ -174,7 +174,7 @@ def test_degenerate_pixels_end_with_a_word_or_an_answer() -> None:
             failed = bool(word(result) & FAILED)
             assert np.isnan(result.conversion_gain[0]) == failed, name
             assert result.n_iterations[0] < 6000, name
-            if name not in ("huge outlier above", "hot", "four frames"):
+            if name not in ("huge outlier above", "huge outlier below", "hot", "four frames"):
                 assert word(result) != FitStatus.OK, name
 
 

@@ -49,10 +49,11 @@ def write_fit(context: StageContext, status_map: np.ndarray, lost: np.ndarray) -
         values = np.where(lost, np.nan, store.read(f"truth/{name}"))
         store.write_array(f"fit/{name}", values)
         store.write_array(f"fit/{name}_stderr", 0.01 * np.abs(values))
-    diagonal = [store.read(f"fit/{name}_stderr") ** 2 for name in PARAMETERS]
-    store.write_array("fit/covariance", np.stack(diagonal, axis=-1)[..., None] * np.eye(4))
+    store.write_array("fit/correlation", np.zeros((*lost.shape, 6)))
+    for name, value in {"chi2": 50.0, "dof": 50.0, "p": 0.5}.items():
+        store.write_array(f"fit/goodness_{name}", np.where(lost, np.nan, value))
+    store.write_array("fit/outlier_share", np.zeros(lost.shape))
     store.write_array("fit/fit_status", status_map)
-    store.write_array("fit/goodness_p", np.where(lost, np.nan, 0.5))
     store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
     for tile in context.tiles():
         store.records.mark("fit", "truth", tile.key, {})
