@@ -16,6 +16,15 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         ("pixels",),
     ),
     (
+        "goodness",
+        "Does the model describe each pixel?",
+        "The histogram of each pixel is tested against its fitted density by a chi-square of merged bins, "
+        "whose p-values are uniform by chance. Of many thousand tests some look significant: pixels are "
+        "called misfits only as far as the rate of false discoveries allows. Single samples that the model "
+        "does not expect at all (cosmic rays, glitches) are left out of the fit and counted.",
+        (),
+    ),
+    (
         "cells",
         "From signal to electron number",
         "The peaks of the PCD are whole electrons. Each signal belongs to the electron number that "
@@ -62,6 +71,13 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         ("components",),
     ),
     (
+        "uncertainty",
+        "How sure are the numbers?",
+        "Standard errors follow from the curvature of each pixel's likelihood, those of derived "
+        "quantities from the whole covariance of the four parameters.",
+        (),
+    ),
+    (
         "status",
         "Fit status",
         "Pixels that could not be fitted, or whose values deserve caution, and why.",
@@ -83,6 +99,27 @@ CAPTIONS: dict[str, str] = {
         "Gray: share of the frames at each digital number. Black: fitted density. Below: (observed − "
         "expected) / √expected; the gray band is two standard deviations. A good fit has about one line "
         "in twenty beyond the band and no pattern. Uncertainties are standard errors of the fit."
+    ),
+    "goodness": (
+        "p-values of the goodness of fit of all pixels (blue); by chance they are uniform (line, with two "
+        "standard deviations in gray), a peak at 0 is made of pixels that the model does not describe. Map: "
+        "chi-square as standard normal deviate, clipped at −4 and 6; circles are the misfits at a rate of "
+        "false discoveries of {rate:g}."
+    ),
+    "worst_pixels": (
+        "The pixels of the poorest fit, the poorest first, drawn as above. With thousands of pixels the "
+        "poorest look odd by chance, too: q is the rate of false discoveries at which the pixel counts."
+    ),
+    "left_out": (
+        "Samples where the fitted model expects fewer than {floor:g} frames per DN are left out of the "
+        "likelihood. Left: pixels by how many they lost. Right: where they are; white pixels lost none. "
+        "Without outliers about one pixel in two hundred loses a single sample by chance."
+    ),
+    "uncertainty": (
+        "Left: part of the variance of each map over the pixels that is noise of the estimates; near 100 % "
+        "(dotted) the map shows noise alone, and more frames would show more of the sensor. Right: "
+        "predicted density of the ensemble (black), its standard error from those of the maps (blue), and "
+        "the sampling noise of the data it is compared with (light blue)."
     ),
     "read_noise_histogram": (
         "Read noise, quantisation included. The blue line is the median, the shaded part holds the pixels"

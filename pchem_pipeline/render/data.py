@@ -96,6 +96,10 @@ class ReportData:
         inputs: one mapping per input file: name, size, hash, ...
         stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
             ``peak_memory_bytes``, ``units``, ``notes``.
+        misfits: what the maps say of the goodness of fit: ``tested``, ``misfits``, ``false_discovery_rate``,
+            ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``, ``p``, ``q``), ``pixels_with_outliers``.
+        worst: the pixels of the poorest fit.
+        intervals: by quantity the ends of its profile intervals, (y, x) each, where they were asked for.
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
         inspector: maps and pixels to look at in the browser, or None.
@@ -123,6 +127,9 @@ class ReportData:
     run: Mapping[str, Any] = field(default_factory=dict)
     inputs: Sequence[Mapping[str, Any]] = ()
     stages: Sequence[Mapping[str, Any]] = ()
+    misfits: Mapping[str, Any] = field(default_factory=dict)
+    worst: Sequence[PixelFit] = ()
+    intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
     inspector: InspectorData | None = None

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from pchem_pipeline.model.electrons import thresholds
 from pchem_pipeline.model.maps import summarise
-from pchem_pipeline.render import ensemble_figures, map_figures, pixel_figures
+from pchem_pipeline.render import ensemble_figures, map_figures, pixel_figures, trust_figures
 from pchem_pipeline.render.captions import CAPTIONS, highlighted_cases
 from pchem_pipeline.render.data import MAP_NAMES, PixelFit, ReportData
 from pchem_pipeline.render.ranges import finite
@@ -26,13 +26,19 @@ EXHIBIT_NAMES = (
     "cluster_edges_example",
     "cluster_edges_pixel",
     "pixel_fits",
+    "goodness",
+    "worst_pixels",
+    "left_out",
     "read_noise_histogram",
     *(f"map_{name}" for name in MAP_NAMES),
     "ensemble",
     "electron_numbers",
     "component_widths",
+    "uncertainty",
     "fit_status",
 )
+
+_UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,10 @@ class Exhibit:
 
 def exhibits(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
     """Return the figures that the data allow, in the order of the report."""
-    makers = (_cells, _pixels, _read_noise, _maps, _ensemble, _electrons, _components, _status)
+    makers = (
+        _cells, _pixels, _goodness, _left_out, _read_noise, _maps, _ensemble, _electrons, _components,
+        _uncertainty, _status,
+    )  # fmt: skip
     return [exhibit for make in makers for exhibit in make(data, settings)]
 
 
@@ -147,6 +156,86 @@ def _pixels(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             "Histograms with fitted densities. " + "; ".join(words) + ".",
             drawing(pixel_figures.pixel_fits, data.pixels),
             PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
+        )
+    ]
+
+
+def _goodness(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    names = [f"goodness_{part}" for part in ("p", "chi2", "dof", "q")]
+    if not data.misfits or any(name not in data.fit for name in names):
+        return []
+    facts = data.misfits
+    text = (
+        f"p-values and misfit of {count(int(facts['tested']), data.noun)}; "
+        f"{count(int(facts['misfits']), 'misfit')} at a rate of false discoveries of "
+        f"{facts['false_discovery_rate']:g}."
+    )
+    found = [
+        Exhibit(
+            "goodness",
+            "goodness",
+            "Goodness of fit of all pixels",
+            CAPTIONS["goodness"].format(rate=facts["false_discovery_rate"]),
+            text,
+            drawing(
+                trust_figures.goodness,
+                {name: data.fit[name] for name in names},
+                float(facts["false_discovery_rate"]),
+            ),
+            PAGE_MM,
+            raster=not map_figures.is_strip(data.shape),
+        )
+    ]
+    if data.worst:
+        places = ", ".join(pixel.place for pixel in data.worst)
+        found.append(
+            Exhibit(
+                "worst_pixels",
+                "goodness",
+                "Pixels of the poorest fit",
+                CAPTIONS["worst_pixels"],
+                f"Histograms with fitted densities and residuals: {places}.",
+                drawing(pixel_figures.pixel_fits, data.worst),
+                PAGE_MM if len(data.worst) > 1 else COLUMN_MM,
+            )
+        )
+    return found
+
+
+def _left_out(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    share = data.fit.get("outlier_share")
+    if share is None or not data.misfits.get("tail_guard"):
+        return []
+    hit = int((share > 0).sum())
+    return [
+        Exhibit(
+            "left_out",
+            "goodness",
+            "Samples left out of the fit",
+            CAPTIONS["left_out"].format(floor=data.misfits["tail_guard"]),
+            f"{count(hit, data.noun)} of {share.size:,} lost samples, at most "
+            f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
+            drawing(trust_figures.left_out, share, data.n_frames),
+            PAGE_MM,
+            raster=not map_figures.is_strip(data.shape),
+        )
+    ]
+
+
+def _uncertainty(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    shares = trust_figures.noise_shares(data.maps, _UNCERTAIN)
+    if not shares or "epcd_exact" not in data.ensemble:
+        return []
+    words = ", ".join(f"{symbol(name)[1]} {percent(min(value, 1.0), 1.0)}" for name, value in shares.items())
+    return [
+        Exhibit(
+            "uncertainty",
+            "uncertainty",
+            "Noise in the maps and in the prediction",
+            CAPTIONS["uncertainty"],
+            f"Part of the variance of the maps that is noise of the estimates: {words}.",
+            drawing(trust_figures.uncertainty, shares, data.ensemble),
+            PAGE_MM,
         )
     ]
 

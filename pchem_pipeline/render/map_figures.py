@@ -43,6 +43,7 @@ __all__ = [
     "map_and_histogram",
     "map_bins",
     "read_noise_histogram",
+    "show_map",
     "status_counts",
 ]
 
@@ -140,7 +141,7 @@ def _image(
     figure: Figure, axes: Axes, values: FloatArray, label: str, stretch: Literal["beta", "linear"]
 ) -> None:
     drawn = stretch_map(values, stretch)
-    image = _show(figure, axes, drawn.colour, vmin=0.0, vmax=1.0)
+    image = show_map(axes, drawn.colour, vmin=0.0, vmax=1.0)
     n_missing = int(np.isnan(drawn.colour).sum())
     if n_missing:
         patch = Patch(facecolor=NO_VALUE, edgecolor="#888888", label=f"no value: {count(n_missing, 'pixel')}")
@@ -152,7 +153,14 @@ def _image(
         bar.set_label(label)
 
 
-def _show(figure: Figure, axes: Axes, colour: NDArray[Any], **options: Any) -> AxesImage:
+def show_map(axes: Axes, colour: NDArray[Any], **options: Any) -> AxesImage:
+    """Draw an image of the pixels, square unless the sensor is very long; NaN has the colour of no value.
+
+    Args:
+        axes: where.
+        colour: what the colour stands for, (y, x).
+        options: of matplotlib's ``imshow``.
+    """
     ny, nx = colour.shape
     square = 1.0 / _LONGEST_RATIO <= ny / nx <= _LONGEST_RATIO
     axes.set_facecolor(NO_VALUE)
@@ -321,7 +329,7 @@ def fit_status_map(
         figure = new_figure(width_mm, _map_height(status.shape, width_mm - 14.0) + legend_mm)
         axes = figure.add_subplot()
         norm = BoundaryNorm(np.arange(len(palette) + 1) - 0.5, len(palette))
-        _show(figure, axes, colour, cmap=ListedColormap(palette), norm=norm)
+        show_map(axes, colour, cmap=ListedColormap(palette), norm=norm)
     figure.legend(
         handles=[Patch(facecolor=c, edgecolor="#888888", label=text) for c, text in legend],
         loc="outside lower left",

@@ -11,8 +11,9 @@ import numpy as np
 from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.map_figures import status_counts
 from pchem_pipeline.render.ranges import finite
+from pchem_pipeline.render.trust_figures import noise_shares
 from pchem_pipeline.render.verdict import summaries
-from pchem_pipeline.render.wording import measured, percent, scientific, short, symbol, unit_text
+from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol, unit_text
 
 __all__ = ["Table", "provenance_tables", "result_tables", "size_words"]
 
@@ -31,7 +32,9 @@ class Table:
 
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
-    makers = (_channels, _parameters, _against_truth, _rmse, _moments, _electrons, _status)
+    makers = (
+        _channels, _parameters, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals, _status,
+    )  # fmt: skip
     return [table for make in makers if (table := make(data)).rows]
 
 
@@ -262,6 +265,70 @@ def _electrons(data: ReportData) -> Table:
         ("k", "estimated", "predicted p(k)", "estimator should show"),
         tuple(rows),
         section="electrons",
+    )
+
+
+def _misfits(data: ReportData) -> Table:
+    facts = data.misfits
+    rows = [
+        (
+            f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
+            f"{row['chi2']:.1f}",
+            f"{row['dof']:.1f}",
+            scientific(float(row["p"])),
+            scientific(float(row["q"])),
+            "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",
+        )
+        for row in facts.get("worst", ())
+    ]
+    if not rows:
+        return Table("misfits", "", "", (), ())
+    return Table(
+        "misfits",
+        f"Worst {data.noun}s",
+        f"Of {int(facts['tested']):,} tested {data.noun}s, {int(facts['misfits']):,} disagree with the model "
+        f"at a rate of false discoveries of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
+        f"{count(int(facts['pixels_with_outliers']), data.noun)} lost samples to the tail guard, at most "
+        f"{percent(float(facts['largest_outlier_share']), 1.0)} of their frames.",
+        (data.noun, "χ²", "degrees of freedom", "p", "q", "misfit"),
+        tuple(rows),
+        section="goodness",
+    )
+
+
+def _intervals(data: ReportData) -> Table:
+    rows = []
+    shares = noise_shares(data.maps, _ORDER)
+    for name in (name for name in _ORDER if data.has_values(name) and f"{name}_stderr" in data.maps):
+        _, words, unit = symbol(name)
+        values, errors = data.maps[name], data.maps[f"{name}_stderr"]
+        known = finite(errors)
+        if not known.size:
+            continue
+        ends = ["", ""]
+        if name in data.intervals:
+            low, high = data.intervals[name]
+            ends = [short(float(np.nanmedian(part / errors)), 3) for part in (values - low, high - values)]
+        rows.append(
+            (
+                f"{words} ({unit})",
+                short(float(np.median(known)), 3),
+                percent(float(np.median(known)), abs(float(np.median(finite(values))))),
+                percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
+                *(ends if data.intervals else ()),
+            )
+        )
+    profile = ("profile: below", "profile: above") if data.intervals else ()
+    head = ("quantity", f"error of a {data.noun}", "of the value", "noise in the map", *profile)
+    words = " Ends of the profile-likelihood intervals below and above the estimate, in standard errors."
+    return Table(
+        "uncertainties",
+        "Uncertainties",
+        f"Median standard error of a {data.noun}, and the part of the map's variance that it makes."
+        + (words if data.intervals else ""),
+        head,
+        tuple(rows),
+        section="uncertainty",
     )
 
 

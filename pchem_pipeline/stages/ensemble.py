@@ -194,8 +194,10 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     lobes = None
     if job.effects:
         lobes = tuple(store.read(f"fit/{name}", rows) for name in FREE_LOBES)
-    stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)
-    covariance = covariance_from(stderr, store.read("fit/correlation", (*rows, slice(None))))
+    covariance = None
+    if store.has("fit/correlation"):
+        stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)
+        covariance = covariance_from(stderr, store.read("fit/correlation", (*rows, slice(None))))
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
@@ -212,7 +214,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             job.axes,
             job.effects,
             None if lobes is None else (lobes[0][part].ravel(), lobes[1][part].ravel()),
-            covariance[part].reshape(n, 4, 4),
+            None if covariance is None else covariance[part].reshape(n, 4, 4),
         )
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size

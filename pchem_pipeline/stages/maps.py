@@ -127,5 +127,6 @@ def _misfits(context: StageContext) -> dict[str, Any]:
         "false_discovery_rate": settings.false_discovery_rate,
         "worst": worst,
         "pixels_with_outliers": int(np.count_nonzero(outliers > 0)),
+        "tail_guard": context.config.fit.tail_guard,
         "largest_outlier_share": float(np.nanmax(outliers, initial=0.0)),
     }

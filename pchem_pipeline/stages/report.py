@@ -27,7 +27,7 @@ from pchem_pipeline.stages.discrepancy_result import read_discrepancy
 from pchem_pipeline.stages.drawing import draw_by_workers
 from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.stages.inspector import gather_inspector
-from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, variables_of
+from pchem_pipeline.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -56,7 +56,9 @@ NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
 SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
 identity = _THIS.identity
 
-_FIT_MAPS = ("fit_status", "goodness_p")
+_FIT_MAPS = ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share")
+#: Maps that are no parameters.
+_NOT_SHOWN = ("quality", "goodness_q")
 _TRUTH = (*PARAMETERS, "read_noise_e")
 #: Labels of the four shown pixels, and the ranks of read noise and quanta exposure at which they lie.
 _CORNERS = (
@@ -187,11 +189,17 @@ def gather(
     from pchem_pipeline.stages.sensor import SensorInfo
 
     sensor = SensorInfo.read(store)
-    maps = _group(store, "maps", skip=("quality",))
+    intervals = _intervals(store)
+    ends = [path for name in intervals for path in interval_names(name)]
+    maps = _group(store, "maps", skip=(*_NOT_SHOWN, *ends))
     fit = {name: store.read(f"fit/{name}") for name in _FIT_MAPS if store.has(f"fit/{name}")}
-    pixels = _pixels(store, config, sensor, maps, fit)
+    pixels = _pixels(store, _shown(config, sensor, maps, fit), sensor, maps, fit)
     discrepancy = read_discrepancy(store)
     suspects = [place for each in discrepancy.found.where for place in each.pixels] if discrepancy else []
+    if store.has("maps/goodness_q"):
+        fit["goodness_q"] = store.read("maps/goodness_q")
+    misfits = store.attributes("maps").get("goodness", {})
+    worst = [(f"q = {row['q']:.2g}", row["y"], row["x"]) for row in misfits.get("worst", ())]
     ensemble = _group(store, "ensemble")
     facts = dict(store.attributes("ensemble"))
     moments, _ = facts.pop("moments", []), facts.pop("missing", {})
@@ -206,6 +214,9 @@ def gather(
         status_words={int(bit): text for bit, text in MEANINGS.items()},
         failed_mask=int(FAILED),
         pixels=pixels,
+        misfits=misfits,
+        worst=_pixels(store, worst, sensor, maps, fit),
+        intervals=intervals,
         ensemble=ensemble,
         ensemble_facts=facts,
         component_cases=[case_name(case) for case in cases],
@@ -236,19 +247,39 @@ def _group(store: RunStore, group: str, skip: Sequence[str] = ()) -> dict[str, N
     }
 
 
-def _pixels(
-    store: RunStore,
+def _intervals(store: RunStore) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Read the ends of the profile intervals, by quantity, where there are any."""
+    found = {}
+    for name in (*INTERVALS, "dark_current"):
+        low, high = (f"maps/{path}" for path in interval_names(name))
+        if store.has(low):
+            found[name] = store.read(low), store.read(high)
+    return found
+
+
+def _shown(
     config: RunConfig,
     sensor: SensorInfo,
     maps: Mapping[str, NDArray[Any]],
     fit: Mapping[str, NDArray[Any]],
-) -> list[PixelFit]:
-    """Read the histograms of the shown pixels."""
+) -> list[Chosen]:
+    """Return the pixels that stand for the sensor."""
     chosen: list[Chosen] = [("", y, x) for y, x in config.report.pixels]
     if not chosen and sensor.names and sensor.nx <= _FEW_CHANNELS:
         chosen = [(name, 0, x) for x, name in enumerate(sensor.names)]
     if not chosen:
         chosen = choose_pixels(maps["read_noise_e"], maps["quanta_exposure"], fit["fit_status"])
+    return chosen
+
+
+def _pixels(
+    store: RunStore,
+    chosen: Sequence[Chosen],
+    sensor: SensorInfo,
+    maps: Mapping[str, NDArray[Any]],
+    fit: Mapping[str, NDArray[Any]],
+) -> list[PixelFit]:
+    """Read the histograms of some pixels."""
     names = (*PARAMETERS, "read_noise_e")
     effects = fitted_effects(store)
     found = []
