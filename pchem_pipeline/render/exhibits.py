@@ -19,7 +19,7 @@ from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM
 from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol
 
-__all__ = ["EXHIBIT_NAMES", "Drawing", "Exhibit", "drawing", "exhibits"]
+__all__ = ["EXHIBIT_NAMES", "UNCERTAIN", "Drawing", "Exhibit", "drawing", "exhibits"]
 
 #: Names of all figures that a report can have, in their order.
 EXHIBIT_NAMES = (
@@ -38,7 +38,8 @@ EXHIBIT_NAMES = (
     "fit_status",
 )
 
-_UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
+#: Maps of which the figure of uncertainties tells the share of noise.
+UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ def _left_out(data: ReportData, _: ReportSettings) -> list[Exhibit]:
 
 
 def _uncertainty(data: ReportData, _: ReportSettings) -> list[Exhibit]:
-    shares = trust_figures.noise_shares(data.maps, _UNCERTAIN)
+    shares = trust_figures.noise_shares(data.maps, UNCERTAIN)
     if not shares or "epcd_exact" not in data.ensemble:
         return []
     words = ", ".join(f"{symbol(name)[1]} {percent(min(value, 1.0), 1.0)}" for name, value in shares.items())

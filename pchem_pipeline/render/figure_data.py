@@ -5,19 +5,21 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.discovery import misfit
 from pchem_pipeline.model.electrons import thresholds
 from pchem_pipeline.model.pcd import pcd
 from pchem_pipeline.render.data import MAP_NAMES, PixelFit, ReportData
-from pchem_pipeline.render.exhibits import Exhibit
+from pchem_pipeline.render.exhibits import UNCERTAIN, Exhibit
 from pchem_pipeline.render.map_figures import is_strip, map_bins, status_counts
 from pchem_pipeline.render.pixel_figures import PAPER_EXAMPLE, cell_range, has_fit
 from pchem_pipeline.render.settings import ReportSettings
+from pchem_pipeline.render.trust_figures import noise_shares
 from pchem_pipeline.render.wording import stored_unit
 
 __all__ = ["DataTable", "csv_text", "figure_tables"]
@@ -130,6 +132,29 @@ def _codes(pixel: PixelFit) -> NDArray[np.int64]:
     return pixel.origin + np.arange(pixel.counts.size)
 
 
+def _goodness(data: ReportData, _: ReportSettings) -> list[DataTable]:
+    columns = {name: data.fit[f"goodness_{name}"].ravel() for name in ("p", "chi2", "dof", "q")}
+    deviate = misfit(columns["chi2"], columns["dof"])
+    return [DataTable("", _grid(data.shape) | columns | {"misfit (standard deviations)": deviate})]
+
+
+def _left_out(data: ReportData, _: ReportSettings) -> list[DataTable]:
+    share = data.fit["outlier_share"]
+    return [DataTable("", _grid(share.shape) | {"share left out": share.ravel()})]
+
+
+def _uncertainty(data: ReportData, _: ReportSettings) -> list[DataTable]:
+    shares = noise_shares(data.maps, UNCERTAIN)
+    columns = {"map": list(shares), "share of the variance": list(shares.values())}
+    names = ("epcd_exact", "epcd_stderr")
+    curves = {f"{name} (1/DN)": data.ensemble[name] for name in names if name in data.ensemble}
+    return [DataTable("maps", columns), DataTable("ensemble", {"dn (DN)": data.ensemble["dn"], **curves})]
+
+
+def _worst(data: ReportData, settings: ReportSettings) -> list[DataTable]:
+    return _pixels(replace(data, pixels=data.worst), settings)
+
+
 def _pixels(data: ReportData, _: ReportSettings) -> list[DataTable]:
     parts = [_pixel_columns(pixel) for pixel in data.pixels]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -175,7 +200,10 @@ def _ensemble(data: ReportData, _: ReportSettings) -> list[DataTable]:
         if axis in data.ensemble and f"{data_name}density" in data.ensemble:
             columns = {f"{axis} ({unit})": data.ensemble[axis]}
             columns["counts"] = data.ensemble[f"{data_name}counts"]
-            names = ["density", *(f"{model}{suffix}" for suffix in ("exact", "dependent", "independent"))]
+            names = [
+                "density",
+                *(f"{model}{suffix}" for suffix in ("exact", "stderr", "dependent", "independent")),
+            ]
             names[0] = f"{data_name}density"
             columns |= {f"{n} (1/{unit})": data.ensemble[n] for n in names if n in data.ensemble}
             tables.append(DataTable(part, columns))
@@ -205,6 +233,10 @@ _MAKERS: dict[str, Callable[[ReportData, ReportSettings], list[DataTable]]] = {
     "cluster_edges_example": _example,
     "cluster_edges_pixel": _first_fitted,
     "pixel_fits": _pixels,
+    "goodness": _goodness,
+    "worst_pixels": _worst,
+    "left_out": _left_out,
+    "uncertainty": _uncertainty,
     "read_noise_histogram": _read_noise,
     "ensemble": _ensemble,
     "electron_numbers": _electrons,
