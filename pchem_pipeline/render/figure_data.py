@@ -145,7 +145,7 @@ def _left_out(data: ReportData, _: ReportSettings) -> list[DataTable]:
 
 def _uncertainty(data: ReportData, _: ReportSettings) -> list[DataTable]:
     shares = noise_shares(data.maps, UNCERTAIN)
-    columns = {"map": list(shares), "share of the variance": list(shares.values())}
+    columns: dict[str, Any] = {"map": list(shares), "share of the variance": list(shares.values())}
     names = ("epcd_exact", "epcd_stderr")
     curves = {f"{name} (1/DN)": data.ensemble[name] for name in names if name in data.ensemble}
     return [DataTable("maps", columns), DataTable("ensemble", {"dn (DN)": data.ensemble["dn"], **curves})]
