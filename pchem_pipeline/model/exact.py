@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,8 +158,8 @@ def _height(result: FitResult) -> FloatArray:
 
 def _single(joint: JointFit) -> FitResult:
     """Return a joint fit of one sample as the fit of a single sample."""
-    nothing = np.zeros(joint.bias.size)
-    values = {each.name: getattr(joint, each.name, nothing) for each in fields(FitResult)}
+    nothing: Any = np.zeros(joint.bias.size)
+    values: dict[str, Any] = {each.name: getattr(joint, each.name, nothing) for each in fields(FitResult)}
     return FitResult(**{**values, "quanta_exposure": joint.quanta_exposure[:, 0].copy()})
 
 
