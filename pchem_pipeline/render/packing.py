@@ -2,8 +2,9 @@
 
 A map becomes one code of 16 bits per pixel: 0 for no value, 2 to 65534 for ``low + step * (code - 2)`` (its
 power of ten where the map is logarithmic), and 1 and 65535 for the few values below and above that range,
-which follow as they are. The order of the codes is the order of the values, so that ranks and percentiles
-can be counted on codes. Histograms are stored without their empty ends, small counts in one byte.
+which follow as they are; a 1 of a logarithmic map that does not follow is 0. The order of the codes is the
+order of the values, so that ranks and percentiles can be counted on codes. Histograms are stored without
+their empty ends, small counts in one byte.
 """
 
 from __future__ import annotations
@@ -97,8 +98,10 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
         work = np.log10(flat) if scale.log else flat
         place = np.rint((work - scale.low) / scale.step) + _FIRST
     place = np.where(place < _FIRST, _BELOW, np.where(place > _LAST, _ABOVE, place))
-    codes = np.where(known & np.isfinite(place), place, _NONE).astype("<u2")
-    odd = np.flatnonzero((codes == _BELOW) | (codes == _ABOVE))
+    codes = np.where(known & ~np.isnan(place), place, _NONE).astype("<u2")
+    if scale.log:  # zeros, which may be many, need no place in the list
+        codes[known & (flat == 0)] = _BELOW
+    odd = np.flatnonzero(((codes == _BELOW) & ~(scale.log & (flat == 0))) | (codes == _ABOVE))
     planes = [codes & 255, codes >> 8]
     content = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
@@ -113,6 +116,7 @@ def unpack_map(packed: PackedMap, shape: tuple[int, int]) -> FloatArray:
     values = packed.scale.low + packed.scale.step * (codes.astype(np.float64) - _FIRST)
     values = 10.0**values if packed.scale.log else values
     values[codes == _NONE] = np.nan
+    values[codes == _BELOW] = 0.0
     odd = np.frombuffer(content, "<u4", packed.n_odd, 2 * n)
     values[odd] = np.frombuffer(content, "<f4", packed.n_odd, 2 * n + 4 * packed.n_odd)
     return values.reshape(shape)

@@ -58,6 +58,17 @@ def test_wide_positive_values_keep_their_relative_error() -> None:
     np.testing.assert_allclose(back.ravel()[1:], values.ravel()[1:], rtol=0.0117)
 
 
+def test_many_zeros_cost_nothing() -> None:
+    values = np.random.default_rng(3).lognormal(0, 2, (80, 80))
+    values[:, 20:] = 0.0
+    packed = pack_map(values, choose_scale(values))
+    assert packed.n_odd == 0
+    assert len(packed.data) < 4000
+    back = unpack_map(packed, values.shape)
+    assert (back[:, 20:] == 0).all()
+    np.testing.assert_allclose(back, values, rtol=0.0117)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
 def test_whole_numbers_are_exact(dtype: type) -> None:
     values = np.random.default_rng(4).integers(0, 200, (30, 30)).astype(dtype)

@@ -142,7 +142,7 @@
     if (slot !== undefined && exact) return exact[slot];
     const code = map.codes[i];
     if (code === NONE) return NaN;
-    return code === BELOW || code === ABOVE ? map.odd.get(i) : codeValue(map, code);
+    return code === BELOW || code === ABOVE ? map.odd.get(i) ?? 0 : codeValue(map, code);
   };
   const errorPath = (path) => (factOf.has(`${path}_stderr`) ? `${path}_stderr` : null);
   const wordsOf = (fact, value) => {
@@ -183,7 +183,7 @@
     return [low, high];
   };
   const valueOfCode = (map, code) => {
-    if (code === BELOW) return oddEnds(map)[0];
+    if (code === BELOW) return map.log ? 0 : oddEnds(map)[0];
     return code === ABOVE ? oddEnds(map)[1] : codeValue(map, code);
   };
   const quantile = (map, counts, share) => {
@@ -306,6 +306,7 @@
     redraw();
   };
   const layout = () => {
+    if (!state.map) return;
     const wasWhole = view.scale <= view.fit * 1.001;
     const frame = canvas.parentElement;
     view.width = Math.max(frame.clientWidth, 80);
@@ -512,6 +513,7 @@
   let brush = null;
   const showHistogram = () => {
     const { map, selection } = state;
+    if (!map) return;
     const there = !categorical(map.fact) && total(map.counts) > 0;
     byId("inspector-brush").hidden = !there;
     if (!there) return;
@@ -918,6 +920,7 @@
       state.map = map;
     } catch (error) {
       layers.delete(path);
+      if (state.map) byId("inspector-map").value = state.map.fact.path;
       say(`${fact.label} cannot be shown: ${error.message}`);
       return;
     } finally { delete app.dataset.busy; }
@@ -1010,6 +1013,8 @@
     let path = asked.path ?? (first.includes("maps/read_noise_e") ? "maps/read_noise_e" : first[0]);
     if (!first.includes(path)) path = first[0];
     await showMap(path);
+    if (!state.map && path !== "fit/fit_status" && state.status) await showMap("fit/fit_status");
+    if (!state.map) throw new Error("no map can be read");
     if (state.map && !asked.path && total(state.map.counts) === 0 && state.status) await showMap("fit/fit_status");
     listen();
     if (asked.pixel >= 0) { await choose(asked.pixel, { quiet: true }); byId("inspector").scrollIntoView(); }

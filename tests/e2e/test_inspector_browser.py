@@ -1,0 +1,482 @@
+"""The inspector in a real browser: Debian's Chromium, headless, driven by Playwright."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from inspector_material import make_run
+
+from pchem_pipeline.model.fit_status import MEANINGS
+from pchem_pipeline.model.maps import display_transform
+from pchem_pipeline.model.pcd import pcd
+from pchem_pipeline.render.packing import unpack_map
+from pchem_pipeline.render.wording import measured, short, symbol
+from pchem_pipeline.stages.inspector import packed_map
+from pchem_pipeline.stages.view import make_server
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.variables import VARIABLES
+
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="no Playwright; install it with: pip install playwright"
+)
+CHROMIUM = os.environ.get("PCHEM_CHROMIUM") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium; install it with: apt-get install chromium, or set PCHEM_CHROMIUM"
+)
+
+NY, NX = 70, 90
+PANEL = ("quanta_exposure", "dark_current", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
+HOSTILE = '<script>window.hit = 1</script><img src=x onerror="window.hit = 2">'
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> RunStore:
+    """A run of 6300 pixels, of which 2400 are in the file in full."""
+    return make_run(tmp_path_factory.mktemp("looked at"))
+
+
+@dataclass
+class Tab:
+    """An open page with all that it said and asked for."""
+
+    page: Any
+    said: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+
+    def text(self, selector: str) -> str:
+        return re.sub(r"\s+", " ", self.page.locator(selector).inner_text()).strip()
+
+    def wait(self, i: int) -> None:
+        self.page.wait_for_selector(f'#inspector-app[data-pixel="{i}"]', timeout=10_000)
+
+    def value(self, path: str) -> str:
+        return self.text(f'#inspector-values tr[data-path="{path}"] td >> nth=0')
+
+    def show(self, path: str) -> None:
+        self.page.select_option("#inspector-map", path)
+        self.page.wait_for_selector(f'#inspector-app[data-map="{path}"]', timeout=10_000)
+
+    def position(self, y: float, x: float) -> tuple[float, float]:
+        """Where a pixel is in the window, the whole map being shown."""
+        self.page.locator("#inspector-canvas").scroll_into_view_if_needed()
+        box = self.page.locator("#inspector-canvas").bounding_box()
+        scale = min(box["width"] / NX, box["height"] / NY)
+        left, top = (box["width"] - NX * scale) / 2, (box["height"] - NY * scale) / 2
+        return box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale
+
+    def click(self, y: int, x: int) -> None:
+        self.page.mouse.click(*self.position(y, x))
+        self.wait(y * NX + x)
+
+
+@pytest.fixture
+def open_tab(browser: Any) -> Iterator[Any]:
+    """Open pages that must say nothing and ask nobody; checked at the end of each test."""
+    tabs, contexts = [], []
+
+    def open_(url: str, width: int = 1280, scheme: str = "light", ready: bool = True) -> Tab:
+        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+        tab = Tab(context.new_page())
+        tab.page.on("console", lambda message: tab.said.append(message.text))
+        tab.page.on("pageerror", lambda error: tab.said.append(str(error)))
+        tab.page.on("request", lambda request: tab.asked.append(request.url))
+        tab.page.goto(url)
+        if ready:
+            tab.page.wait_for_selector("#inspector-app[data-ready]", timeout=20_000)
+        contexts.append(context)
+        tabs.append((tab, url))
+        return tab
+
+    yield open_
+    for tab, url in tabs:
+        assert tab.said == []
+        start = url.split("#")[0] if url.startswith("file:") else url.split("#")[0].rstrip("/")
+        assert [each for each in tab.asked if not each.startswith((start, "data:"))] == []
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture
+def tab(open_tab: Any, store: RunStore) -> Tab:
+    return open_tab(file_url(store))  # type: ignore[no-any-return]
+
+
+def file_url(store: RunStore) -> str:
+    return (store.path / "report.html").as_uri()
+
+
+def in_full(tab: Tab) -> set[int]:
+    """Pixels whose histogram is in the file: those that Next visits."""
+    found = tab.page.evaluate(
+        "async () => { const t = document.getElementById('inspector-sample').textContent;"
+        "const b = Uint8Array.from(atob(t), (c) => c.charCodeAt(0));"
+        "const s = new Blob([b]).stream().pipeThrough(new DecompressionStream('gzip'));"
+        "const v = new DataView(await new Response(s).arrayBuffer());"
+        "const n = JSON.parse(document.getElementById('inspector-facts').textContent).sample.n;"
+        "return Array.from({length: n}, (_, i) => v.getUint32(4 * i, true)); }"
+    )
+    return set(found)
+
+
+def shown_value(store: RunStore, name: str, i: int) -> str:
+    value, error = (float(store.read(f"maps/{each}").ravel()[i]) for each in (name, f"{name}_stderr"))
+    return measured(value, error, symbol(name)[2])
+
+
+def as_shown(store: RunStore, path: str) -> np.ndarray:
+    """The map as the page has it where it has no exact values."""
+    return unpack_map(packed_map(store, VARIABLES[path]), (NY, NX))
+
+
+def selected(tab: Tab) -> int:
+    found = re.match(r"([\d,]+) pixels? selected", tab.text("#inspector-selection"))
+    assert found, tab.text("#inspector-selection")
+    return int(found[1].replace(",", ""))
+
+
+def test_it_opens_from_disk_and_asks_nobody(tab: Tab) -> None:
+    assert tab.asked == [tab.page.url.split("#")[0]]
+    assert tab.page.locator("#inspector-map option").count() >= 15
+    assert tab.text("#inspector-histogram-words").startswith("read noise: median")
+
+
+def test_the_policy_of_the_page_forbids_network_and_other_scripts(browser: Any, store: RunStore) -> None:
+    page = browser.new_page()
+    page.goto(file_url(store))
+    page.evaluate(
+        "() => { window.forbidden = [];"
+        "document.addEventListener('securitypolicyviolation',"
+        "(e) => window.forbidden.push(e.effectiveDirective)) }"
+    )
+    assert page.evaluate("fetch('http://127.0.0.1:9/').then(() => 'sent', () => 'refused')") == "refused"
+    page.evaluate(
+        "() => { const s = document.createElement('script'); s.text = 'window.hit = 1';"
+        "document.body.append(s) }"
+    )
+    page.wait_for_function("window.forbidden.length >= 2", timeout=5000)
+    assert page.evaluate("window.hit") is None
+    assert set(page.evaluate("window.forbidden")) == {"connect-src", "script-src-elem"}
+    page.close()
+
+
+def test_a_click_shows_the_numbers_of_the_store(tab: Tab, store: RunStore) -> None:
+    status = store.read("fit/fit_status").ravel()
+    full = sorted(i for i in in_full(tab) if status[i] == 0)
+    assert len(full) > 1000
+    for i in (full[10], full[len(full) // 2]):
+        tab.click(*divmod(i, NX))
+        assert tab.text("#inspector-title") == f"Pixel y = {i // NX}, x = {i % NX}"
+        assert tab.text("#inspector-status").startswith("✓ good fit; goodness of fit p = ")
+        for name in PANEL:
+            assert tab.value(f"maps/{name}") == shown_value(store, name, i), name
+        counts = store.read("histogram/counts")[divmod(i, NX)]
+        assert f"Gray: {counts.sum():,} frames." in tab.text("#inspector-caption")
+
+
+def test_a_pixel_that_is_not_in_full_says_so(tab: Tab, store: RunStore) -> None:
+    known = np.isfinite(store.read("maps/bias").ravel())
+    i = next(i for i in range(2000, NX * NY) if i not in in_full(tab) and known[i])
+    tab.click(*divmod(i, NX))
+    assert (
+        "histogram is not in the file, which holds 2,400 of 6,300. To see every one: pchem view run.zarr"
+        in tab.text("#inspector-note")
+    )
+    for name in PANEL:
+        value, error = tab.value(f"maps/{name}").split(" ± ")
+        exact, exact_error = (store.read(f"maps/{each}").ravel()[i] for each in (name, f"{name}_stderr"))
+        # half a step of the code, and half a unit of the last digit shown
+        last = 0.5 * 10.0 ** -len(value.partition(".")[2])
+        typical = np.nanmedian(store.read(f"maps/{name}_stderr"))
+        assert abs(float(value.replace("−", "-")) - exact) <= typical / 16 + last, name
+        assert float(error.split()[0]) == pytest.approx(exact_error, rel=0.1)
+    tab.page.click("#inspector-nearest")
+    tab.page.wait_for_selector("#inspector-nearest", state="hidden")
+    assert "frames." in tab.text("#inspector-caption")
+
+
+def test_the_table_of_the_histogram_has_the_fitted_density(tab: Tab, store: RunStore) -> None:
+    status = store.read("fit/fit_status").ravel()
+    i = next(i for i in sorted(in_full(tab)) if status[i] == 0 and i > 3000)
+    tab.click(*divmod(i, NX))
+    tab.page.click("#inspector-counts summary")
+    tab.page.wait_for_selector("#inspector-counts tbody tr")
+    rows = [row.split("\t") for row in tab.page.locator("#inspector-counts tbody").inner_text().splitlines()]
+    theta = [
+        store.read(f"maps/{name}").ravel()[i]
+        for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+    ]
+    counts, origin = (
+        store.read("histogram/counts").reshape(NX * NY, -1)[i],
+        store.read("histogram/origin").ravel()[i],
+    )
+    assert len(rows) > 30
+    for row in rows:
+        dn = int(row[0])
+        there = 0 <= dn - origin < counts.size
+        assert int(row[1]) == (counts[dn - origin] if there else 0)
+        expected = counts.sum() * float(pcd(dn, *theta))
+        if expected > 0.01:
+            assert float(row[2].replace("−", "-")) == pytest.approx(expected, rel=0.01, abs=0.01)
+
+
+def test_keyboard_only(tab: Tab, store: RunStore) -> None:
+    press = tab.page.keyboard.press
+    for _ in range(80):
+        press("Tab")
+        if tab.page.evaluate("document.activeElement.id") == "inspector-canvas":
+            break
+    else:
+        pytest.fail("the map cannot be reached by Tab")
+    press("ArrowRight")
+    centre = (NY // 2) * NX + NX // 2
+    tab.wait(centre)
+    for key, i in (
+        ("ArrowRight", centre + 1),
+        ("ArrowDown", centre + 1 + NX),
+        ("Shift+ArrowLeft", centre + 1 + NX - 10),
+    ):
+        press(key)
+        tab.wait(i)
+    assert f"y = {NY // 2 + 1}, x = {NX // 2 - 9}: read noise" in tab.text("#inspector-spoken")
+    press("Home")
+    tab.wait((NY // 2 + 1) * NX)
+    press("]")
+    tab.page.wait_for_function(
+        f"document.getElementById('inspector-app').dataset.pixel > {(NY // 2 + 1) * NX}"
+    )
+    # a rectangle of 3 x 4 pixels
+    y, x = divmod(int(tab.page.get_attribute("#inspector-app", "data-pixel")), NX)
+    press("s")
+    for key in ("ArrowDown", "ArrowDown", "ArrowRight", "ArrowRight", "ArrowRight"):
+        press(key)
+    press("s")
+    assert selected(tab) == 12
+    assert f"y {y} to {y + 2}, x {x} to {x + 3}" in tab.text("#inspector-selection")
+    press("Escape")
+    assert tab.text("#inspector-selection").startswith("Nothing selected")
+    press("+")
+    press("0")
+
+
+def test_controls_by_keyboard(tab: Tab) -> None:
+    tab.page.fill("#inspector-y", "12")
+    tab.page.fill("#inspector-x", "34")
+    tab.page.focus("#inspector-x")
+    tab.page.keyboard.press("Enter")
+    tab.wait(12 * NX + 34)
+    tab.page.fill("#inspector-y", "70")
+    tab.page.keyboard.press("Enter")
+    assert "There is no such pixel: y is 0 to 69, x is 0 to 89." in tab.text("#inspector-spoken")
+
+
+def test_typed_ends_select_the_right_pixels(tab: Tab, store: RunStore) -> None:
+    shown = as_shown(store, "maps/read_noise_e")
+    tab.page.fill("#inspector-from", "0.28")
+    tab.page.fill("#inspector-to", "0.31")
+    tab.page.keyboard.press("Enter")
+    inside = (shown >= 0.28) & (shown <= 0.31)
+    assert 500 < inside.sum() < 5000
+    assert selected(tab) == inside.sum()
+    tab.show("maps/bias")
+    bias = as_shown(store, "maps/bias")
+    step = packed_map(store, VARIABLES["maps/bias"]).scale.step
+    found = re.search(r"Median bias ([\d.]+) DN, of all ([\d.]+)", tab.text("#inspector-selection"))
+    assert found is not None
+    for text, values in ((found[1], bias[inside]), (found[2], bias[np.isfinite(bias)])):
+        assert float(text) == pytest.approx(np.median(values), abs=step + 0.5)
+    assert selected(tab) == inside.sum()
+
+
+def test_a_brush_over_the_histogram_selects_the_right_pixels(tab: Tab, store: RunStore) -> None:
+    plot = tab.page.locator("#inspector-histogram")
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    y = box["y"] + box["height"] / 2
+    tab.page.mouse.move(box["x"] + 0.2 * box["width"], y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(box["x"] + 0.35 * box["width"], y, steps=4)
+    tab.page.mouse.up()
+    low, high = (float(tab.page.input_value(f"#inspector-{end}")) for end in ("from", "to"))
+    shown = as_shown(store, "maps/read_noise_e")
+    slack = 1e-4 * high
+    least = ((shown >= low + slack) & (shown <= high - slack)).sum()
+    most = ((shown >= low - slack) & (shown <= high + slack)).sum()
+    assert 100 < least <= selected(tab) <= most < NX * NY
+    assert most - least < 100
+    assert tab.page.locator("#inspector-histogram .chosen").count() == 1
+    tab.page.click("#inspector-clear")
+    assert tab.text("#inspector-selection").startswith("Nothing selected")
+
+
+def test_a_rectangle_on_the_map_selects_the_right_pixels(tab: Tab, store: RunStore) -> None:
+    (x0, y0), (x1, y1) = tab.position(10, 20), tab.position(29, 59)
+    tab.page.keyboard.down("Shift")
+    tab.page.mouse.move(x0, y0)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x1, y1, steps=5)
+    tab.page.mouse.up()
+    tab.page.keyboard.up("Shift")
+    assert selected(tab) == 20 * 40
+    part = as_shown(store, "maps/read_noise_e")[10:30, 20:60]
+    median = float(np.nanmedian(part))
+    assert f"Median read noise {short(median)[:4]}" in tab.text("#inspector-selection")
+
+
+def test_colours_by_rank_are_those_of_the_paper(tab: Tab, store: RunStore) -> None:
+    """Labels of the colour bar: the values whose Beta(2,2) level is 0, 1/4, 1/2, 3/4 and 1."""
+    tab.page.select_option("#inspector-colours", "beta")
+    labels = [float(text) for text in tab.page.locator("#inspector-scale .ticks span").all_inner_texts()]
+    values = store.read("maps/read_noise_e")
+    level = display_transform(values)
+    for label, wanted in zip(labels, (0.0, 0.25, 0.5, 0.75, 1.0), strict=True):
+        nearest = values.ravel()[np.nanargmin(np.abs(level.ravel() - wanted))]
+        assert label == pytest.approx(nearest, rel=0.01)
+
+
+def test_the_status_map_has_its_words_and_selects_by_them(tab: Tab, store: RunStore) -> None:
+    tab.show("fit/fit_status")
+    status = store.read("fit/fit_status")
+    legend = tab.page.locator("#inspector-scale button")
+    bit, words = next((bit, words) for bit, words in MEANINGS.items() if ((status & int(bit)) != 0).sum() > 5)
+    n = int(((status & int(bit)) != 0).sum())
+    button = legend.filter(has_text=words)
+    assert button.inner_text().strip() == f"{words}: {n:,} pixels"
+    button.click()
+    assert selected(tab) == n
+
+
+def test_the_address_leads_to_the_pixel(open_tab: Any, store: RunStore) -> None:
+    first = open_tab(file_url(store))
+    first.show("maps/bias")
+    first.click(33, 44)
+    address = first.page.url
+    assert address.endswith("#pixel=33,44&map=maps/bias")
+    second = open_tab(address)
+    second.wait(33 * NX + 44)
+    assert second.page.get_attribute("#inspector-app", "data-map") == "maps/bias"
+    assert second.text("#inspector-title") == "Pixel y = 33, x = 44"
+
+
+@pytest.mark.parametrize(
+    "hash_", ["#pixel=70,0", "#pixel=-1,4&map=<script>", "#pixel=1e3,2&colours=x", "#map=__proto__"]
+)
+def test_addresses_of_nothing_do_no_harm(open_tab: Any, store: RunStore, hash_: str) -> None:
+    tab = open_tab(file_url(store) + hash_)
+    assert tab.page.get_attribute("#inspector-app", "data-pixel") is None
+    assert tab.page.get_attribute("#inspector-app", "data-map") == "maps/read_noise_e"
+
+
+@pytest.mark.parametrize("width", [360, 800, 1280])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_every_width_in_light_and_dark(
+    open_tab: Any, store: RunStore, width: int, scheme: str
+) -> None:
+    tab = open_tab(f"{file_url(store)}#pixel=20,30", width, scheme)
+    tab.wait(20 * NX + 30)
+    assert tab.page.evaluate("document.documentElement.scrollWidth - window.innerWidth") <= 0
+    colour = tab.page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert colour == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(20, 24, 28)")
+    canvas = tab.page.locator("#inspector-canvas").bounding_box()
+    assert canvas["width"] > 0.35 * width
+
+
+def test_everything_has_a_name_for_screen_readers(tab: Tab) -> None:
+    tab.click(*divmod(min(i for i in in_full(tab) if i > 2000), NX))
+    nameless = tab.page.evaluate(
+        "() => [...document.querySelectorAll('#inspector :is(button, input, select, canvas, svg, a)')]"
+        ".filter((e) => !(e.labels?.length || e.getAttribute('aria-label') || e.textContent.trim()))"
+        ".map((e) => e.outerHTML)"
+    )
+    assert nameless == []
+    assert re.search(
+        r"Histogram of .*DN; fitted density; first edges .* DN",
+        tab.page.get_attribute("#inspector-plot", "aria-label"),
+    )
+    assert re.search(
+        r"median 0\.\d+ e⁻, 5 to 95 % from", tab.page.get_attribute("#inspector-histogram", "aria-label")
+    )
+    assert tab.page.get_attribute("#inspector-selection", "aria-live") == "polite"
+
+
+def test_hostile_words_are_shown_not_run(open_tab: Any, tmp_path: Path) -> None:
+    words = {int(bit): HOSTILE for bit in MEANINGS}
+    store = make_run(
+        tmp_path, (12, 16), failed=0.3, n_frames=60, title=HOSTILE, status_words=words,
+        inputs=[{"name": HOSTILE, "size": 1, "hash": HOSTILE}], run={"store": HOSTILE, "model": HOSTILE},
+    )  # fmt: skip
+    tab = open_tab(file_url(store))
+    tab.show("fit/fit_status")
+    tab.page.focus("#inspector-canvas")
+    tab.page.keyboard.press("ArrowRight")
+    tab.page.wait_for_selector("#inspector-app[data-pixel]")
+    assert tab.page.evaluate("window.hit") is None
+    assert HOSTILE in tab.page.inner_text("h1")
+    assert HOSTILE in tab.page.inner_text("#inputs")
+    assert tab.page.locator("img[src=x]").count() == 0
+
+
+def test_a_third_failed(open_tab: Any, tmp_path: Path) -> None:
+    store = make_run(tmp_path, (12, 16), failed=0.34, n_frames=60)
+    tab = open_tab(file_url(store))
+    lost = np.flatnonzero(~np.isfinite(store.read("maps/bias")))
+    assert f"{lost.size} pixels without a value" in tab.text("#inspector-scale")
+    tab.page.select_option("#inspector-notable", str(lost[0]))
+    tab.wait(int(lost[0]))
+    assert tab.text("#inspector-status").startswith("✕ ")
+    assert tab.value("maps/read_noise_e") == "no value"
+    assert "fitted density" not in tab.text("#inspector-caption")
+
+
+def test_the_server_shows_every_pixel_and_every_map(open_tab: Any, store: RunStore) -> None:
+    store.write_array("fit/log_likelihood", np.arange(NX * NY, dtype=float).reshape(NY, NX))
+    page = store.path / "report.html"
+    text = page.read_text()
+    assert '"path":"fit/log_likelihood"' not in text
+    entry = json.dumps(
+        {"path": "fit/log_likelihood", "group": "Fit", "label": "log likelihood", "unit": "nat"}
+        | {"sentence": "", "kind": "value", "words": {}, "here": False}
+    )
+    page.write_text(text.replace('],"panel":[', f',{entry}],"panel":[', 1))
+    server, address = make_server(store.path)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        tab = open_tab(address)
+        known = np.isfinite(store.read("maps/bias").ravel())
+        i = next(i for i in range(3000, NX * NY) if i not in in_full(tab) and known[i])
+        tab.click(*divmod(i, NX))
+        for name in PANEL:
+            assert tab.value(f"maps/{name}") == shown_value(store, name, i), name
+        counts = store.read("histogram/counts")[divmod(i, NX)]
+        assert f"Gray: {counts.sum():,} frames." in tab.text("#inspector-caption")
+        tab.show("fit/log_likelihood")
+        words = re.search(r"median (\d+) nat", tab.text("#inspector-histogram-words"))
+        assert words is not None
+        assert int(words[1]) == pytest.approx(NX * NY / 2, rel=0.013)
+        assert any("/api/map?path=fit%2Flog_likelihood" in each for each in tab.asked)
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+        page.write_text(text)
+        store.delete("fit/log_likelihood")
