@@ -220,12 +220,19 @@ def discrepancy(
 
 
 @app.command()
-def status(target: Target) -> None:
+def status(
+    target: Target,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="go on until the command that works on the run ends")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object per line, for machines")] = False,
+) -> None:
     """Print how far each stage is, and why one is stale."""
-    from pchem_pipeline.stages.session import find_run, run_status
+    from pchem_pipeline.stages.session import find_run
+    from pchem_pipeline.stages.watch import watch as follow
 
-    for state in run_status(find_run(target)):
-        typer.echo(f"{state.stage:<11} {state.words()}")
+    terminal = sys.stdout.isatty()
+    follow(find_run(target), typer.echo, follow=watch, as_json=as_json, terminal=terminal)
 
 
 @app.command()

@@ -161,6 +161,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(store.locked())
+        beacon.show({"stage": ""})
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(target.config))
         write_json(store.path / ".pchem" / "location.json", _location(target))

@@ -39,10 +39,11 @@ class Beacon:
             self._shown = True
 
     def remove(self) -> None:
-        """Remove the file, if this process wrote it."""
+        """Remove the file, if this process wrote it and no other has begun since."""
         if self._shown:
-            with contextlib.suppress(OSError):
-                self._path.unlink()
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                if json.loads(self._path.read_text(encoding="utf-8"))["pid"] == os.getpid():
+                    self._path.unlink()
 
 
 def read_beacon(store: Path) -> dict[str, Any] | None:

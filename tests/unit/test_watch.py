@@ -1,0 +1,88 @@
+"""Watching a run: rows that tell rate and remaining time, JSON lines, and an end when the work ends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pchem_pipeline import cli
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.stages import session
+from pchem_pipeline.stages import watch as watch_module
+from pchem_pipeline.stages.pipeline import StageState
+from pchem_pipeline.stages.session import Target
+from pchem_pipeline.stages.watch import pace_words, rows, watch
+
+TARGET = Target(parse_config("input: {files: [a.tif]}\n"), Path("/x"), Path("/x/run.zarr"))
+PACE = {"stage": "fit", "unit": "tile", "done": 8, "total": 64, "rate": 2.0, "remaining": 28.0}
+DONE, PART = StageState("ingest", "complete"), StageState("fit", "partial", "", 8, 64)
+
+
+def test_rows_tell_rate_and_remaining_time() -> None:
+    assert rows([DONE, PART], None) == ["ingest      complete", "fit         partial 8 of 64"]
+    assert rows([DONE, PART], PACE)[1] == "fit         running 8 of 64 tiles, 2/s, 28 s left"
+    both = {**PACE, "stage": "ingest and histogram", "unit": "MiB"}
+    assert rows([PART], both)[1].strip() == "running (ingest and histogram) 8 of 64 MiB, 2/s, 28 s left"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rate": 0.05, "remaining": 1120.0}, "running 8 of 64 tiles, 20 s each, 18 min 40 s left"),
+        ({"rate": 0.005, "remaining": 11200.0}, "running 8 of 64 tiles, 200 s each, 3 h 06 min left"),
+        ({"rate": None, "remaining": None}, "running 8 of 64 tiles"),
+        ({"stage": "ingest: hash"}, "running (hash) 8 of 64 tiles, 2/s, 28 s left"),
+    ],
+)
+def test_paces_in_words(change: dict[str, object], words: str) -> None:
+    assert pace_words({**PACE, **change}) == words
+    assert pace_words({"stage": ""}) == "running"
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Three looks: at work, further, done."""
+    paces = iter([PACE, {**PACE, "done": 16, "remaining": 24.0}, None])
+    states = iter([[DONE, PART], [DONE, PART], [DONE, StageState("fit", "complete")]])
+    monkeypatch.setattr(watch_module, "read_beacon", lambda store: next(paces))
+    monkeypatch.setattr(watch_module, "run_status", lambda target: next(states))
+    return []
+
+
+def test_watching_ends_with_the_work_and_tells_what_changed(looks: list[float]) -> None:
+    written: list[str] = []
+    watch(TARGET, written.append, follow=True, sleep=looks.append)
+    assert len(looks) == 2
+    assert written == [
+        "ingest      complete\nfit         running 8 of 64 tiles, 2/s, 28 s left",
+        "fit         running 16 of 64 tiles, 2/s, 24 s left",
+        "fit         complete",
+    ]
+
+
+def test_a_terminal_is_drawn_over(looks: list[float]) -> None:
+    written: list[str] = []
+    watch(TARGET, written.append, follow=True, terminal=True, sleep=looks.append)
+    assert written[1].startswith("\x1b[2A\x1b[Jingest      complete\nfit ")
+
+
+def test_json_lines_and_ctrl_c(looks: list[float]) -> None:
+    def stop(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    written: list[str] = []
+    watch(TARGET, written.append, follow=True, as_json=True, sleep=stop)
+    [content] = map(json.loads, written)
+    assert content["progress"]["remaining"] == 28.0
+    assert content["stages"][1] == {"stage": "fit", "state": "partial", "why": "", "done": 8, "total": 64}
+
+
+def test_the_command_looks_once_unless_asked(looks: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "find_run", lambda path: TARGET)
+    result = CliRunner().invoke(cli.app, ["status", "run.yaml"], catch_exceptions=False)
+    assert result.stdout.splitlines() == rows([DONE, PART], PACE)
+    result = CliRunner().invoke(cli.app, ["status", "run.yaml", "--json"], catch_exceptions=False)
+    assert json.loads(result.stdout)["progress"]["done"] == 16
