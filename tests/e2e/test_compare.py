@@ -50,7 +50,7 @@ def test_nothing_changed_is_proven_by_digests(shell, copies):
     rows = {row["name"]: row for row in pair["arrays"]}
     assert {row["state"] for row in rows.values()} == {"identical"}
     assert len(rows) > 60
-    for name in ("histogram/counts", "fit/covariance", "summary/row_sum", "ensemble/epcd_exact"):
+    for name in ("histogram/counts", "fit/correlation", "summary/row_sum", "ensemble/epcd_exact"):
         values = np.ascontiguousarray(copies.read(name))
         digest = hashlib.sha256(values.tobytes()).hexdigest()
         assert rows[name]["sha256"] == [digest, digest]
