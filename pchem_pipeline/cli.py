@@ -41,6 +41,9 @@ Backend = Annotated[
     Literal["serial", "threads", "processes", "distributed"] | None,
     typer.Option(help="who does the work [default: compute.backend]"),
 ]
+MaxMemory = Annotated[
+    int | None, typer.Option(min=64, help="memory that it may take, MiB [default: compute.max_memory]")
+]
 LogJson = Annotated[Path | None, typer.Option(help="append JSON lines about the run to this file")]
 Progress = Annotated[
     Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
@@ -69,14 +72,16 @@ def _command(
     log_json: Path | None,
     progress: Literal["auto", "on", "off"],
     quiet: bool,
+    max_memory: int | None = None,
 ) -> Command:
     from pchem_pipeline.stages.base import Options
     from pchem_pipeline.stages.session import Command
 
     options = Options(force=force, dry_run=dry_run, tiles=tiles, roi=_roi(roi))
     return Command(
-        options, workers=workers, backend=backend, progress=progress, quiet=quiet, log_json=log_json
-    )
+        options, workers=workers, backend=backend, max_memory=max_memory, progress=progress, quiet=quiet,
+        log_json=log_json,
+    )  # fmt: skip
 
 
 def _stage_command(name: str, summary: str) -> None:
@@ -90,6 +95,7 @@ def _stage_command(name: str, summary: str) -> None:
         roi: Roi = None,
         workers: Workers = None,
         backend: Backend = None,
+        max_memory: MaxMemory = None,
         log_json: LogJson = None,
         progress: Progress = "auto",
         quiet: Quiet = False,
@@ -98,7 +104,7 @@ def _stage_command(name: str, summary: str) -> None:
 
         command = _command(
             force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
-            log_json=log_json, progress=progress, quiet=quiet,
+            log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
         )  # fmt: skip
         run = find_run(target)
         if name == "ingest":
@@ -158,6 +164,7 @@ def run(
     roi: Roi = None,
     workers: Workers = None,
     backend: Backend = None,
+    max_memory: MaxMemory = None,
     log_json: LogJson = None,
     progress: Progress = "auto",
     quiet: Quiet = False,
@@ -171,7 +178,7 @@ def run(
 
     command = _command(
         force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet,
+        log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
     )  # fmt: skip
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}
@@ -381,7 +388,7 @@ def main(arguments: list[str] | None = None) -> None:
     except PchEmError as error:
         _fail(str(error), error.exit_code)
     except MemoryError:
-        _fail("out of memory; use fewer --workers or a smaller histogram.band_memory", ExitCode.INTERNAL)
+        _fail("out of memory; use fewer --workers or --max-memory", ExitCode.INTERNAL)
     except KeyboardInterrupt:
         _fail(
             "stopped by SIGINT; finished tiles are kept, run the same command again to go on", ExitCode.SIGINT

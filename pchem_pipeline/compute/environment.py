@@ -90,5 +90,20 @@ def available_memory() -> int | None:
 
 def peak_rss_bytes() -> int:
     """Return the largest resident set of this process or of one of its finished children."""
-    sizes = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return max(sizes) * (1 if sys.platform == "darwin" else 1024)
+    own = _peak_of_this_program()
+    if own is None:
+        own = _unit() * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return max(own, _unit() * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+
+
+def _unit() -> int:
+    return 1 if sys.platform == "darwin" else 1024
+
+
+def _peak_of_this_program() -> int | None:
+    """Return the largest resident set since the program began; other counts keep that of who started it."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM:"))
+    except (OSError, StopIteration, ValueError):
+        return None

@@ -40,6 +40,7 @@ from pchem_pipeline.stages.base import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.counting import BandCounter, Emit, TileCounter
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.frame_source import FrameSource, open_source, read_ahead
+from pchem_pipeline.stages.plan import band_bytes
 
 if TYPE_CHECKING:
     from pchem_pipeline.compute.executor import Outcome
@@ -107,15 +108,15 @@ def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
     settings, tiles = context.config.histogram, context.tiles()
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
-    most = (settings.band_memory << 20) // row
+    most = band_bytes(context.config, context.executor.workers) // row
     pending = {tile.key for tile in context.pending(tiles)}
     bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
     highest = max(band.y1 - band.y0 for band in bands)
     if highest > most:
         context.note(
             f"{highest} rows of {columns} pixels, the least that a worker can take, need "
-            f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory; "
-            "lower histogram.window_frames, or --workers"
+            f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory or compute.max_memory "
+            "allow; lower histogram.window_frames, or --workers"
         )
     return bands
 
@@ -181,7 +182,7 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
     tiles = context.tiles()
-    most = (settings.band_memory << 20) // row
+    most = band_bytes(context.config, context.executor.workers) // row
     everything = {tile.key for tile in tiles}
     bands = plan_bands(tiles, everything, most, context.executor.workers, source.rows_per_read)
     context.stop.check()

@@ -56,7 +56,7 @@ def sweep_input(context: StageContext) -> None:
     frames = open_frames(context.config.input, context.base_dir)
     if not _blocks_are_chunks(context, frames):
         return
-    if sweep_bytes(context, frames.shape, frames.dtype, bins=0) > allowed_bytes(context):
+    if sweep_bytes(context.config, frames.shape, frames.dtype, 0) > _allowed(context):
         return
     paths = input_paths(context.config.input, context.base_dir)
     quick = quick_identity(paths)
@@ -97,6 +97,10 @@ def _blocks_are_chunks(context: StageContext, frames: FrameSequence) -> bool:
     return context.config.input.mode == "reference" or block == frames.shape[0] or block % chunk == 0
 
 
+def _allowed(context: StageContext) -> int:
+    return allowed_bytes(context.config, context.executor.workers)
+
+
 def _whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
     """Turn bytes into whole MiB of progress."""
     done = shown = 0
@@ -115,7 +119,7 @@ def _sweep(context: StageContext, frames: FrameSequence, once: ReadOnce) -> bool
     """Read everything once; tell whether memory was enough."""
     settings = context.config.histogram
     shape, copies = frames.shape, context.config.input.mode == "copy"
-    bands = cut_rows(shape[1], sweep_rows(context, shape, frames.dtype), context.executor.workers)
+    bands = cut_rows(shape[1], sweep_rows(context.config, shape, frames.dtype), context.executor.workers)
     sweep = Sweep(once.read, shape, frames.dtype, bands, settings.window_frames)
     counters: list[BandCounter] = []
     workers = ThreadPoolExecutor(context.executor.workers, thread_name_prefix="count")
@@ -124,7 +128,7 @@ def _sweep(context: StageContext, frames: FrameSequence, once: ReadOnce) -> bool
             context.stop.check()
             if t0 == 0:
                 bins = _choose_bins(context, pool, parts)
-                if sweep_bytes(context, shape, frames.dtype, bins) > allowed_bytes(context):
+                if sweep_bytes(context.config, shape, frames.dtype, bins) > _allowed(context):
                     return False
                 _create(context, frames, bins)
                 counters = [BandCounter(context.store.path, rows, shape, bins, settings) for rows in bands]

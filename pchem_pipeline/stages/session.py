@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -62,6 +62,7 @@ class Command:
         progress: auto | on | off.
         quiet: say warnings only.
         log_json: file for JSON lines.
+        max_memory: overrides ``compute.max_memory``, MiB.
     """
 
     options: Options = field(default_factory=Options)
@@ -70,6 +71,7 @@ class Command:
     progress: ProgressMode = "auto"
     quiet: bool = False
     log_json: Path | None = None
+    max_memory: int | None = None
 
 
 def find_run(path: Path) -> Target:
@@ -102,7 +104,7 @@ def find_run(path: Path) -> Target:
 
 def with_overrides(target: Target, command: Command) -> Target:
     """Return the target with the command line's compute settings."""
-    given = {"workers": command.workers, "backend": command.backend}
+    given = {"workers": command.workers, "backend": command.backend, "max_memory": command.max_memory}
     changes = {key: value for key, value in given.items() if value is not None}
     return target.changed("compute", **changes) if changes else target
 
@@ -213,9 +215,28 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
     reporter = Reporter("off", quiet=command.quiet)
     for name in stages:
         state = states.get(name, StageState(name, "missing"))
-        runs = state.state != "complete" or command.options.force
+        runs = _is_to_do(states, name, command)
         reporter.info(f"{name}: {state.words()}" + (" -> would run" if runs else " -> nothing to do"))
+    for line in _plan(target, [name for name in stages if _is_to_do(states, name, command)], command):
+        reporter.info(line)
     return [states.get(name, StageState(name, "missing")) for name in stages]
+
+
+def _is_to_do(states: Mapping[str, StageState], name: str, command: Command) -> bool:
+    return name not in states or states[name].state != "complete" or command.options.force
+
+
+def _plan(target: Target, todo: Sequence[str], command: Command) -> list[str]:
+    """Say what it takes to go through the camera files, where that is to be done and they are there."""
+    from pchem_pipeline.frames.histograms import is_histogram_input
+
+    target = with_overrides(target, command)
+    config = target.config
+    if "histogram" not in todo or "simulate" in todo or is_histogram_input(config.input, target.base_dir):
+        return []
+    from pchem_pipeline.stages.plan import make_plan
+
+    return make_plan(config, target.base_dir).words()
 
 
 def _reading_context(target: Target, reporter: Reporter, options: Options) -> StageContext:

@@ -33,13 +33,24 @@ def invoke(*arguments):
 @pytest.mark.parametrize("name", ["simulate", "histogram", "fit", "maps", "ensemble", "report", "electrons"])
 def test_a_stage_command_runs_its_stage(calls, name):
     options = ["--force", "--tiles", "0.0", "--roi", "0:8,8:16", "--workers", "3", "--backend", "serial"]
-    result = invoke(name, "run.zarr", *options, "--progress", "off", "--quiet", "--log-json", "l.json")
+    result = invoke(
+        name,
+        "run.zarr",
+        *options,
+        "--progress",
+        "off",
+        "--quiet",
+        "--log-json",
+        "l.json",
+        "--max-memory",
+        "900",
+    )
     assert result.exit_code == 0
     [(target, stages, command)] = calls
     assert stages == [name]
     assert target.config == parse_config(CONFIG)
     expected = Options(force=True, dry_run=False, tiles="0.0", roi=(0, 8, 8, 16))
-    assert command == Command(expected, 3, "serial", "off", True, Path("l.json"))
+    assert command == Command(expected, 3, "serial", "off", True, Path("l.json"), 900)
 
 
 def test_ingest_crops_the_input_to_the_region(calls):

@@ -176,8 +176,8 @@ def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
     onepass.sweep_input(context)
     assert context.swept is None
     # what the first block shows can be too much, too
-    room = plan.sweep_bytes(context, frames.shape, frames.dtype, bins=0) + 1000
-    monkeypatch.setattr(onepass, "allowed_bytes", lambda context: room)
+    room = plan.sweep_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
+    monkeypatch.setattr(onepass, "allowed_bytes", lambda config, workers: room)
     onepass.sweep_input(context)
     assert context.swept is None
     run_both(context)

@@ -1,0 +1,106 @@
+"""The plan of a run: said before it starts, and kept."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.stages.bands import bytes_per_row
+from pchem_pipeline.stages.plan import BASE_BYTES, allowed_bytes, band_bytes, make_plan, sweep_bytes
+
+#: counts a run in a process of its own, and prints the memory that it took
+PROGRAM = """
+import json, sys
+from pchem_pipeline.compute.environment import peak_rss_bytes, prepare_environment
+prepare_environment()
+from pathlib import Path
+from pchem_pipeline.stages.session import Command, find_run, run_stages
+target = find_run(Path(sys.argv[1]))
+states = run_stages(target, ["ingest", "histogram"], Command(quiet=True))
+print(json.dumps([peak_rss_bytes(), *[state.state for state in states]]))
+"""
+
+
+@pytest.fixture
+def camera(tmp_path):
+    """Write a raw file of some frames of 256 x 256 pixels, repeated; return its YAML."""
+
+    def write(n_frames: int, **sections: object) -> Path:
+        rng = np.random.default_rng(5)
+        shape = (256, 256, 256)
+        block = np.rint(100 + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype("<u2")
+        file = tmp_path / f"{n_frames}.raw"
+        with file.open("wb") as stream:
+            for _ in range(n_frames // len(block)):
+                stream.write(block.data)
+        facts = {"shape": [256, 256], "dtype": "uint16", "byte_order": "little"}
+        (tmp_path / f"{n_frames}.raw.json").write_text(json.dumps(facts))
+        content = {"run": {"store": f"{n_frames}.zarr"}, "input": {"files": [file.name], "mode": "reference"}}
+        path = tmp_path / f"{n_frames}.yaml"
+        path.write_text(json.dumps({**content, **sections}))
+        return path
+
+    return write
+
+
+def _run(path: Path) -> list:
+    outcome = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, timeout=300
+    )
+    assert outcome.returncode == 0, outcome.stderr
+    return json.loads(outcome.stdout)
+
+
+@pytest.mark.parametrize("limit", [None, 320])
+def test_memory_is_what_was_said_whatever_the_number_of_frames(camera, limit):
+    compute = {"workers": 2, **({} if limit is None else {"max_memory": limit})}
+    peaks = []
+    for n_frames in (256, 1024):
+        path = camera(n_frames, compute=compute)
+        config = RunConfig.model_validate(json.loads(path.read_text()))
+        plan = make_plan(config, path.parent)
+        assert plan.one_pass == (limit is None)
+        said = sweep_bytes(config, plan.shape, np.dtype(np.uint16), plan.bins)
+        peak, *states = _run(path)
+        assert states == ["complete", "complete"]
+        assert 0.5 * said < peak < 1.2 * (said if limit is None else limit << 20)
+        assert peak < 1.2 * plan.held_bytes
+        peaks.append(peak)
+    # the longer file is 100 MB longer than the shorter one
+    assert abs(peaks[1] - peaks[0]) < 60e6
+
+
+def test_the_plan_in_words(camera):
+    path = camera(512, compute={"workers": 3, "max_memory": 2000})
+    config = RunConfig.model_validate(json.loads(path.read_text()))
+    plan = make_plan(config, path.parent)
+    assert (plan.shape, plan.tiles, plan.workers, plan.one_pass) == ((512, 256, 256), 16, 3, True)
+    size = 512 * 256 * 256 * 2
+    assert plan.input_bytes == pytest.approx(size, rel=1e-3)
+    assert plan.read_bytes == pytest.approx(size * (1 + 250 / 512), rel=1e-3)
+    assert 1 < plan.seconds < 600
+    text = "\n".join(plan.words())
+    assert "reads 0.0671 GB of camera files once" in text
+    assert "16 tiles of 64 x 64" in text
+    assert "2000 MiB are allowed" in text
+    less = config.model_copy(update={"compute": config.compute.model_copy(update={"max_memory": 64})})
+    assert "twice, by bands of rows" in "\n".join(make_plan(less, path.parent).words())
+
+
+def test_the_limit_is_shared_by_the_workers():
+    config = RunConfig.model_validate({"input": {"files": ["a"]}, "compute": {"max_memory": 1000}})
+    assert allowed_bytes(config, 4) == 1000 << 20
+    assert BASE_BYTES + 4 * band_bytes(config, 4) <= 1000 << 20
+    free = RunConfig.model_validate({"input": {"files": ["a"]}})
+    assert band_bytes(free, 4) == 640 << 20
+    assert allowed_bytes(free, 4) >= BASE_BYTES + 4 * (640 << 20)
+    # what a row needs does not depend on the number of frames, so neither do the plans
+    assert bytes_per_row(512, 5000, 2, 64, free.histogram) == bytes_per_row(
+        512, 60_000, 2, 64, free.histogram
+    )
