@@ -227,6 +227,40 @@ def discrepancy(
 
 
 @app.command()
+def joint(
+    targets: Annotated[
+        list[Path], typer.Argument(help="a joint.yaml, or the runs (YAML or store) in order of exposure")
+    ],
+    bias: Annotated[
+        list[Path] | None, typer.Option(help="runs: one whose frames hold no electrons (repeatable)")
+    ] = None,
+    store: Annotated[Path | None, typer.Option(help="runs: store of the fit [default: joint.zarr]")] = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    tiles: Tiles = None,
+    workers: Workers = None,
+    backend: Backend = None,
+    log_json: LogJson = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Fit several exposures of a sensor together.
+
+    One gain, bias and read noise for each pixel; dark current as the slope of H. Runs get their histograms.
+    """
+    from pchem_pipeline.stages.joint_session import find_joint, run_joint
+
+    command = _command(
+        force=force, dry_run=dry_run, tiles=tiles, roi=None, workers=workers, backend=backend,
+        log_json=log_json, progress=progress, quiet=quiet,
+    )  # fmt: skip
+    fit = find_joint(targets, bias or [], store, write=not dry_run)
+    run_joint(fit, command)
+    if not dry_run:
+        typer.echo(fit.store / "report.html")
+
+
+@app.command()
 def status(
     target: Target,
     watch: Annotated[

@@ -78,6 +78,8 @@ _PARAMETER_WORDS = {
     "read_noise_e": ("e-", "read noise, quantisation included", "sigma_e-"),
     "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R"),
     "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time", "i_d"),
+    "spurious_charge": ("e-", "spurious charge: exposure that does not grow with time or light", "H_0"),
+    "charge_per_level": ("e-/level", "slope of the quanta exposure against the light level", ""),
 }
 
 
@@ -103,6 +105,32 @@ def _ends(group: str, names: tuple[str, ...]) -> list[Variable]:
             words = f"{end} end of the profile-likelihood interval of the {sentence}"
             found.append(Variable(f"{group}/{path}", _MAP, "float64", unit, words))
     return found
+
+
+def _joint() -> list[Variable]:
+    """Return what a joint fit of several exposures keeps beside its maps; axis `sample`: the exposures."""
+    unit, sentence, symbol = _PARAMETER_WORDS["quanta_exposure"]
+    cube = ("sample", *_MAP)
+    both = ("joint_parameter", "joint_parameter_2")
+    found: list[tuple[str, tuple[str, ...], str, str, str, str]] = [
+        ("quanta_exposure", cube, "float64", unit, sentence, symbol),
+        ("quanta_exposure_stderr", cube, "float64", unit, f"standard error of the {sentence}", ""),
+        ("mean", cube, "float64", "DN", "mean of the sample", ""),
+        ("variance", cube, "float64", "DN2", "variance of the sample", ""),
+        ("linearity_residual", cube, "float64", "e-", "quanta exposure minus the line through all", ""),
+        ("linearity_residual_stderr", cube, "float64", "e-", "standard error of that residual", ""),
+        ("linearity_chi2", _MAP, "float64", "1", "chi-square of the exposures against the line", ""),
+        ("linearity_p", _MAP, "float64", "1", "probability of a larger one if the pixel is linear", ""),
+        ("covariance", (*_MAP, *both), "float64", "1", "covariance of (H_1 ... H_J, g, mu, sigma)", ""),
+        ("log_likelihood", _MAP, "float64", "nat", "joint log-likelihood at the estimate", ""),
+        ("likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up", ""),
+        ("fit_status", _MAP, "uint16", "1", "reasons for caution or failure, as bits; 0 is fine", ""),
+        ("n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel", ""),
+        ("goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of all samples, bins merged", ""),
+        ("goodness_dof", _MAP, "int32", "1", "degrees of freedom of goodness_chi2", ""),
+        ("goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds", ""),
+    ]
+    return [Variable(f"joint/{name}", *rest) for name, *rest in found]  # type: ignore[arg-type]
 
 
 def _discrepancy() -> list[Variable]:
@@ -218,6 +246,8 @@ _ALL: list[Variable] = [
     Variable(
         "maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is called misfit"
     ),
+    *_both("maps", ("spurious_charge", "charge_per_level")),  # of a joint fit
+    *_joint(),
     Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
     # raw ensemble (paper, Sec. II-C): axis `dn`
     Variable("ensemble/dn", ("dn",), "int32", "DN", "digital number"),

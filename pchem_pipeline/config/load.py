@@ -14,7 +14,15 @@ from pydantic_core import to_jsonable_python
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError, quoted
 
-__all__ = ["dump_config", "load_config", "make_config", "parse_config", "setting_of"]
+__all__ = [
+    "complaints",
+    "dump_config",
+    "load_config",
+    "make_config",
+    "parse_config",
+    "setting_of",
+    "yaml_content",
+]
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -53,13 +61,22 @@ def parse_config(text: str, name: str = "config") -> RunConfig:
     Raises:
         ConfigError: the text is not YAML or a setting is wrong.
     """
+    return make_config(yaml_content(text, name), name)
+
+
+def yaml_content(text: str, name: str) -> dict[str, Any]:
+    """Return the mapping in a YAML text.
+
+    Raises:
+        ConfigError: the text is not YAML, a key is given twice, or it holds no mapping.
+    """
     try:
         content = yaml.load(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
         raise ConfigError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{name}: holds no settings; write a commented default with: pchem init")
-    return make_config(content, name)
+    return content
 
 
 def make_config(content: Mapping[str, Any], name: str) -> RunConfig:
@@ -71,7 +88,7 @@ def make_config(content: Mapping[str, Any], name: str) -> RunConfig:
     try:
         return RunConfig.model_validate(content)
     except ValidationError as error:
-        raise ConfigError(f"{name}: {_sentence(error)}") from error
+        raise ConfigError(f"{name}: {complaints(error)}") from error
 
 
 def dump_config(config: RunConfig) -> str:
@@ -90,24 +107,27 @@ def setting_of(config: RunConfig, dotted: str) -> Any:
     return to_jsonable_python(value, by_alias=True)
 
 
-def _sentence(error: ValidationError) -> str:
-    return "; ".join(_complaint(item) for item in error.errors())
+def complaints(error: ValidationError, model: type[BaseModel] = RunConfig) -> str:
+    """Return in one line what is wrong with the settings of a model, each with its place."""
+    return "; ".join(_complaint(item, model) for item in error.errors())
 
 
-def _complaint(item: Any) -> str:
+def _complaint(item: Any, root: type[BaseModel]) -> str:
     where = ".".join(str(part) for part in item["loc"])
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "extra_forbidden":
-        close = difflib.get_close_matches(str(item["loc"][-1]), _keys_at(item["loc"][:-1]), 1)
+        close = difflib.get_close_matches(str(item["loc"][-1]), _keys_at(item["loc"][:-1], root), 1)
         return f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else "")
     given = "" if isinstance(item["input"], dict | BaseModel) else f" (given: {item['input']!r})"
     return f"{where}: {message}{given}" if where else message
 
 
-def _keys_at(location: tuple[Any, ...]) -> list[str]:
+def _keys_at(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:
     """Return the keys that the section at ``location`` knows."""
-    model: Any = RunConfig
+    model: Any = root
     for name in location:
+        if isinstance(name, int):
+            continue
         fields = getattr(model, "model_fields", {})
         if name not in fields:
             return []

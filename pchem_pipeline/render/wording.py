@@ -21,6 +21,7 @@ _UNITS = {
     "e-2": "e⁻²",
     "e-/DN": "e⁻/DN",
     "e-/px/s": "e⁻/px/s",
+    "e-/level": "e⁻/level",
     "1/e-": "1/e⁻",
     "DN2": "DN²",
     "1": "",
@@ -35,6 +36,8 @@ _SYMBOLS = {
     "read_noise_e": (r"$\sigma_{\mathrm{e}^-}$", "read noise", "e-"),
     "analog_read_noise_e": (r"$\sigma_R$", "analog read noise", "e-"),
     "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
+    "spurious_charge": (r"$H_0$", "spurious charge", "e-"),
+    "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),
 }
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

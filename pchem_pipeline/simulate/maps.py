@@ -67,7 +67,11 @@ def draw_truth(settings: SimulateSettings, rows: tuple[int, int] | None = None) 
 
 def _streams(settings: SimulateSettings, purpose: str, ys: NDArray[np.int64]) -> KeyedStreams:
     return KeyedStreams(
-        settings.seed, f"map/{purpose}", np.zeros(1, np.int64), ys, np.arange(settings.shape[1])
+        settings.seed if settings.sensor_seed is None else settings.sensor_seed,
+        f"map/{purpose}",
+        np.zeros(1, np.int64),
+        ys,
+        np.arange(settings.shape[1]),
     )
 
 

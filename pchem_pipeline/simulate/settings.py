@@ -171,6 +171,13 @@ class SimulateSettings(Section):
     seed: int = Field(
         default=1, ge=0, lt=2**63, description="root of all random numbers; same seed, same frames"
     )
+    sensor_seed: int | None = Field(
+        default=None,
+        ge=0,
+        lt=2**63,
+        description="root of the pixels' parameters; null: seed. With it, another seed gives other frames of "
+        "the same sensor, for example at another integration time",
+    )
     integration_time: float = Field(default=4.87, gt=0, description="integration time of a frame, s")
     bit_depth: int = Field(default=14, ge=1, le=24, description="bits of the ADC; DN end at 2**bit_depth - 1")
     format: Literal["tiff", "fits", "hdf5", "npy", "raw", "zarr"] = Field(

@@ -113,6 +113,16 @@ _ALL = (
         ("discrepancy",),
         identities.search_start,
     ),
+    # of a joint fit, whose samples are other runs
+    Declaration("joint", 1, (), ("fit", "maps", "run.tile"), (), ("joint", "maps"), identities.joint_samples),
+    Declaration(
+        "joint_report",
+        1,
+        ("joint",),
+        ("report", "run.title", "run.allowed_failed_pixels"),
+        ("joint", "maps"),
+        (),
+    ),
 )
 
 #: Declaration of each stage, by name.

@@ -9,7 +9,7 @@ from pchem_pipeline.stages.input_identity import known_identity
 if TYPE_CHECKING:
     from pchem_pipeline.stages.base import StageContext
 
-__all__ = ["adc_limits", "input_content", "integration_time", "search_start", "verdict"]
+__all__ = ["adc_limits", "input_content", "integration_time", "joint_samples", "search_start", "verdict"]
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
@@ -55,3 +55,8 @@ def search_start(context: StageContext) -> dict[str, Any]:
     if kept.get("model_after") == present:
         present = kept["model_before"]
     return {"model": present, "roi": list(context.options.roi or kept.get("roi") or ())}
+
+
+def joint_samples(context: StageContext) -> dict[str, Any]:
+    """Return the samples of a joint fit, with the fingerprints of their histograms, and the ADC's limits."""
+    return {**context.store.attributes("samples"), **adc_limits(context)}

@@ -22,6 +22,7 @@ from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = [
+    "JOINT_STAGES",
     "OPTIONAL_STAGES",
     "STAGES",
     "StageState",
@@ -38,6 +39,9 @@ STAGES = ("simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"
 
 #: Stages that are run on demand only.
 OPTIONAL_STAGES = ("electrons", "discrepancy")
+
+#: Stages of a joint fit of several runs, which has a store of its own.
+JOINT_STAGES = ("joint", "joint_report")
 
 _LIBRARIES = ("numpy", "scipy", "numba", "zarr", "dask", "tifffile", "astropy", "h5py", "matplotlib")
 

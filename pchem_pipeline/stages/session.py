@@ -15,6 +15,7 @@ from pchem_pipeline.errors import ConfigError, IncompleteRunError, StoreError
 from pchem_pipeline.stages.base import Options, StageContext
 from pchem_pipeline.stages.interrupt import StopRequest, stop_on_signals
 from pchem_pipeline.stages.pipeline import (
+    JOINT_STAGES,
     OPTIONAL_STAGES,
     StageState,
     declaration_of,
@@ -134,8 +135,9 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
         if failed:
             raise IncompleteRunError("; ".join(failed) + "; the rest is kept, run again to retry")
-        if "fit" in stages:
-            _check_failed_pixels(context)
+        for name in ("fit", "joint"):
+            if name in stages:
+                _check_failed_pixels(context, f"{name}/fit_status")
     return states
 
 
@@ -193,6 +195,8 @@ def run_status(target: Target) -> list[StageState]:
     if not (target.store / "zarr.json").exists():
         return [StageState(name, "missing") for name in stages]
     context = _reading_context(target, Reporter("off", quiet=True), Options())
+    if context.store.records.read(JOINT_STAGES[0]) is not None:
+        stages = JOINT_STAGES
     stages += tuple(name for name in OPTIONAL_STAGES if context.store.records.read(name) is not None)
     states: list[StageState] = []
     stale: set[str] = set()
@@ -246,11 +250,11 @@ def _reading_context(target: Target, reporter: Reporter, options: Options) -> St
     )
 
 
-def _check_failed_pixels(context: StageContext) -> None:
+def _check_failed_pixels(context: StageContext, name: str) -> None:
     """Complain if more pixels have no value than the configuration allows."""
     from pchem_pipeline.model.fit_status import FAILED
 
-    words = context.store.read("fit/fit_status")
+    words = context.store.read(name)
     failed = int(((words & int(FAILED)) != 0).sum())
     allowed = context.config.run.allowed_failed_pixels
     if failed > allowed * words.size:
