@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.fit_status import FitStatus
     from pchem_pipeline.model.pchem import FitResult, fit_histograms
     from pchem_pipeline.model.settings import FitSettings
+    from pchem_pipeline.stages.notebook import open_run
     from pchem_pipeline.store.run_store import RunStore
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "RunStore",
     "__version__",
     "fit_histograms",
+    "open_run",
 ]
 
 __version__ = "0.1.0"
@@ -44,6 +46,7 @@ _HOMES = {
     "PchEmError": "errors",
     "RunStore": "store.run_store",
     "fit_histograms": "model.pchem",
+    "open_run": "stages.notebook",
 }
 
 

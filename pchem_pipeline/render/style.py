@@ -37,6 +37,7 @@ __all__ = [
     "PURPLE",
     "SKY",
     "VERMILION",
+    "Figure",
     "figure_bytes",
     "inches",
     "new_figure",

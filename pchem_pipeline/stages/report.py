@@ -47,6 +47,7 @@ __all__ = [
     "WRITES",
     "choose_pixels",
     "identity",
+    "read_pixels",
     "report_tile",
     "run",
 ]
@@ -193,7 +194,7 @@ def gather(
     ends = [path for name in intervals for path in interval_names(name)]
     maps = _group(store, "maps", skip=(*_NOT_SHOWN, *ends))
     fit = {name: store.read(f"fit/{name}") for name in _FIT_MAPS if store.has(f"fit/{name}")}
-    pixels = _pixels(store, _shown(config, sensor, maps, fit), sensor, maps, fit)
+    pixels = read_pixels(store, _shown(config, sensor, maps, fit), sensor, maps, fit)
     discrepancy = read_discrepancy(store)
     suspects = [place for each in discrepancy.found.where for place in each.pixels] if discrepancy else []
     if store.has("maps/goodness_q"):
@@ -215,7 +216,7 @@ def gather(
         failed_mask=int(FAILED),
         pixels=pixels,
         misfits=misfits,
-        worst=_pixels(store, worst, sensor, maps, fit),
+        worst=read_pixels(store, worst, sensor, maps, fit),
         intervals=intervals,
         ensemble=ensemble,
         ensemble_facts=facts,
@@ -272,14 +273,22 @@ def _shown(
     return chosen
 
 
-def _pixels(
+def read_pixels(
     store: RunStore,
     chosen: Sequence[Chosen],
     sensor: SensorInfo,
     maps: Mapping[str, NDArray[Any]],
     fit: Mapping[str, NDArray[Any]],
 ) -> list[PixelFit]:
-    """Read the histograms of some pixels."""
+    """Read the histograms and fits of some pixels.
+
+    Args:
+        store: the run.
+        chosen: label, y and x of each.
+        sensor: the input.
+        maps: parameters and standard errors, (y, x); anything that is indexed so.
+        fit: ``fit_status`` and ``goodness_p``, likewise.
+    """
     names = (*PARAMETERS, "read_noise_e")
     effects = fitted_effects(store)
     found = []

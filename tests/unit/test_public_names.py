@@ -18,6 +18,7 @@ def test_the_public_names_are_these():
         "RunStore",
         "__version__",
         "fit_histograms",
+        "open_run",
     }
     assert set(pchem_pipeline.__all__) == names
     for name in names:

@@ -1,0 +1,144 @@
+"""A run in a notebook: lazy datasets with units and masks, pixels, figures, and the tutorial executed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pchem_pipeline
+from pchem_pipeline.errors import ConfigError, MissingDependencyError, StoreError
+from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
+from pchem_pipeline.render.style import figure_bytes
+from pchem_pipeline.store.run_store import RunStore
+
+TUTORIAL = Path(__file__).parents[2] / "notebooks" / "tutorial.ipynb"
+
+
+@pytest.fixture(scope="module")
+def run(finished):
+    return pchem_pipeline.open_run(finished)
+
+
+@pytest.fixture(scope="module")
+def store(finished):
+    return RunStore.open(finished)
+
+
+def test_maps_are_lazy_and_know_their_units(run, store, finished):
+    maps = pchem_pipeline.open_run(str(finished)).maps
+    assert not maps.bias.variable._in_memory
+    assert maps.bias.dims == ("y", "x")
+    assert (maps.conversion_gain.attrs["units"], maps.x.attrs["units"]) == ("e-/DN", "pixel")
+    assert {"quality", "fit_status", "y", "x"} <= set(maps.coords)
+    np.testing.assert_array_equal(maps.bias.values, store.read("maps/bias"))
+    np.testing.assert_array_equal(maps.fit_status.values, store.read("fit/fit_status"))
+    assert maps.sel(y=3, x=5).bias.item() == store.read("maps/bias")[3, 5]
+    for name in ("fit", "histogram", "summary", "ensemble"):
+        assert len(getattr(run, name).data_vars) > 3
+    assert run.ensemble.density.coords["dn"].attrs["units"] == "DN"
+    assert int(run.ensemble.counts.sum()) == int(store.read("ensemble/counts").sum())
+
+
+def test_masks_leave_out_what_is_not_to_be_believed(run, store):
+    quality = store.read("maps/quality")
+    assert 0 < (quality == 0).sum() < quality.size
+    np.testing.assert_array_equal(run.good.values, quality == 0)
+    np.testing.assert_array_equal(run.usable.values, quality <= 1)
+    kept = run.maps.where(run.good).bias.values
+    np.testing.assert_array_equal(np.isfinite(kept), (quality == 0) & np.isfinite(store.read("maps/bias")))
+
+
+def test_a_pixel_is_that_of_the_store(run, store):
+    y, x = (int(i) for i in np.argwhere(store.read("maps/quality") == 0)[7])
+    pixel = run.pixel(y, x)
+    assert pixel.parameters["bias"] == store.read("maps/bias")[y, x]
+    assert pixel.stderr["bias"] == store.read("maps/bias_stderr")[y, x]
+    assert (pixel.status, f"y = {y}, x = {x}" in repr(pixel)) == ("", True)
+    counts, origin = store.read("histogram/counts")[y, x], store.read("histogram/origin")[y, x]
+    assert int(pixel.histogram.sum()) == 1200
+    dn = pixel.histogram.dn.values
+    np.testing.assert_array_equal(pixel.histogram.values, counts[dn - origin])
+    assert pixel.histogram.values[[0, -1]].min() > 0
+    z = (pixel.histogram - pixel.expected) / np.sqrt(pixel.expected)
+    known = z.values[pixel.expected.values > 5]
+    # 20 to 30 bins: the mean square of N(0, 1) within five standard errors
+    assert abs((known**2).mean() - 1) < 5 * np.sqrt(2 / known.size)
+    for figure in (pixel.plot(), pixel.plot_cells(width="60mm")):
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    assert len(run.pixels([(0, 0), (1, 2)])) == 2
+
+
+@pytest.mark.parametrize("place", [(-1, 0), (20, 0), (0, 28)])
+def test_pixels_outside_are_refused(run, place):
+    with pytest.raises(ConfigError, match="lies outside the sensor of 20 x 28"):
+        run.pixel(*place)
+
+
+def test_figures_are_those_of_the_report(run, finished, tmp_path):
+    assert set(run.plot.names) == set(EXHIBIT_NAMES) & set(run.plot.names)
+    assert len(run.plot.names) > 10
+    [report] = (path.read_bytes() for path in (finished / "figures").glob("electron_numbers.svg"))
+    drawn = figure_bytes(run.plot.electrons(), "svg", title="Estimated electron numbers")
+    assert drawn == report
+    maps = run.plot.maps("bias", "analog_read_noise_e", width=60)
+    assert list(maps) == ["bias", "analog_read_noise_e"]
+    assert maps["bias"].get_figwidth() == pytest.approx(60 / 25.4)
+    assert maps._repr_html_().count("data:image/png;base64,") == 2
+    assert [path.name for path in maps.save(tmp_path / "out", ("svg",))] == [
+        "bias.svg",
+        "analog_read_noise_e.svg",
+    ]
+    assert len(run.plot.discrepancy()) == 0
+    with pytest.raises(ConfigError, match="this run has no figure nothing; it has cluster_edges"):
+        run.plot.figure("nothing")
+    with pytest.raises(StoreError, match="this run has no map gain; it has quanta_exposure"):
+        run.plot.map("gain")
+    with pytest.raises(ConfigError, match="jpg cannot be drawn"):
+        maps.save(tmp_path, ("jpg",))
+
+
+def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
+    with pytest.raises(StoreError, match="has no truth yet; see what is missing with: pchem status"):
+        _ = run.truth
+    with pytest.raises(ConfigError, match="does not exist"):
+        pchem_pipeline.open_run(tmp_path / "none.zarr")
+    assert "report: complete" in repr(run)
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(MissingDependencyError, match=r'pip install "pchem-pipeline\[notebook\]"'):
+        pchem_pipeline.open_run(finished)
+
+
+def test_the_tutorial_runs(finished, tmp_path):
+    (tmp_path / "pchem-demo").mkdir()
+    shutil.copytree(finished, tmp_path / "pchem-demo" / "demo.zarr")
+    shutil.copy(TUTORIAL, tmp_path)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    result = subprocess.run(
+        [Path(sys.executable).with_name("jupyter-execute"), "--inplace", "tutorial.ipynb"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    cells = json.loads((tmp_path / "tutorial.ipynb").read_text())["cells"]
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    text = "".join("".join(output.get("text", [])) for output in outputs)
+    median = np.median(
+        RunStore.open(finished).read("maps/bias")[RunStore.open(finished).read("maps/quality") == 0]
+    )
+    assert f"bias             {median:9.4f} DN" in text
+    kinds = [kind for output in outputs for kind in output.get("data", {})]
+    assert kinds.count("image/png") == 2
+    assert any("data:image/png" in "".join(output.get("data", {}).get("text/html", "")) for output in outputs)
+    assert {"ensemble.pdf", "figures"} <= {path.name for path in tmp_path.iterdir()}
+    assert not any(output["output_type"] == "error" or output.get("name") == "stderr" for output in outputs)
+
+
+def test_the_tutorial_is_kept_without_outputs():
+    cells = json.loads(TUTORIAL.read_text())["cells"]
+    assert all(not cell.get("outputs") and not cell.get("execution_count") for cell in cells)
