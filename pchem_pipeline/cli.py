@@ -100,16 +100,13 @@ def _stage_command(name: str, summary: str) -> None:
         progress: Progress = "auto",
         quiet: Quiet = False,
     ) -> None:
-        from pchem_pipeline.stages.session import cropped, find_run, run_stages
+        from pchem_pipeline.stages.session import find_run, run_stages
 
         command = _command(
             force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
             log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
         )  # fmt: skip
-        run = find_run(target)
-        if name == "ingest":
-            run, command = cropped(run, command)
-        run_stages(run, [name], command)
+        run_stages(find_run(target), [name], command)
 
     stage.__doc__ = summary
     app.command(name)(stage)
@@ -129,9 +126,45 @@ def init(
     typer.echo(path)
 
 
+@app.command()
+def ingest(
+    target: Target,
+    append: Annotated[
+        bool,
+        typer.Option(
+            "--append", help="take the files that came behind those of a finished run; reads only them"
+        ),
+    ] = False,
+    force: Force = False,
+    dry_run: DryRun = False,
+    tiles: Tiles = None,
+    roi: Roi = None,
+    workers: Workers = None,
+    backend: Backend = None,
+    max_memory: MaxMemory = None,
+    log_json: LogJson = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Check the camera files; copy or reference their frames."""
+    from pchem_pipeline.stages.session import cropped, find_run, run_stages
+
+    command = _command(
+        force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
+        log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
+    )  # fmt: skip
+    run = find_run(target)
+    if append:
+        from pchem_pipeline.stages.append import append_frames
+
+        append_frames(run, command)
+    else:
+        run, command = cropped(run, command)
+        run_stages(run, ["ingest"], command)
+
+
 for _name, _summary in {
     "simulate": "Write a simulated camera's frames, and its truth.",
-    "ingest": "Check the camera files; copy or reference their frames.",
     "histogram": "Count every pixel's DN; keep summaries in time and space.",
     "fit": "Fit H, g, mu and sigma of every pixel by PCH-EM.",
     "maps": "Make the maps, with units, standard errors and quality.",

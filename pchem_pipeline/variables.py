@@ -217,6 +217,12 @@ _ALL: list[Variable] = [
         "DN",
         "sum over 64 rows of a column of a frame",
     ),
+    Variable(
+        "summary/open_sums", ("sum", "y", "x"), "int64", "1", "sums of the last time block, to go on from"
+    ),
+    Variable(
+        "summary/open_covariances", ("lag", "y", "x"), "float64", "DN2", "sums of covariances, to go on from"
+    ),
     Variable("summary/frame_mean", ("frame",), "float64", "DN", "mean of a frame"),
     Variable("summary/frame_variance", ("frame",), "float64", "DN2", "variance over the pixels of a frame"),
     *_both("fit", PARAMETERS),

@@ -96,6 +96,22 @@ class HistogramAccumulator:
         self._fixed = np.zeros(shape, np.bool_)
         self._first = True
 
+    @classmethod
+    def resumed(cls, held: RowHistograms, n_frames: int) -> HistogramAccumulator:
+        """Go on after the frames of finished histograms, as if it had never stopped.
+
+        Args:
+            held: what `finish` returned.
+            n_frames: number of frames in the end, those of ``held`` included.
+        """
+        self = cls(held.counts.shape[:2], held.counts.shape[2], n_frames)
+        for name, values in vars(held).items():
+            getattr(self, f"_{name}")[...] = values
+        # a window stays where it is for good once the range was too large for it
+        self._fixed[...] = self._maximum.astype(np.int64) - self._minimum >= held.counts.shape[2]
+        self._first = False
+        return self
+
     def add(self, frames: _Frames) -> None:
         """Count a block of frames, (frame, y, x).
 

@@ -22,6 +22,7 @@ __all__ = [
     "BlockSums",
     "CovarianceMaps",
     "LineSums",
+    "OpenSums",
     "SummaryAccumulator",
     "block_starts",
     "frame_statistics",
@@ -75,6 +76,20 @@ class CovarianceMaps:
     lag1_covariance: NDArray[np.float64]
     neighbour_covariance_x: NDArray[np.float64]
     neighbour_covariance_y: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OpenSums:
+    """The sums of a time block that is not whole yet, and of the covariances so far.
+
+    Attributes:
+        sums: of d = DN - reference: d, d^2, d times that of the frame before, of x + 1, of y + 1; then the
+            reference and the DN of the last frame; (7, y, x).
+        covariances: sums over the closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
+    """
+
+    sums: NDArray[np.int64]
+    covariances: NDArray[np.float64]
 
 
 def line_sums(frames: _Frames) -> LineSums:
@@ -134,6 +149,27 @@ class SummaryAccumulator:
         self._sums = np.zeros((5, *shape), np.int64)
         self._covariances = np.zeros((3, *shape))
         self._freedom = 0
+
+    @classmethod
+    def resumed(cls, state: OpenSums, n_frames: int, block_frames: int) -> SummaryAccumulator:
+        """Go on after ``n_frames`` frames, as if it had never stopped.
+
+        Args:
+            state: what `open_sums` returned after these frames.
+            n_frames: number of frames so far.
+            block_frames: frames in a time block.
+        """
+        self = cls(state.sums.shape[1:], block_frames)
+        closed, self._in_block = divmod(n_frames, block_frames)
+        self._freedom = closed * (block_frames - 1)
+        self._sums[...], self._covariances[...] = state.sums[:5], state.covariances
+        self._reference[...], self._before[...] = state.sums[5:]
+        return self
+
+    def open_sums(self) -> OpenSums:
+        """Return all that is needed to go on later; to be taken before `finish`."""
+        ends = np.stack([self._reference, self._before]).astype(np.int64)
+        return OpenSums(np.concatenate([self._sums, ends]), self._covariances.copy())
 
     def add(self, frames: _Frames) -> list[BlockSums]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""

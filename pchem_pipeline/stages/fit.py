@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
+from pchem_pipeline.stages.fit_start import drop_fit, kept_fit
 from pchem_pipeline.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
 
 if TYPE_CHECKING:
@@ -52,6 +54,7 @@ def fit_tile(
     adc_limits: tuple[int, int] | None,
     effects: Sequence[Effect] = (),
     set_aside: Sequence[Interval] = (),
+    start: NDArray[np.float64] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the group ``fit`` of a tile, by name.
 
@@ -63,12 +66,18 @@ def fit_tile(
         adc_limits: first and last code of the ADC, DN, or None where they are not known.
         effects: of the run's model.
         set_aside: codes that the fit leaves out, e- on the comb of the plain fit.
+        start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
     """
     counts = histogram["counts"]
     shape = counts.shape[:2]
     flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
     rows = counts.reshape(-1, counts.shape[2])
-    plain: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits)
+    old = None if start is None else start.reshape(-1, start.shape[2])
+    known = None if old is None else old[:, : len(PARAMETERS)]
+    plain: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits, start=known)
+    if old is not None:
+        # from a start no neighbours are tried; the gap to them was the old one, and grows with the frames
+        plain = replace(plain, likelihood_gap=np.fmin(plain.likelihood_gap, old[:, len(PARAMETERS)]))
     if effects:
         result = _grown(rows, flat["origin"], plain, settings, effects)
     else:
@@ -154,6 +163,8 @@ def run(context: StageContext) -> None:
         set_aside=context.config.model.set_aside_e,
     )
     done = context.run_units(context.tiles(), task, needs="histogram")
+    if len(done) == context.n_keys:
+        drop_fit(context.store.path)
     biased, pixels = (sum(tile.get(key, 0) for tile in done.values()) for key in ("rounded", "pixels"))
     if biased:
         context.note(
@@ -180,7 +191,8 @@ def _do_tile(
     """Fit one tile of the store; the summary counts its pixels."""
     run_store = open_store(store)
     histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
-    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside)
+    start = kept_fit(store, tile.region)
+    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]

@@ -218,6 +218,8 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
         context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
         return
     context.create_maps([f"summary/{name}" for name in _COVARIANCES])
+    for name, length in (("open_sums", 7), ("open_covariances", 3)):
+        context.create(f"summary/{name}", (length, ny, nx), chunks=(length, tile, tile))
     starts = block_starts(n_frames, settings.block_frames)
     rows = max(tile, ROW_GROUP)
     for name in ("block_sum", "block_sum_square"):

@@ -13,7 +13,14 @@ from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.stages.base import StageContext
 from pchem_pipeline.store.files import read_json, write_json
 
-__all__ = ["identity_is_new", "inspect_input", "keep_identity", "known_identity", "shortened"]
+__all__ = [
+    "identity_is_new",
+    "inspect_input",
+    "keep_identity",
+    "kept_identity",
+    "known_identity",
+    "shortened",
+]
 
 _LISTED_FILES = 64
 
@@ -52,6 +59,18 @@ def known_identity(context: StageContext) -> dict[str, Any]:
 def identity_is_new(context: StageContext) -> bool:
     """Tell whether nothing is known of the input yet."""
     return read_json(_place(context)) is None
+
+
+def kept_identity(context: StageContext) -> dict[str, Any]:
+    """Return what is kept of the input: its files (quick identity) and their content identity.
+
+    Raises:
+        StoreError: nothing is kept.
+    """
+    known = read_json(_place(context))
+    if known is None:
+        raise StoreError(f"{context.store.path} knows no input yet; run: pchem ingest")
+    return dict(known)
 
 
 def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[str, Any]) -> None:

@@ -37,7 +37,7 @@ from pchem_pipeline.stages.sweep import Parts, Sweep, cut_rows
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
-__all__ = ["sweep_input"]
+__all__ = ["block_tasks", "do_all", "sweep_input", "whole_mebibytes"]
 
 _STAGES = ("ingest", "histogram")
 
@@ -65,7 +65,7 @@ def sweep_input(context: StageContext) -> None:
     for name in _STAGES:
         context.store.records.forget(name)
     with context.reporter.progress("ingest and histogram", total, "MiB") as advance:
-        once = ReadOnce(frames, paths, workers, _whole_mebibytes(advance))
+        once = ReadOnce(frames, paths, workers, whole_mebibytes(advance))
         if not _sweep(context, frames, once):
             return
         identity = once.identity()
@@ -101,7 +101,7 @@ def _allowed(context: StageContext) -> int:
     return allowed_bytes(context.config, context.executor.workers)
 
 
-def _whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
+def whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
     """Turn bytes into whole MiB of progress."""
     done = shown = 0
 
@@ -118,7 +118,7 @@ def _whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
 def _sweep(context: StageContext, frames: FrameSequence, once: ReadOnce) -> bool:
     """Read everything once; tell whether memory was enough."""
     settings = context.config.histogram
-    shape, copies = frames.shape, context.config.input.mode == "copy"
+    shape = frames.shape
     bands = cut_rows(shape[1], sweep_rows(context.config, shape, frames.dtype), context.executor.workers)
     sweep = Sweep(once.read, shape, frames.dtype, bands, settings.window_frames)
     counters: list[BandCounter] = []
@@ -132,18 +132,12 @@ def _sweep(context: StageContext, frames: FrameSequence, once: ReadOnce) -> bool
                     return False
                 _create(context, frames, bins)
                 counters = [BandCounter(context.store.path, rows, shape, bins, settings) for rows in bands]
-            tasks = [functools.partial(each.add, part) for each, part in zip(counters, parts, strict=True)]
-            if copies:
-                tasks += [
-                    functools.partial(_copy, context, t0, rows, part)
-                    for rows, part in zip(bands, parts, strict=True)
-                ]
-            _do_all(pool, tasks)
-        _do_all(pool, [counter.finish for counter in counters])
+            do_all(pool, block_tasks(context, counters, bands, t0, parts))
+        do_all(pool, [counter.finish for counter in counters])
     return True
 
 
-def _do_all(pool: ThreadPoolExecutor, tasks: Sequence[Callable[[], None]]) -> None:
+def do_all(pool: ThreadPoolExecutor, tasks: Sequence[Callable[[], None]]) -> None:
     """Do tasks at the same time; the first error is raised when all have ended."""
     futures = [pool.submit(task) for task in tasks]
     for error in [future.exception() for future in futures]:
@@ -173,6 +167,31 @@ def _create(context: StageContext, frames: FrameSequence, bins: int) -> None:
     if context.config.input.mode == "copy":
         ingest.create_frames(context, frames)
     histogram.create_arrays(context, frames.shape, bins)
+
+
+def block_tasks(
+    context: StageContext,
+    counters: Sequence[BandCounter],
+    bands: Sequence[tuple[int, int]],
+    t0: int,
+    parts: Parts,
+) -> list[Callable[[], None]]:
+    """Return what is to be done with a block of frames: count each band, and copy it where that is asked.
+
+    Args:
+        context: of the run.
+        counters: of the bands.
+        bands: first row and end of each.
+        t0: first frame of the block.
+        parts: frames (frame, y, x) of each band.
+    """
+    tasks: list[Callable[[], None]] = [
+        functools.partial(counter.add, part) for counter, part in zip(counters, parts, strict=True)
+    ]
+    if context.config.input.mode == "copy":
+        for rows, part in zip(bands, parts, strict=True):
+            tasks.append(functools.partial(_copy, context, t0, rows, part))
+    return tasks
 
 
 def _copy(context: StageContext, t0: int, rows: tuple[int, int], part: NDArray[Any]) -> None:

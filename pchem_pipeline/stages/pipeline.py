@@ -31,6 +31,7 @@ __all__ = [
     "execute",
     "load_stage",
     "pipeline_of",
+    "setting_values",
     "status",
 ]
 
@@ -94,10 +95,18 @@ def fingerprint_content(stage: StageModule | Declaration, context: StageContext)
     return {
         "stage": stage.NAME,
         "version": stage.VERSION,
-        "settings": {key: setting_of(context.config, key) for key in stage.SETTINGS},
+        "settings": setting_values(stage.NAME, context, stage),
         "upstream": upstream,
         "input": identity_of(stage, context),
     }
+
+
+def setting_values(
+    name: str, context: StageContext, stage: StageModule | Declaration | None = None
+) -> dict[str, Any]:
+    """Return the settings that a stage reads, as JSON data."""
+    keys = (stage or DECLARED[name]).SETTINGS
+    return {key: setting_of(context.config, key) for key in keys}
 
 
 def _state_of_record(store: RunStore, record: StageRecord) -> str:

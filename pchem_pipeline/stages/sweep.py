@@ -43,6 +43,7 @@ class Sweep:
         dtype: np.dtype[Any],
         bands: Sequence[tuple[int, int]],
         step: int,
+        first: int = 0,
     ) -> None:
         """Take the memory; nothing is read yet.
 
@@ -51,9 +52,11 @@ class Sweep:
             shape: frames, rows, columns.
             dtype: type of the samples.
             bands: rows of each band, see `cut_rows`.
-            step: frames in a block; the last one may be shorter.
+            step: frames in a block; blocks end at multiples of it, the last one may be shorter.
+            first: frame to begin with.
         """
         self._read, self._n_frames, self._step = read, shape[0], min(step, shape[0])
+        self._first, self._skipped = first, first // self._step
         self._buffers = [
             [np.empty((self._step, y1 - y0, shape[2]), dtype) for y0, y1 in bands] for _ in range(2)
         ]
@@ -61,7 +64,7 @@ class Sweep:
     @property
     def n_blocks(self) -> int:
         """Number of blocks."""
-        return -(-self._n_frames // self._step)
+        return -(-self._n_frames // self._step) - self._skipped
 
     @contextmanager
     def blocks(self) -> Iterator[Iterator[tuple[int, Parts]]]:
@@ -74,8 +77,7 @@ class Sweep:
 
     def _blocks(self, pool: ThreadPoolExecutor) -> Iterator[tuple[int, Parts]]:
         def request(number: int) -> tuple[Parts, Future[None]]:
-            t0 = number * self._step
-            t1 = min(t0 + self._step, self._n_frames)
+            t0, t1 = self._frames(number)
             parts = [band[: t1 - t0] for band in self._buffers[number % 2]]
             return parts, pool.submit(self._read, parts, t0, t1)
 
@@ -85,4 +87,9 @@ class Sweep:
             reading.result()
             if number + 1 < self.n_blocks:
                 pending = request(number + 1)
-            yield number * self._step, parts
+            yield self._frames(number)[0], parts
+
+    def _frames(self, number: int) -> tuple[int, int]:
+        """Return the first frame of a block, and its end."""
+        start = (number + self._skipped) * self._step
+        return max(start, self._first), min(start + self._step, self._n_frames)

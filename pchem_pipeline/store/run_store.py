@@ -186,6 +186,16 @@ class RunStore:
         with self._translated(name, region):
             self.array(name)[region] = data
 
+    def resize(self, name: str, length: int) -> None:
+        """Make an array longer (or shorter) along its first axis; what it holds stays.
+
+        Raises:
+            StoreError: it is missing, or the file system refused.
+        """
+        array = self.array(name)
+        with self._translated(name):
+            array.resize((length, *array.shape[1:]))
+
     def delete(self, name: str) -> None:
         """Remove an array or a group, if it exists."""
         if name in self._root:
