@@ -169,7 +169,9 @@ class SummaryAccumulator:
     def open_sums(self) -> OpenSums:
         """Return all that is needed to go on later; to be taken before `finish`."""
         ends = np.stack([self._reference, self._before]).astype(np.int64)
-        return OpenSums(np.concatenate([self._sums, ends]), self._covariances.copy())
+        covariances = self._covariances.copy()
+        covariances[2, ROW_GROUP - 1 :: ROW_GROUP] = covariances[2, -1] = 0.0  # no pair across the border
+        return OpenSums(np.concatenate([self._sums, ends]), covariances)
 
     def add(self, frames: _Frames) -> list[BlockSums]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""
