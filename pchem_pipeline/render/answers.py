@@ -42,14 +42,16 @@ def _sensor(data: ReportData) -> Answer:
     lost = pixels.failed / pixels.total
     noise = finite(data.maps.get("read_noise_e", np.empty(0)))
     median = float(np.median(noise)) if noise.size else float("nan")
-    parts = [f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} have a value"]
+    share = "all" if pixels.failed == 0 else f"{percent(pixels.fitted, pixels.total)} of"
+    parts = [f"{share} {count(pixels.total, data.noun)} have a value"]
     if noise.size:
         below = percent(float((noise < _TOO_NOISY).sum()), noise.size)
-        parts.append(f"read noise {short(median, 3)} e⁻, {below} of them below {_TOO_NOISY:g} e⁻")
+        parts.append(f"median read noise {short(median, 3)} e⁻, {below} below {_TOO_NOISY:g} e⁻")
     odd, where = _outliers(data)
     if odd:
         parts.append(f"{percent(odd, 1.0)} are outliers in {where}")
     text = "; ".join(parts) + "."
+    text = text[0].upper() + text[1:]
     if lost > data.allowed_failed:
         return Answer(question, "serious", "No", text)
     if median > _TOO_NOISY:
@@ -89,4 +91,10 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     passed = sum(flag.level == "good" for flag in about)
     checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check failed"
     looked = "" if data.discrepancy is not None else " What the model may be missing was not looked for."
+    pixels = pixel_counts(data)
+    if pixels.failed > data.allowed_failed * pixels.total:
+        word = f"For the {data.noun}s with a value"
+        return Answer(
+            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} have none.{looked}"
+        )
     return Answer(question, "good", "Yes", f"{checks}.{looked}")

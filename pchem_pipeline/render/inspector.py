@@ -124,6 +124,7 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
         "failedMask": data.failed_mask,
         "model": data.run.get("model", ""),
         "command": shown.command,
+        "keptTo": shown.kept_to,
         "colours": "".join(f"{r:02x}{g:02x}{b:02x}" for r, g, b in colours),
         "maps": [map_facts(entry) for entry in shown.maps],
         "panel": list(PANEL_MAPS),

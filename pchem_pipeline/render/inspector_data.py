@@ -69,9 +69,11 @@ class InspectorData:
     Attributes:
         maps: in the order of the list; those not packed are shown by ``pchem view`` only.
         sample: the pixels in full.
+        kept_to: to which part of a standard error the packed maps are true, in words.
         command: what shows every pixel.
     """
 
     maps: tuple[MapEntry, ...]
     sample: PixelSample
+    kept_to: str
     command: str

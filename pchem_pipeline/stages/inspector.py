@@ -44,10 +44,10 @@ __all__ = [
 _ALL_PIXELS = 4096
 #: Pixels in full in the file of a larger sensor, and how many of them with the mass of a model with effects.
 _SOME_PIXELS, _SOME_MASSES = 2400, 300
-#: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 3/4.
-_MAPS_BUDGET = 3.4e6
+#: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9.
+_MAPS_BUDGET, _MAPS_POWER = 3.4e6, 0.9
 _PAPER_PIXELS = 512 * 512
-#: Errors of a map's codes: a sixteenth of a pixel's standard error, and 1 % of a standard error itself; four
+#: Steps of a map's codes: an eighth of a pixel's standard error, and 2 % of a standard error itself; four
 #: times that for sensors beyond a million pixels.
 _STEPS_PER_ERROR, _STEP_OF_ERRORS = 8.0, 0.02
 _COARSE_PIXELS, _COARSE = 1_000_000, 4.0
@@ -150,19 +150,20 @@ def gather_inspector(
     chosen = choose_inspected(maps, fit, shown, suspects, everything=_ALL_PIXELS, most=_SOME_PIXELS)
     here = [entry.path for entry in entries if entry.packed is not None or entry.same_as is not None]
     sample = read_sample(store, chosen, here, sensor.shape)
-    return InspectorData(tuple(entries), sample, f"pchem view {quoted(Path(store.path.name))}")
+    kept_to = "a quarter" if sensor.ny * sensor.nx > _COARSE_PIXELS else "a sixteenth"
+    return InspectorData(tuple(entries), sample, kept_to, f"pchem view {quoted(Path(store.path.name))}")
 
 
 def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
     """Pack maps, the important ones first, until the budget is spent."""
     n = shape[0] * shape[1]
-    budget = _MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** 0.75
+    budget = _MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER
     order = sorted(listed, key=lambda each: _importance(each.variable.path))
     found: dict[str, MapEntry] = {}
     for each in order:
         entry = map_entry(each)
         alike = _multiple_of_exposure(store, each.variable)
-        if alike is not None and alike[0] in found:
+        if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
             found[entry.path] = replace(entry, same_as=alike)
             continue
         packed = packed_map(store, each.variable)
