@@ -12,10 +12,25 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 
 from pchem_pipeline import __version__
-from pchem_pipeline.errors import ConfigError, ExitCode, PchEmError
+from pchem_pipeline.cli_options import (
+    Backend,
+    DryRun,
+    Force,
+    LogJson,
+    MaxMemory,
+    Progress,
+    Quiet,
+    Roi,
+    Target,
+    Tiles,
+    Workers,
+    make_command,
+)
+from pchem_pipeline.cli_plan import plan
+from pchem_pipeline.errors import ExitCode, PchEmError
 
 if TYPE_CHECKING:
-    from pchem_pipeline.stages.session import Command
+    pass
 
 __all__ = ["app", "main"]
 
@@ -27,61 +42,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
-Force = Annotated[bool, typer.Option("--force", help="do it again even if it is up to date")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="say what would be done and why; write nothing")]
-Tiles = Annotated[str | None, typer.Option(help="only these tiles, iy.ix: 0.3,2.1 or ranges 0:2.0:4")]
-Roi = Annotated[
-    str | None,
-    typer.Option(help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, others do its tiles"),
-]
-Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
-Backend = Annotated[
-    Literal["serial", "threads", "processes", "distributed"] | None,
-    typer.Option(help="who does the work [default: compute.backend]"),
-]
-MaxMemory = Annotated[
-    int | None, typer.Option(min=64, help="memory that it may take, MiB [default: compute.max_memory]")
-]
-LogJson = Annotated[Path | None, typer.Option(help="append JSON lines about the run to this file")]
-Progress = Annotated[
-    Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
-
-
-def _roi(text: str | None) -> tuple[int, int, int, int] | None:
-    if text is None:
-        return None
-    try:
-        (y0, y1), (x0, x1) = (map(int, part.split(":")) for part in text.split(","))
-    except ValueError:
-        raise ConfigError(f"--roi {text!r}: write y0:y1,x0:x1 in pixels, such as 0:128,64:192") from None
-    return y0, y1, x0, x1
-
-
-def _command(
-    *,
-    force: bool,
-    dry_run: bool,
-    tiles: str | None,
-    roi: str | None,
-    workers: int | None,
-    backend: str | None,
-    log_json: Path | None,
-    progress: Literal["auto", "on", "off"],
-    quiet: bool,
-    max_memory: int | None = None,
-) -> Command:
-    from pchem_pipeline.stages.base import Options
-    from pchem_pipeline.stages.session import Command
-
-    options = Options(force=force, dry_run=dry_run, tiles=tiles, roi=_roi(roi))
-    return Command(
-        options, workers=workers, backend=backend, max_memory=max_memory, progress=progress, quiet=quiet,
-        log_json=log_json,
-    )  # fmt: skip
 
 
 def _stage_command(name: str, summary: str) -> None:
@@ -209,7 +169,7 @@ def run(
     from pchem_pipeline.stages.session import cropped, run_stages
     from pchem_pipeline.stages.start import find_or_start
 
-    command = _command(
+    command = make_command(
         force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
         log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
     )  # fmt: skip
@@ -250,7 +210,7 @@ def discrepancy(
     from pchem_pipeline.stages.growing import find_and_grow
     from pchem_pipeline.stages.session import find_run
 
-    command = _command(
+    command = make_command(
         force=force, dry_run=dry_run, tiles=None, roi=roi, workers=workers, backend=backend,
         log_json=log_json, progress=progress, quiet=quiet,
     )  # fmt: skip
@@ -283,7 +243,7 @@ def joint(
     """
     from pchem_pipeline.stages.joint_session import find_joint, run_joint
 
-    command = _command(
+    command = make_command(
         force=force, dry_run=dry_run, tiles=tiles, roi=None, workers=workers, backend=backend,
         log_json=log_json, progress=progress, quiet=quiet,
     )  # fmt: skip
@@ -291,6 +251,51 @@ def joint(
     run_joint(fit, command)
     if not dry_run:
         typer.echo(fit.store / "report.html")
+
+
+@app.command()
+def methods(
+    target: Target,
+    with_runs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--with", help="store of a run of the same pixels at another exposure (dark first of all)"
+        ),
+    ] = None,
+    pixels: Annotated[
+        int | None, typer.Option(min=1, help="pixels to compare [default: methods.pixels]")
+    ] = None,
+    study_pixels: Annotated[
+        int | None,
+        typer.Option(min=0, help="simulated pixels at each read noise [default: methods.study_pixels]"),
+    ] = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    workers: Workers = None,
+    backend: Backend = None,
+    log_json: LogJson = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Compare other characterisation methods with PCH-EM.
+
+    Photon transfer, EMVA 1288, PCH peaks and valleys, cumulants and others, on the same pixels and simulated.
+    """
+    from pchem_pipeline.stages.methods_result import compare_methods
+    from pchem_pipeline.stages.session import find_run
+
+    command = make_command(
+        force=force, dry_run=dry_run, tiles=None, roi=None, workers=workers, backend=backend,
+        log_json=log_json, progress=progress, quiet=quiet,
+    )  # fmt: skip
+    given = {"with_runs": with_runs, "pixels": pixels, "study_pixels": study_pixels}
+    known = {name: value for name, value in given.items() if value is not None}
+    text = compare_methods(find_run(target), command, known)
+    if text:
+        typer.echo(text)
+
+
+app.command()(plan)
 
 
 @app.command()

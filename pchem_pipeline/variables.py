@@ -6,7 +6,7 @@ Nothing is written that is not listed here; the attributes in the store come fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 __all__ = [
     "FREE_LOBES",
@@ -372,6 +372,13 @@ _ALL: list[Variable] = [
     # where the model and the data disagree; axes: `score` as effects.evidence.SCORES, `channel` charge and
     # readout, `side` below and above, `statistic` as discrepancy.catalogue.STATISTICS
     *_discrepancy(),
+    # other methods beside PCH-EM; the attribute `methods` of the estimates names the axis `method`
+    Variable("methods/pixel_y", ("pixel",), "int32", "1", "row of the compared pixel"),
+    Variable("methods/pixel_x", ("pixel",), "int32", "1", "column of the compared pixel"),
+    *[
+        replace(_parameter("methods", name, "by each method: "), dims=("method", "pixel"))
+        for name in PARAMETERS
+    ],
     *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e", "analog_read_noise_e")],
     Variable(
         "truth/defect",

@@ -10,6 +10,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.settings import ModelSettings
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.ensemble_settings import EnsembleSettings, MapsSettings
 from pchem_pipeline.model.histogram_settings import HistogramSettings
 from pchem_pipeline.model.settings import FitSettings
@@ -56,6 +57,9 @@ class RunConfig(Section):
     discrepancy: DiscrepancySettings = Field(
         default_factory=DiscrepancySettings, description="search for what the model is missing"
     )
+    methods: MethodsSettings = Field(
+        default_factory=MethodsSettings, description="other methods beside PCH-EM (pchem methods)"
+    )
     report: ReportSettings = Field(default_factory=ReportSettings, description="report.html and figures")
     compute: ComputeSettings = Field(default_factory=ComputeSettings, description="who does the work")
 
@@ -68,6 +72,7 @@ class RunConfig(Section):
         "maps",
         "ensemble",
         "discrepancy",
+        "methods",
         "report",
         "compute",
         mode="before",

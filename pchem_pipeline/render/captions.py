@@ -78,6 +78,13 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         (),
     ),
     (
+        "methods",
+        "Other methods beside PCH-EM",
+        "The same pixels characterised by the methods of the literature, with the smallest errors that any "
+        "method could have.",
+        ("methods",),
+    ),
+    (
         "status",
         "Fit status",
         "Pixels that could not be fitted, or whose values deserve caution, and why.",

@@ -28,7 +28,7 @@ FEW_CHANNELS = 32
 MAP_NAMES = ("dark_current", "conversion_gain", "bias", "read_noise_e")
 
 #: The parts of a report that a run may lack; the keys of ``ReportData.missing``.
-PARTS = ("pixels", "maps", "dark_current", "ensemble", "nuced", "electrons", "components", "truth")
+PARTS = ("pixels", "maps", "dark_current", "ensemble", "nuced", "electrons", "components", "truth", "methods")
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ class ReportData:
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
         inspector: maps and pixels to look at in the browser, or None.
+        methods: content of ``methods.json``, or None where nobody compared.
     """
 
     title: str
@@ -133,6 +134,7 @@ class ReportData:
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
     inspector: InspectorData | None = None
+    methods: Mapping[str, Any] | None = None
 
     @property
     def noun(self) -> str:

@@ -12,6 +12,7 @@ from pchem_pipeline.render.discrepancy_exhibits import discrepancy_exhibits
 from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
 from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.inspector import content_policy, embedded, script
+from pchem_pipeline.render.method_exhibits import method_exhibits, method_tables
 from pchem_pipeline.render.pictures import DrawAll, Picture, draw_picture, longest_first, ready_picture
 from pchem_pipeline.render.report_json import report_json
 from pchem_pipeline.render.sections import Material, page_sections
@@ -53,7 +54,7 @@ def render_report(
     """
     settings = settings or ReportSettings()
     figures: dict[str, bytes] = {}
-    shown = exhibits(data, settings)
+    shown = [*exhibits(data, settings), *method_exhibits(data)]
     others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
     drawn = {} if draw is None else draw(longest_first([*shown, *others]), settings)
 
@@ -63,6 +64,7 @@ def render_report(
         return draw_picture(exhibit, settings, figures)
 
     pictures = [picture(exhibit) for exhibit in shown]
+    tables = [*result_tables(data), *method_tables(data)]
     view: DiscrepancyView[Picture] | None = None
     if data.discrepancy is not None:
         view = discrepancy_view(data.discrepancy, picture)
@@ -74,7 +76,7 @@ def render_report(
         flag_signs=_FLAG_SIGNS,
         inspector=inspector,
         policy=content_policy(script() if inspector else None),
-        sections=page_sections(Material(data, settings, pictures, result_tables(data), view)),
+        sections=page_sections(Material(data, settings, pictures, tables, view)),
     )
     pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
     return RenderedReport(page, report_json(data), figures, pages)

@@ -123,6 +123,15 @@ _ALL = (
         ("joint", "maps"),
         (),
     ),
+    Declaration(
+        "methods",
+        1,
+        ("histogram", "fit"),
+        ("methods",),
+        ("histogram", "fit", "truth"),
+        ("methods",),
+        identities.other_samples,
+    ),
 )
 
 #: Declaration of each stage, by name.

@@ -14,6 +14,7 @@ from pchem_pipeline.render.data import ReportData
 from pchem_pipeline.render.discrepancy_exhibits import discrepancy_exhibits
 from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.figure_data import figure_tables
+from pchem_pipeline.render.method_exhibits import method_exhibits
 from pchem_pipeline.render.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.stages.drawing import drawing_executor
@@ -85,7 +86,7 @@ def gather_run(target: Target) -> ReportData:
 def exhibits_of(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
     """Return the figures of the report and of the discrepancy page."""
     others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
-    return [*exhibits(data, settings), *others]
+    return [*exhibits(data, settings), *method_exhibits(data), *others]
 
 
 def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:

@@ -9,7 +9,15 @@ from pchem_pipeline.stages.input_identity import known_identity
 if TYPE_CHECKING:
     from pchem_pipeline.stages.base import StageContext
 
-__all__ = ["adc_limits", "input_content", "integration_time", "joint_samples", "search_start", "verdict"]
+__all__ = [
+    "adc_limits",
+    "input_content",
+    "integration_time",
+    "joint_samples",
+    "other_samples",
+    "search_start",
+    "verdict",
+]
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
@@ -40,11 +48,22 @@ def integration_time(context: StageContext) -> dict[str, Any]:
 
 
 def verdict(context: StageContext) -> dict[str, str] | None:
-    """Return what the report depends on beside its upstream stages: a verdict, where there is one."""
+    """Return what the report depends on beside its upstream stages: a verdict, a comparison of methods."""
     from pchem_pipeline.stages.discrepancy_result import discrepancy_state
 
     state = discrepancy_state(context.store)
-    return None if state is None else {"discrepancy": state}
+    found = {} if state is None else {"discrepancy": state}
+    compared = context.store.records.read("methods")
+    if compared is not None and compared.finished:
+        found["methods"] = f"{compared.fingerprint[:8]}, {compared.started}"
+    return found or None
+
+
+def other_samples(context: StageContext) -> dict[str, Any]:
+    """Return which other runs join a comparison of methods, and their state."""
+    from pchem_pipeline.stages import other_runs
+
+    return {**adc_limits(context), "with_runs": other_runs.other_samples(context)}
 
 
 def search_start(context: StageContext) -> dict[str, Any]:

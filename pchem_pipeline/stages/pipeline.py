@@ -39,7 +39,7 @@ __all__ = [
 STAGES = ("simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report")
 
 #: Stages that are run on demand only.
-OPTIONAL_STAGES = ("electrons", "discrepancy")
+OPTIONAL_STAGES = ("electrons", "discrepancy", "methods")
 
 #: Stages of a joint fit of several runs, which has a store of its own.
 JOINT_STAGES = ("joint", "joint_report")

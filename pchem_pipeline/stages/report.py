@@ -20,6 +20,7 @@ from pchem_pipeline.render.data import PixelFit, ReportData
 from pchem_pipeline.render.discrepancy_exhibits import DISCREPANCY_NAMES
 from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE
 from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
+from pchem_pipeline.render.method_exhibits import METHOD_FIGURE
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.declared import DECLARED
@@ -27,6 +28,7 @@ from pchem_pipeline.stages.discrepancy_result import read_discrepancy
 from pchem_pipeline.stages.drawing import draw_by_workers
 from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.stages.inspector import gather_inspector
+from pchem_pipeline.stages.methods_result import METHODS_FILE, read_methods
 from pchem_pipeline.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
 
 if TYPE_CHECKING:
@@ -161,7 +163,11 @@ def _write(
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):
-        if old.name not in rendered.figures and old.stem in (*EXHIBIT_NAMES, *DISCREPANCY_NAMES):
+        if old.name not in rendered.figures and old.stem in (
+            *EXHIBIT_NAMES,
+            *DISCREPANCY_NAMES,
+            METHOD_FIGURE,
+        ):
             old.unlink(missing_ok=True)
     for name, page in rendered.pages.items():
         store.write_file(name, page.encode())
@@ -234,7 +240,8 @@ def gather(
             for file in sensor.identity.get("files", [])
         ],
         stages=list(stages),
-        missing=_missing(maps, ensemble),
+        missing=_missing(maps, ensemble) | _not_compared(store),
+        methods=read_methods(store),
         discrepancy=discrepancy,
         inspector=gather_inspector(store, sensor, maps, fit, [(p.y, p.x) for p in pixels], suspects),
     )
@@ -394,6 +401,12 @@ def _missing(maps: Mapping[str, NDArray[Any]], ensemble: Mapping[str, NDArray[An
         if name not in ensemble:
             found[part] = f"{_PARTS[part]}: {why}"
     return found
+
+
+def _not_compared(store: RunStore) -> dict[str, str]:
+    if (store.path / METHODS_FILE).exists():
+        return {}
+    return {"methods": f"not compared in this run; to do so, run: pchem methods {store.path.name}"}
 
 
 _PARTS = {

@@ -159,7 +159,7 @@ def test_what_a_run_lacks_is_said(folder: Path) -> None:
     for name in ("maps/dark_current", "maps/dark_current_stderr"):
         context.store.delete(name)
     data = gather(context.store, context.config, None, [])
-    assert set(data.missing) == {"dark_current", "ensemble", "nuced", "electrons", "components"}
+    assert set(data.missing) == {"dark_current", "ensemble", "nuced", "electrons", "components", "methods"}
     assert "input.integration_time" in data.missing["dark_current"]
 
 

@@ -1,0 +1,160 @@
+"""What a characterisation method is given, what it returns, and where it is registered.
+
+A method is one file of this package: a subclass of :class:`Method` under :func:`register_method`. Adding one
+touches no other file.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.methods.moments import SampleMoments, sample_moments
+
+__all__ = [
+    "Estimates",
+    "Method",
+    "PixelSamples",
+    "Sample",
+    "Settings",
+    "no_estimates",
+    "register_method",
+    "registered",
+]
+
+FloatArray = NDArray[np.float64]
+Needs = Literal["one sample", "a dark and a bright sample", "a series of samples"]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Histograms of n pixels at one exposure.
+
+    Attributes:
+        counts: shape (n, B).
+        origin: DN of bin 0, shape (n,).
+    """
+
+    counts: NDArray[np.integer]
+    origin: NDArray[np.int64]
+
+    def moments(self) -> SampleMoments:
+        """Return the unbiased moments of every pixel."""
+        return sample_moments(self.counts, self.origin)
+
+
+@dataclass(frozen=True)
+class PixelSamples:
+    """The same pixels under one or several exposures.
+
+    Attributes:
+        samples: the first is the one whose quanta exposure is asked for.
+        adc_limits: first and last code of the ADC, DN, where known.
+    """
+
+    samples: tuple[Sample, ...]
+    adc_limits: tuple[int, int] | None = None
+
+    @property
+    def n_pixels(self) -> int:
+        """Number of pixels."""
+        return int(self.samples[0].origin.size)
+
+    def by_brightness(self) -> list[int]:
+        """Return the samples' numbers from the darkest to the brightest, by the median pixel."""
+        means = [sample.moments().mean for sample in self.samples]
+        level = [
+            float(np.median(mean[np.isfinite(mean)])) if np.isfinite(mean).any() else 0.0 for mean in means
+        ]
+        return [int(number) for number in np.argsort(level, kind="stable")]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers that the iterative methods need.
+
+    Attributes:
+        em_iterations: largest number of EM steps of the paper's plain form.
+        em_tolerance: relative change of every parameter below which plain EM stops.
+    """
+
+    em_iterations: int = 1000
+    em_tolerance: float = 1e-6
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What a method says of n pixels.
+
+    Attributes:
+        parameters: (H, g, mu, sigma) in e-, e-/DN, DN and DN, shape (n, 4); NaN where there is no answer, for
+            single parameters too.
+        reasons: why pixels have no answer, or a doubtful one: words to number of pixels.
+    """
+
+    parameters: FloatArray
+    reasons: Mapping[str, int] = field(default_factory=dict)
+
+
+def no_estimates(n_pixels: int) -> FloatArray:
+    """Return parameters of pixels without an answer, shape (n_pixels, 4)."""
+    return np.full((n_pixels, 4), np.nan)
+
+
+class Method(ABC):
+    """A way to estimate the parameters of pixels.
+
+    Attributes:
+        name: short name, in tables and files.
+        title: what people call it.
+        source: whose method it is.
+        needs: the samples that it needs.
+        remark: what to know before believing it, one sentence.
+        order: place in tables.
+        sensor_wide: it gives one gain to all pixels, averaged over them.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    source: ClassVar[str]
+    needs: ClassVar[Needs]
+    remark: ClassVar[str]
+    order: ClassVar[int]
+    sensor_wide: ClassVar[bool] = False
+
+    @abstractmethod
+    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+        """Return the estimates of every pixel; no pixel raises."""
+
+    def missing(self, n_samples: int) -> str:
+        """Say what the method lacks with so many samples; empty where it can work."""
+        least = {"one sample": 1, "a dark and a bright sample": 2, "a series of samples": 3}[self.needs]
+        return "" if n_samples >= least else f"needs {self.needs}; this comparison has {n_samples}"
+
+
+_REGISTERED: dict[str, type[Method]] = {}
+
+
+def register_method(method: type[Method]) -> type[Method]:
+    """Register a method under its name.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    other = _REGISTERED.get(method.name)
+    if other is not None and other.__module__ != method.__module__:
+        raise ValueError(
+            f"the method {method.name!r} is registered twice: {other.__module__}, {method.__module__}"
+        )
+    _REGISTERED[method.name] = method
+    return method
+
+
+def registered() -> dict[str, type[Method]]:
+    """Return the methods registered so far, by name."""
+    return dict(_REGISTERED)

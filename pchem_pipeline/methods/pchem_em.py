@@ -1,0 +1,39 @@
+"""PCH-EM as this package runs it, among the other methods."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS
+from pchem_pipeline.model.pchem import fit_histograms
+
+__all__ = ["PchEm"]
+
+
+@register_method
+class PchEm(Method):
+    """Maximum likelihood of one sample: several starts, EM and Newton steps, the neighbours looked at.
+
+    Hendrickson et al. 2023, with the numerical work of :mod:`pchem_pipeline.model.pchem`.
+    """
+
+    name = "pchem_em"
+    title = "PCH-EM (this package)"
+    source = "Hendrickson et al. 2023, with several starts and a Newton finish"
+    needs = "one sample"
+    remark = "above about 0.5 e- of read noise one sample tells little"
+    order = 10
+
+    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+        """Return the fit of the first sample."""
+        sample = pixels.samples[0]
+        result = fit_histograms(sample.counts, sample.origin)
+        parameters = np.stack(
+            [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
+        )
+        failed = result.fit_status[(result.fit_status & int(FAILED)) != 0]
+        reasons = {
+            text: int(np.count_nonzero(failed & int(bit))) for bit, text in MEANINGS.items() if bit & FAILED
+        }
+        return Estimates(parameters, {text: n for text, n in reasons.items() if n})

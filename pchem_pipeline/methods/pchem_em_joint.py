@@ -1,0 +1,44 @@
+"""PCH-EM of several samples at once, as this package runs it, among the other methods."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
+from pchem_pipeline.model.fit_status import FAILED, MEANINGS
+from pchem_pipeline.model.joint import fit_joint
+
+__all__ = ["JointPchEm"]
+
+
+@register_method
+class JointPchEm(Method):
+    """Maximum likelihood of all samples together: one g, mu and sigma, an H for each exposure.
+
+    Multi-sample PCH-EM (Hendrickson et al. 2024, arXiv 2403.04498; IEEE Trans. Electron Devices), with the
+    numerical work of :mod:`pchem_pipeline.model.joint`. The darkest sample is taken for bias frames, as by
+    the other methods that need one.
+    """
+
+    name = "pchem_em_joint"
+    title = "PCH-EM, all samples jointly"
+    source = "Hendrickson et al. 2024, arXiv 2403.04498"
+    needs = "a dark and a bright sample"
+    remark = "the darkest sample is taken for bias frames"
+    order = 12
+
+    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+        """Return the fit of all samples."""
+        darkest = pixels.by_brightness()[0]
+        result = fit_joint(
+            [sample.counts for sample in pixels.samples],
+            [sample.origin for sample in pixels.samples],
+            dark=[number == darkest for number in range(len(pixels.samples))],
+        )
+        exposure = result.quanta_exposure[:, 0]
+        parameters = np.stack([exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1)
+        failed = result.fit_status[(result.fit_status & int(FAILED)) != 0]
+        reasons = {
+            text: int(np.count_nonzero(failed & int(bit))) for bit, text in MEANINGS.items() if bit & FAILED
+        }
+        return Estimates(parameters, {text: n for text, n in reasons.items() if n})

@@ -1,0 +1,139 @@
+"""Loops of plain EM, straight from the paper's update equations, on histograms.
+
+Nothing here is shared with the fit of this package, so that the two can be compared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["em_tile"]
+
+_SMALL = 1e-17  # terms below this share of their sum are left out
+
+
+@njit(nogil=True, cache=True)
+def mean_electrons(x: float, theta: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the posterior mean of k and of k^2 given x, eq. (gamma_nk); theta: (H, 1/g, mu, sigma)."""
+    exposure, step, bias, sigma = theta
+    first = max(0, int(np.rint((x - bias) / step)))
+    along = step / (sigma * sigma)
+    fall = np.exp(-step * along)
+    residual = x - bias - first * step
+    total, one, two = 1.0, float(first), float(first) * first
+    # the ratio of neighbouring terms falls by the same factor at every electron
+    term, ratio, k = 1.0, np.exp((residual - 0.5 * step) * along), first
+    while True:
+        k += 1
+        grow = ratio * exposure / k
+        term *= grow
+        ratio *= fall
+        total += term
+        one += term * k
+        two += term * k * k
+        if grow < 1.0 and term < _SMALL * total:
+            break
+    term, ratio, k = 1.0, np.exp(-(residual + 0.5 * step) * along), first
+    while k > 0:
+        grow = ratio * k / exposure
+        term *= grow
+        ratio *= fall
+        k -= 1
+        total += term
+        one += term * k
+        two += term * k * k
+        if grow < 1.0 and term < _SMALL * total:
+            break
+    return one / total, two / total
+
+
+@njit(nogil=True, cache=True)
+def em_pixel(
+    counts: NDArray[np.integer],
+    theta: NDArray[np.float64],
+    only_light: bool,
+    max_iterations: int,
+    tolerance: float,
+) -> int:
+    """Iterate in place until every parameter changes relatively by less than the tolerance.
+
+    Args:
+        counts: histogram, shape (B,); its bins are the values of x.
+        theta: (H, 1/g, mu, sigma), mu in bins; overwritten.
+        only_light: update H and g only; bias and read noise are known.
+        max_iterations: largest number of steps.
+        tolerance: relative change; that of mu is against sigma.
+
+    Returns:
+        Steps taken; negative where the parameters left the allowed range.
+    """
+    n, mean = 0.0, 0.0
+    for i in range(counts.size):
+        n += counts[i]
+        mean += counts[i] * float(i)
+    mean /= n
+    spread = 0.0
+    for i in range(counts.size):
+        spread += counts[i] * (i - mean) ** 2
+    spread /= n
+    for iteration in range(1, max_iterations + 1):
+        a = b = c = 0.0
+        for i in range(counts.size):
+            if counts[i] > 0:
+                one, two = mean_electrons(float(i), theta)
+                share = counts[i] / n
+                a += share * one
+                b += share * two
+                c += share * one * (i - mean)
+        bias, sigma = theta[2], theta[3]
+        if only_light:
+            step = (c + (mean - bias) * a) / b if b > 0 else -1.0
+        else:
+            step = c / (b - a * a) if b > a * a else -1.0
+            bias = mean - a * step
+            variance = spread - (b - a * a) * step * step
+            sigma = np.sqrt(variance) if variance > 0 else -1.0
+        if not (step > 0 and sigma > 0 and 1e-9 < a < 1e6 and step < 1e6):
+            return -iteration
+        change = max(
+            abs(a / theta[0] - 1),
+            abs(step / theta[1] - 1),
+            abs(bias - theta[2]) / sigma,
+            abs(sigma / theta[3] - 1),
+        )
+        theta[0], theta[1], theta[2], theta[3] = a, step, bias, sigma
+        if change < tolerance:
+            return iteration
+    return max_iterations
+
+
+@njit(nogil=True, cache=True)
+def em_tile(
+    counts: NDArray[np.integer],
+    parameters: NDArray[np.float64],
+    only_light: bool,
+    max_iterations: int,
+    tolerance: float,
+    steps: NDArray[np.int64],
+) -> None:
+    """Run :func:`em_pixel` on every pixel that has a start; the others get NaN and 0 steps.
+
+    Args:
+        counts: shape (n, B).
+        parameters: (H, 1/g, mu, sigma), mu in bins, shape (n, 4); overwritten.
+        only_light: update H and g only.
+        max_iterations: largest number of steps.
+        tolerance: relative change at which to stop.
+        steps: steps of each pixel, shape (n,), output.
+    """
+    for pixel in range(counts.shape[0]):
+        start = parameters[pixel]
+        usable = start[0] > 0 and start[1] > 0 and start[3] > 0 and np.isfinite(start).all()
+        if usable and counts[pixel].sum() > 0:
+            steps[pixel] = em_pixel(counts[pixel], start, only_light, max_iterations, tolerance)
+        else:
+            steps[pixel] = 0
+        if steps[pixel] <= 0:
+            start[:] = np.nan

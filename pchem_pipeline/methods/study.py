@@ -1,0 +1,113 @@
+"""How the error of the gain grows with the read noise, for every method, on simulated pixels.
+
+All methods are given the same number of frames: one sample has all of them, a dark and a bright sample half
+each, a series (dark, half and full exposure) a third each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
+from pchem_pipeline.methods.compare import MethodResult, compare
+from pchem_pipeline.methods.photon_transfer import gain_variance
+from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.model.drawn_histograms import draw_histograms
+from pchem_pipeline.model.expected_information import (
+    expected_information,
+    inverse_information,
+    shared_information,
+)
+
+__all__ = ["SHARES", "StudyPoint", "study_point"]
+
+#: Exposures of the samples in units of H, by what a method needs; frames are shared evenly.
+SHARES: dict[str, tuple[float, ...]] = {
+    "one sample": (1.0,),
+    "a dark and a bright sample": (1.0, 0.0),
+    "a series of samples": (1.0, 0.0, 0.5),
+}
+
+
+@dataclass(frozen=True)
+class StudyPoint:
+    """Where and with what to simulate.
+
+    Attributes:
+        read_noise_e: s_e, e-, quantisation included.
+        quanta_exposure: H of the bright sample, e-.
+        conversion_gain: g, e-/DN.
+        n_frames: frames of a pixel, all samples together.
+        n_pixels: pixels to simulate.
+        seed: of the random numbers.
+    """
+
+    read_noise_e: float
+    quanta_exposure: float
+    conversion_gain: float
+    n_frames: int
+    n_pixels: int
+    seed: int
+
+
+def study_point(point: StudyPoint, settings: Settings) -> dict[str, Any]:
+    """Return errors of all methods at one read noise, and the bounds there, as plain data.
+
+    Methods that give one gain to the whole sensor are left out: they average over pixels.
+
+    Args:
+        point: what to simulate.
+        settings: of the iterative methods.
+    """
+    results: list[MethodResult] = []
+    for number, (needs, exposures) in enumerate(SHARES.items()):
+        names = [n for n, m in methods().items() if m.needs == needs and not m.sensor_wide]
+        rng = np.random.default_rng([point.seed, number, round(1e6 * point.read_noise_e)])
+        frames = max(point.n_frames // len(exposures), 4)
+        drawn = [
+            draw_histograms(
+                rng,
+                np.full(point.n_pixels, share * point.quanta_exposure),
+                point.conversion_gain,
+                # pixels differ in where a DN begins
+                100.0 + rng.random(point.n_pixels),
+                max(point.read_noise_e, point.conversion_gain / np.sqrt(12.0)),
+                frames,
+            )
+            for share in exposures[:1]
+        ]
+        truth = drawn[0].truth
+        drawn += [
+            draw_histograms(
+                rng,
+                share * point.quanta_exposure,
+                truth[:, 1],
+                truth[:, 2],
+                truth[:, 1] * truth[:, 3],
+                frames,
+            )
+            for share in exposures[1:]
+        ]
+        pixels = PixelSamples(tuple(Sample(one.counts, one.origin) for one in drawn))
+        results += compare(pixels, truth, settings, only=names)
+    order = list(methods())
+    results.sort(key=lambda result: order.index(result.name))
+    return {
+        "read_noise_e": point.read_noise_e,
+        "bounds": _gain_bounds(point),
+        "methods": {result.name: result.as_json() for result in results},
+    }
+
+
+def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
+    """Return the smallest relative errors of g: one sample, dark and bright, and photon transfer's own."""
+    exposure, noise, n = point.quanta_exposure, point.read_noise_e, float(point.n_frames)
+    one = inverse_information(expected_information(exposure, noise) * n)[1, 1]
+    two = shared_information(exposure, noise) + shared_information(0.0, noise)
+    both = inverse_information(two * (n / 2))[0, 0]
+    transfer = gain_variance(exposure, 0.0, noise, n / 2, n / 2)
+    found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
+    return {name: float(np.sqrt(value)) if np.isfinite(value) else None for name, value in found.items()}

@@ -1,0 +1,1 @@
+"""How many frames are enough, at which exposure, and how to divide them, from the Cramer-Rao bound."""

@@ -1,0 +1,115 @@
+"""Frames that one sample needs, the precision that frames give, and the best exposure."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pchem_pipeline.model.expected_information import expected_information, inverse_information
+from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.planning.targets import TARGET_NAMES, Target
+
+__all__ = ["best_exposure", "exposure_grid", "frames_grid", "frames_needed", "precision"]
+
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@functools.lru_cache(maxsize=8192)
+def _bound(exposure: float, noise: float) -> FloatArray:
+    """Return the smallest covariance from one frame; do not change it."""
+    return inverse_information(expected_information(exposure, noise))
+
+
+def frames_needed(target: Target, point: Point, shift: float = 0.0) -> float:
+    """Return the number of frames with which one sample reaches a target, by the Cramer-Rao bound.
+
+    Args:
+        target: what is wanted.
+        point: the pixel.
+        shift: systematic error of the parameter, in the unit of ``target.wanted``, which frames do not lower.
+
+    Returns:
+        Frames, whole; infinite where no number of them reaches it.
+    """
+    gradient = target.gradient(point)
+    variance = float(gradient @ _bound(point.quanta_exposure, point.read_noise_e) @ gradient)
+    room = target.wanted(point) ** 2 - shift**2
+    if not np.isfinite(variance) or room <= 0:
+        return float("inf")
+    return float(np.ceil(max(variance / room, 1.0)))
+
+
+def precision(point: Point, n_frames: float) -> dict[str, float]:
+    """Return the smallest standard deviations from so many frames: relative, that of the bias in e-.
+
+    Args:
+        point: the pixel.
+        n_frames: frames of one sample.
+
+    Returns:
+        By parameter of :data:`~pchem_pipeline.planning.targets.TARGET_NAMES`; NaN where frames do not tell.
+    """
+    covariance = _bound(point.quanta_exposure, point.read_noise_e) / n_frames
+    found = {}
+    for name, units in TARGET_NAMES.items():
+        gradient = Target(name, 1.0, units[0]).gradient(point)
+        found[name] = float(np.sqrt(gradient @ covariance @ gradient))
+    return found
+
+
+def exposure_grid(low: float, high: float, n: int) -> FloatArray:
+    """Return exposures evenly spaced in their logarithm."""
+    return np.asarray(np.geomspace(low, high, n))
+
+
+def best_exposure(targets: Sequence[Target], point: Point, low: float, high: float) -> tuple[float, float]:
+    """Return the exposure at which one sample needs the fewest frames for all targets.
+
+    Args:
+        targets: what is wanted.
+        point: the pixel; its own exposure does not matter.
+        low: smallest exposure allowed, e-.
+        high: largest exposure allowed, e-.
+
+    Returns:
+        H (e-) and frames; the frames are infinite where no exposure reaches the targets.
+    """
+
+    def needed(log_exposure: float) -> float:
+        there = replace(point, quanta_exposure=float(np.exp(log_exposure)))
+        return max(frames_needed(target, there) for target in targets)
+
+    grid = np.log(exposure_grid(low, high, 25))
+    values = np.array([needed(x) for x in grid])
+    best = int(np.argmin(values))
+    if not np.isfinite(values[best]):
+        return float("nan"), float("inf")
+    left, right = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+    for _ in range(18):
+        a, b = right - _GOLDEN * (right - left), left + _GOLDEN * (right - left)
+        left, right = (left, b) if needed(a) <= needed(b) else (a, right)
+    ends = [grid[best], 0.5 * (left + right)]
+    found = min(ends, key=needed)
+    return float(np.exp(found)), needed(found)
+
+
+def frames_grid(
+    target: Target, exposures: FloatArray, read_noises: FloatArray, conversion_gain: float
+) -> FloatArray:
+    """Return the frames needed over a grid, shape (read noises, exposures); infinite where none suffice.
+
+    Args:
+        target: what is wanted.
+        exposures: H, e-.
+        read_noises: s_e, e-.
+        conversion_gain: g, e-/DN, for targets in DN.
+    """
+    return np.array(
+        [
+            [frames_needed(target, Point(float(h), float(s), conversion_gain)) for h in exposures]
+            for s in read_noises
+        ]
+    )

@@ -1,0 +1,255 @@
+"""A plan: frames, exposure and samples that reach what is wanted, or the reason why none do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
+from pchem_pipeline.planning.likelihood_limits import ambiguity, rounding_shift
+from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
+from pchem_pipeline.planning.targets import Target
+
+__all__ = ["LEAST_SHARE", "Need", "Plan", "SamplesPlan", "plan_one_sample", "plan_samples"]
+
+#: Parameters that are an electron off where the electron numbers are.
+_COUNTED = ("quanta_exposure", "dark_current", "bias")
+#: Without so much knowledge of the gain, the bound says nothing about real fits.
+_SEEN = Target("conversion_gain", 25.0, "%")
+_BISECTIONS = 7
+#: Smaller shares are not worth a sample.
+LEAST_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class Need:
+    """What one target asks for.
+
+    Attributes:
+        target: what is wanted.
+        bound: frames by the Cramer-Rao bound.
+        certain: frames until electron numbers are not off by one; 0 where that does not matter.
+        seen: frames until the gain is known to a quarter, below which one Gaussian fits as well.
+        shift: systematic error by rounding; relative, of the bias in e-.
+    """
+
+    target: Target
+    bound: float
+    certain: float
+    seen: float
+    shift: float
+
+    @property
+    def frames(self) -> float:
+        """Frames for all of it."""
+        return max(self.bound, self.certain, self.seen)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One sample.
+
+    Attributes:
+        point: exposure, read noise and gain.
+        needs: one a target.
+        frames: that reach all targets; those of the budget where there is none.
+        precision: standard deviations with these frames, by parameter; relative, of the bias in e-.
+        best_exposure: H with which the targets need the fewest frames, e-.
+        best_frames: these frames.
+    """
+
+    point: Point
+    needs: tuple[Need, ...]
+    frames: float
+    precision: dict[str, float]
+    best_exposure: float
+    best_frames: float
+
+
+@dataclass(frozen=True)
+class SamplesPlan:
+    """Several samples.
+
+    Attributes:
+        point: read noise and gain.
+        split: exposures, shares and frames in total by the bound.
+        even: frames in total with the same exposures and even shares.
+        certain: frames in total until electron numbers are not off by one.
+        frames: in total, for both.
+        per_sample: frames of each sample.
+    """
+
+    point: Point
+    split: Split
+    even: float
+    certain: float
+    frames: float
+    per_sample: tuple[int, ...]
+
+
+def plan_one_sample(
+    targets: Sequence[Target],
+    point: Point,
+    *,
+    exposure_given: bool,
+    budget: int | None,
+    max_exposure: float,
+    max_frames: float,
+) -> Plan:
+    """Return the plan of one sample.
+
+    Args:
+        targets: what is wanted; may be empty with a budget.
+        point: the pixel; its exposure counts if it was given.
+        exposure_given: else the best exposure is taken.
+        budget: frames there are, or None.
+        max_exposure: largest exposure allowed, e-.
+        max_frames: more frames than these are as good as never.
+
+    Raises:
+        ConfigError: a target that no number of frames reaches.
+    """
+    aims = tuple(targets) or (Target("conversion_gain", 1.0, "%"),)
+    best, best_frames = _best(aims, point, max_exposure, budget)
+    if not exposure_given:
+        if not np.isfinite(best):
+            raise ConfigError(_hopeless(aims[0], point, "at any exposure", ""))
+        point = replace(point, quanta_exposure=best)
+    shifts = rounding_shift(point)
+    needs = tuple(_need(target, point, shifts) for target in targets)
+    for need in needs:
+        _refuse(need, point, max_frames, best, best_frames)
+    frames = float(budget) if budget is not None else max(need.frames for need in needs)
+    return Plan(point, needs, frames, precision(point, frames), best, best_frames)
+
+
+def _need(target: Target, point: Point, shifts: FloatArray) -> Need:
+    shift = abs(float(target.gradient(point) @ shifts))
+    certain = 0.0
+    if target.name in _COUNTED:
+        certain = ambiguity([point.quanta_exposure], [1.0], point.read_noise_e).frames()
+    return Need(target, frames_needed(target, point, shift), certain, frames_needed(_SEEN, point), shift)
+
+
+def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frames: float) -> None:
+    """Say in one line that a target is out of reach, and what would help.
+
+    Raises:
+        ConfigError: it is.
+    """
+    target = need.target
+    wanted = target.wanted(point)
+    if need.shift >= wanted:
+        unit = "e-" if target.name == "bias" else "%"
+        size = need.shift if target.name == "bias" else 100 * need.shift
+        raise ConfigError(
+            f"{target}: no number of frames reaches it: rounding to whole DN alone shifts it by "
+            f"{size:.2g} {unit} at {point.conversion_gain:g} e-/DN; "
+            "use a camera setting with fewer electrons per DN"
+        )
+    if need.frames > max_frames:
+        cure = ""
+        if best_frames <= max_frames and best_frames < 0.5 * need.frames:
+            cure = f"; an exposure of {best:.3g} e- needs {best_frames:,.0f}"
+        elif target.shared:
+            several = best_samples([target, _SEEN], point, max(point.quanta_exposure, 1.0))
+            if several.frames <= max_frames:
+                cure = f"; several samples (--samples best) need {several.frames:,.0f}"
+        asked = (
+            f"the bound asks for {need.frames:,.3g}"
+            if np.isfinite(need.frames)
+            else "they tell nothing of it"
+        )
+        raise ConfigError(
+            _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({asked}){cure}")
+        )
+
+
+def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
+    return (
+        f"{target}: no number of frames of one sample within --max-frames reaches it {where} "
+        f"and a read noise of {point.read_noise_e:g} e-{more}"
+    )
+
+
+def _best(
+    targets: Sequence[Target], point: Point, max_exposure: float, budget: int | None
+) -> tuple[float, float]:
+    """Return the best exposure and its frames; electron numbers must be certain where a target needs them."""
+    low = min(0.02, 0.1 * max_exposure)
+    targets = (*targets, _SEEN)
+    exposure, frames = best_exposure(targets, point, low, max_exposure)
+    if not np.isfinite(exposure) or not any(target.name in _COUNTED for target in targets):
+        return exposure, frames
+
+    def both(h: float) -> tuple[float, float]:
+        there = replace(point, quanta_exposure=h)
+        bound = max(frames_needed(target, there) for target in targets)
+        return bound, ambiguity([h], [1.0], point.read_noise_e).frames()
+
+    # the bound falls with the exposure up to its best, and certainty costs more and more frames
+    left, right = np.log(low), np.log(exposure)
+    bound, certain = both(exposure)
+    if certain <= max(bound, float(budget or 0)):
+        return exposure, max(bound, certain)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (left + right)
+        bound, certain = both(float(np.exp(middle)))
+        left, right = (middle, right) if certain <= max(bound, float(budget or 0)) else (left, middle)
+    found = float(np.exp(left))
+    return found, max(both(found))
+
+
+def plan_samples(
+    targets: Sequence[Target],
+    exposures: Sequence[float] | None,
+    point: Point,
+    *,
+    budget: int | None,
+    max_exposure: float,
+    max_frames: float,
+) -> SamplesPlan:
+    """Return how to divide frames over several samples.
+
+    Args:
+        targets: gain, bias or read noise.
+        exposures: H of the samples, e-; None to choose them.
+        point: read noise and gain of the pixel.
+        budget: frames in total, or None for as many as the targets need.
+        max_exposure: largest exposure to choose, e-.
+        max_frames: more frames than these are as good as never.
+
+    Raises:
+        ConfigError: a target that no number of frames reaches.
+    """
+    aims = (*targets, _SEEN)
+    if exposures is None:
+        split = best_samples(aims, point, max_exposure)
+    else:
+        split = best_split(aims, exposures, point)
+    # too few frames to be worth a sample of their own
+    kept = [(h, p) for h, p in zip(split.exposures, split.shares, strict=True) if p > LEAST_SHARE]
+    certain = (
+        ambiguity([h for h, _ in kept], [p for _, p in kept], point.read_noise_e).frames()
+        if _lit(kept)
+        else 0.0
+    )
+    frames = max(split.frames, certain)
+    if frames > max_frames:
+        lights = ", ".join(f"{h:g}" for h in split.exposures)
+        raise ConfigError(
+            f"{targets[0]}: no number of frames within --max-frames reaches it with samples of {lights} e- "
+            f"and a read noise of {point.read_noise_e:g} e-; give other exposures, one of them with electrons"
+        )
+    total = float(budget) if budget is not None else frames
+    even = split_frames(aims, split.exposures, [1.0 / len(split.shares)] * len(split.shares), point)
+    per_sample = tuple(int(np.ceil(share * total)) if share > LEAST_SHARE else 0 for share in split.shares)
+    return SamplesPlan(point, split, even, certain, total, per_sample)
+
+
+def _lit(samples: Sequence[tuple[float, float]]) -> bool:
+    return any(exposure > 0 for exposure, _ in samples)

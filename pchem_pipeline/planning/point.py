@@ -1,0 +1,53 @@
+"""A pixel under one exposure, as planning sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.errors import ConfigError
+
+__all__ = ["FloatArray", "Point"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Point:
+    """What is known of the pixel.
+
+    Attributes:
+        quanta_exposure: H, e-.
+        read_noise_e: s_e, e-, quantisation included.
+        conversion_gain: g, e-/DN; matters for rounding and for units of DN only.
+
+    Raises:
+        ConfigError: a number is out of range, or the read noise is below that of rounding.
+    """
+
+    quanta_exposure: float
+    read_noise_e: float
+    conversion_gain: float
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "--exposure": (self.quanta_exposure, 1e-6, 1e4, "e-"),
+            "--read-noise": (self.read_noise_e, 1e-3, 100.0, "e-"),
+            "--gain": (self.conversion_gain, 1e-6, 1e2, "e-/DN"),
+        }
+        for option, (value, low, high, unit) in ranges.items():
+            if not low <= value <= high:
+                raise ConfigError(f"{option} {value:g}: give a number of {low:g} to {high:g} {unit}")
+        if self.read_noise_e < self.conversion_gain / np.sqrt(12.0):
+            raise ConfigError(
+                f"--read-noise {self.read_noise_e:g}: below that of rounding to whole DN, "
+                f"{self.conversion_gain / np.sqrt(12.0):.3g} e- at {self.conversion_gain:g} e-/DN; "
+                "it includes the rounding"
+            )
+
+    @property
+    def read_noise_dn(self) -> float:
+        """Sigma, DN."""
+        return self.read_noise_e / self.conversion_gain

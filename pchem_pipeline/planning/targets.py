@@ -1,0 +1,105 @@
+"""What is wanted: a parameter and how well it shall be known."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.planning.point import FloatArray, Point
+
+__all__ = ["TARGET_NAMES", "Target", "parse_target"]
+
+#: Parameters that can be planned for, with the units in which a precision can be given.
+TARGET_NAMES: dict[str, tuple[str, ...]] = {
+    "quanta_exposure": ("%", "e-"),
+    "dark_current": ("%",),
+    "conversion_gain": ("%", "e-/DN"),
+    "bias": ("e-", "DN"),
+    "read_noise_dn": ("%", "DN"),
+    "read_noise_e": ("%", "e-"),
+}
+_EXAMPLE = {"%": "1%", "e-": "0.02e-", "DN": "0.2DN", "e-/DN": "0.001e-/DN"}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A precision: one standard deviation of a parameter of one pixel.
+
+    Attributes:
+        name: of :data:`TARGET_NAMES`.
+        value: the number, in its unit.
+        unit: ``%``, ``e-``, ``DN`` or ``e-/DN``.
+    """
+
+    name: str
+    value: float
+    unit: str
+
+    def __str__(self) -> str:
+        """Return e.g. ``conversion_gain to 1 %``."""
+        return f"{self.name} to {self.value:g} {self.unit}"
+
+    @property
+    def shared(self) -> bool:
+        """Whether all samples of a pixel share the parameter."""
+        return self.name not in ("quanta_exposure", "dark_current")
+
+    def gradient(self, point: Point) -> FloatArray:
+        """Return the derivative of the parameter by the coordinates of the information, shape (4,).
+
+        Relative for all but the bias, which is in e-.
+        """
+        return {
+            "quanta_exposure": np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0]),
+            "dark_current": np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0]),
+            "conversion_gain": np.array([0.0, 1.0, 0.0, 0.0]),
+            "bias": np.array([0.0, 0.0, 1.0, 0.0]),
+            "read_noise_dn": np.array([0.0, 0.0, 0.0, 1.0]),
+            "read_noise_e": np.array([0.0, 1.0, 0.0, 1.0]),
+        }[self.name]
+
+    def wanted(self, point: Point) -> float:
+        """Return the standard deviation wanted: relative, that of the bias in e-."""
+        gain, noise = point.conversion_gain, point.read_noise_e
+        scale = {
+            ("quanta_exposure", "e-"): 1.0 / point.quanta_exposure,
+            ("conversion_gain", "e-/DN"): 1.0 / gain,
+            ("bias", "e-"): 1.0,
+            ("bias", "DN"): gain,
+            ("read_noise_dn", "DN"): gain / noise,
+            ("read_noise_e", "e-"): 1.0 / noise,
+        }
+        return self.value * scale.get((self.name, self.unit), 0.01)
+
+
+def parse_target(text: str) -> Target:
+    """Return the target of ``name=value`` with a unit, such as ``conversion_gain=1%`` or ``bias=0.02e-``.
+
+    Raises:
+        ConfigError: the name or the unit is unknown, or the value is not above 0.
+    """
+    name, _, rest = text.partition("=")
+    name = name.strip()
+    if name not in TARGET_NAMES:
+        close = difflib.get_close_matches(name, TARGET_NAMES, 1)
+        hint = f"; did you mean {close[0]}?" if close else f"; choose from {', '.join(TARGET_NAMES)}"
+        raise ConfigError(f"--target {text}: {name or 'nothing'} is no parameter{hint}")
+    units = TARGET_NAMES[name]
+    example = f"{name}={_EXAMPLE[units[0]]}"
+    match = re.fullmatch(r"\s*([0-9.+\-]+(?:[eE][+\-]?[0-9]+)?)\s*(%|e-/DN|e-|DN)\s*", rest)
+    try:
+        value = float(match[1]) if match else math.nan
+    except ValueError:
+        value = math.nan
+    if match is None or not math.isfinite(value) or match[2] not in units:
+        raise ConfigError(f"--target {text}: give a number in {' or '.join(units)}, such as {example}")
+    if value <= 0:
+        raise ConfigError(
+            f"--target {text}: no number of frames reaches it; give a number above 0, such as {example}"
+        )
+    return Target(name, value, match[2])

@@ -1,0 +1,152 @@
+"""Check a plan by Monte Carlo: simulate pixels with so many frames, fit them, and look at their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.drawn_histograms import draw_histograms
+from pchem_pipeline.model.fit_status import FAILED, FitStatus
+from pchem_pipeline.model.joint import fit_joint
+from pchem_pipeline.model.pchem import fit_histograms
+from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.planning.targets import Target
+
+__all__ = ["Check", "Verification", "verify", "verify_samples"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One target after the simulation; numbers are relative, of the bias in e-.
+
+    Attributes:
+        target: what was wanted.
+        wanted: standard deviation wanted.
+        rmse: root mean square error of the fitted pixels.
+        rmse_stderr: its standard error.
+        robust_sd: 1.4826 times the median absolute error; a few pixels far off do not move it.
+    """
+
+    target: Target
+    wanted: float
+    rmse: float
+    rmse_stderr: float
+    robust_sd: float
+
+    @property
+    def reached(self) -> bool:
+        """Whether the error is what was wanted, within two standard errors of the simulation."""
+        return self.rmse <= self.wanted + 2 * self.rmse_stderr
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Outcome of a simulation.
+
+    Attributes:
+        n_frames: frames of each pixel.
+        n_pixels: simulated pixels.
+        n_failed: of them without a value.
+        n_ambiguous: of them flagged as ambiguous in the bias.
+        checks: one a target.
+    """
+
+    n_frames: int
+    n_pixels: int
+    n_failed: int
+    n_ambiguous: int
+    checks: tuple[Check, ...]
+
+
+def verify(targets: Sequence[Target], point: Point, n_frames: int, n_pixels: int, seed: int) -> Verification:
+    """Simulate pixels that differ in where their bias lies between two DN, and fit them.
+
+    Args:
+        targets: what was wanted.
+        point: the pixel.
+        n_frames: frames of each pixel.
+        n_pixels: pixels to simulate.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    bias = 100.0 + rng.random(n_pixels)
+    drawn = draw_histograms(
+        rng, point.quanta_exposure, point.conversion_gain, bias, point.read_noise_e, n_frames
+    )
+    fit = fit_histograms(drawn.counts, drawn.origin)
+    found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+    return _outcome(targets, point, _errors(found, drawn.truth), fit.fit_status, n_frames)
+
+
+def _outcome(
+    targets: Sequence[Target],
+    point: Point,
+    errors: FloatArray,
+    words: NDArray[np.uint16],
+    n_frames: int,
+) -> Verification:
+    """Return what the errors of the fitted pixels say about the targets."""
+    return Verification(
+        n_frames,
+        words.size,
+        int(np.count_nonzero(words & int(FAILED))),
+        int(np.count_nonzero(words & int(FitStatus.BIAS_AMBIGUOUS))),
+        tuple(_check(target, point, errors) for target in targets),
+    )
+
+
+def _check(target: Target, point: Point, errors: FloatArray) -> Check:
+    gradient = target.gradient(point)
+    gradient[0] *= point.quanta_exposure
+    values = errors @ gradient
+    values = values[np.isfinite(values)]
+    if values.size < 2:
+        return Check(target, target.wanted(point), float("nan"), float("nan"), float("nan"))
+    square = values**2
+    root = float(np.sqrt(square.mean()))
+    spread = float(square.std(ddof=1) / np.sqrt(square.size))
+    robust = float(1.4826 * np.median(np.abs(values)))
+    return Check(target, target.wanted(point), root, spread / (2 * root), robust)
+
+
+def verify_samples(
+    targets: Sequence[Target],
+    point: Point,
+    exposures: Sequence[float],
+    frames: Sequence[int],
+    n_pixels: int,
+    seed: int,
+) -> Verification:
+    """Simulate pixels under several exposures, and fit all samples jointly.
+
+    Args:
+        targets: what was wanted, of what the samples share.
+        point: read noise and gain of the pixel.
+        exposures: H of the samples, e-; 0 for bias frames.
+        frames: of each sample, above 0.
+        n_pixels: pixels to simulate.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    bias = 100.0 + rng.random(n_pixels)
+    drawn = [
+        draw_histograms(rng, h, point.conversion_gain, bias, point.read_noise_e, n)
+        for h, n in zip(exposures, frames, strict=True)
+    ]
+    fit = fit_joint([d.counts for d in drawn], [d.origin for d in drawn], dark=[h == 0 for h in exposures])
+    brightest = int(np.argmax(exposures))
+    found = np.stack(
+        [fit.quanta_exposure[:, brightest], fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1
+    )
+    errors = _errors(found, drawn[brightest].truth)
+    return _outcome(targets, point, errors, fit.fit_status, sum(frames))
+
+
+def _errors(found: FloatArray, truth: FloatArray) -> FloatArray:
+    """Return the errors of (H, g, mu, sigma): relative, of mu in e-."""
+    errors = found / truth - 1
+    errors[:, 2] = (found[:, 2] - truth[:, 2]) * truth[:, 1]
+    return errors

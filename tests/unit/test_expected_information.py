@@ -1,0 +1,106 @@
+"""Expected information against another formula, against plain differentiation, and in its limits."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm, poisson
+
+from pchem_pipeline.methods.photon_transfer import gain_variance
+from pchem_pipeline.model.expected_information import (
+    expected_information,
+    inverse_information,
+    shared_information,
+)
+from pchem_pipeline.model.fisher import cramer_rao
+
+POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
+
+
+def density(y, theta):
+    """The PCD in electrons, written down from scipy; theta: H, ln g, g mu, ln sigma about g = 1."""
+    exposure, log_gain, bias, log_sigma = theta
+    k = np.arange(60)
+    return float(poisson.pmf(k, exposure) @ norm.pdf(y, bias + k * np.exp(-log_gain), np.exp(log_sigma)))
+
+
+@pytest.mark.parametrize(("exposure", "noise"), POINTS)
+def test_bound_agrees_with_louis_formula(exposure, noise):
+    gain = 0.1
+    ours = inverse_information(expected_information(exposure, noise))
+    louis = cramer_rao(exposure, gain, noise / gain, 1.0)
+    scale = np.array([1.0, 1 / gain, gain, gain / noise])
+    np.testing.assert_allclose(ours, louis * np.outer(scale, scale), rtol=2e-5, atol=2e-5 * ours.max())
+
+
+def test_information_agrees_with_a_plain_integral():
+    exposure, noise, step = 1.3, 0.35, 1e-4
+    theta = np.array([exposure, 0.0, 0.0, np.log(noise)])
+
+    def scores(y):
+        return np.array(
+            [
+                (np.log(density(y, theta + d)) - np.log(density(y, theta - d))) / (2 * step)
+                for d in step * np.eye(4)
+            ]
+        )
+
+    found = expected_information(exposure, noise)
+    for i, j in [(0, 0), (1, 1), (1, 2), (2, 3)]:
+
+        def integrand(y, i=i, j=j):
+            s = scores(y)
+            return density(y, theta) * s[i] * s[j]
+
+        edges = np.arange(-2.5, 11.6, 1.0)
+        whole = sum(quad(integrand, a, b, epsabs=1e-9, epsrel=1e-7)[0] for a, b in itertools.pairwise(edges))
+        assert found[i, j] == pytest.approx(whole, rel=2e-5, abs=2e-5)
+
+
+def test_few_electrons_leave_one_gaussian():
+    """Bias frames are one Gaussian; electrons that are rare but not ruled out cost a known part.
+
+    The score of H at 0 is ``f_1 / f_0 - 1`` with variance ``exp(1 / s^2) - 1``; its covariance with the
+    scores of bias and ln sigma is their mean under f_1, ``1 / s^2``.
+    """
+    noise = 0.5
+    bias_frames = np.diag([0.0, 1 / noise**2, 2.0])
+    np.testing.assert_allclose(shared_information(0.0, noise), bias_frames)
+    cost = noise**-4 / np.expm1(noise**-2)
+    expected = bias_frames - np.array([[0, 0, 0], [0, 1, 1], [0, 1, 1]]) * cost
+    np.testing.assert_allclose(shared_information(1e-9, noise), expected, atol=2e-5)
+
+
+def test_samples_add_up_with_an_exposure_each():
+    """The Schur complements against the whole matrix of (H1, H2, ln g, g mu, ln sigma)."""
+    noise, lights, frames = 0.5, (1.0, 6.0), (300.0, 700.0)
+    whole = np.zeros((5, 5))
+    for number, (exposure, n) in enumerate(zip(lights, frames, strict=True)):
+        index = [number, 2, 3, 4]
+        whole[np.ix_(index, index)] += n * expected_information(exposure, noise)
+    shared = sum(n * shared_information(h, noise) for h, n in zip(lights, frames, strict=True))
+    np.testing.assert_allclose(inverse_information(shared), np.linalg.inv(whole)[2:, 2:], rtol=1e-9)
+
+
+def test_photon_transfer_is_all_there_is_to_know_at_large_read_noise():
+    """Where peaks are gone and electrons many, means and variances tell all: the bound meets PT's."""
+    exposure, noise = 12.0, 2.0
+    shared = 0.5 * (shared_information(exposure, noise) + shared_information(0.0, noise))
+    bound = inverse_information(shared)[0, 0]
+    transfer = gain_variance(exposure, 0.0, noise, 0.5, 0.5)
+    assert bound < transfer
+    assert bound == pytest.approx(transfer, rel=0.1)
+    peaks = 0.5 * (shared_information(exposure, 0.3) + shared_information(0.0, 0.3))
+    assert inverse_information(peaks)[0, 0] < 0.02 * gain_variance(exposure, 0.0, 0.3, 0.5, 0.5)
+
+
+@pytest.mark.parametrize("arguments", [(0.0, 0.3), (2.0, 0.0), (np.nan, 0.3), (2.0, np.inf), (-1.0, 0.3)])
+def test_impossible_pixels_are_refused(arguments):
+    with pytest.raises(ValueError, match="positive"):
+        expected_information(*arguments)
+
+
+def test_singular_information_has_no_inverse():
+    assert np.isnan(inverse_information(np.diag([1.0, 0.0]))).all()
+    assert np.isnan(inverse_information(np.ones((2, 2)))).all()

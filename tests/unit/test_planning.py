@@ -1,0 +1,279 @@
+"""Plans from the bound: against the paper's own numbers, brute force, and what cannot be reached."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.model.expected_information import inverse_information, shared_information
+from pchem_pipeline.planning.frames import best_exposure, frames_grid, frames_needed, precision
+from pchem_pipeline.planning.likelihood_limits import Ambiguity, ambiguity, rounding_shift
+from pchem_pipeline.planning.plan import plan_one_sample, plan_samples
+from pchem_pipeline.planning.point import Point
+from pchem_pipeline.planning.split import best_samples, best_split, split_frames
+from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
+from pchem_pipeline.planning.verify import verify, verify_samples
+from pchem_pipeline.stages.planning import PlanRequest, make_plan
+
+GAIN = 1 / 11
+ONE_PERCENT = parse_target("conversion_gain=1%")
+
+
+def point(exposure=2.0, noise=0.305, gain=GAIN):
+    return Point(exposure, noise, gain)
+
+
+@pytest.mark.parametrize(
+    ("noise", "exposure", "percent"),
+    [(0.2, 2, 0.12), (0.305, 0.1, 1.19), (0.305, 10, 0.16), (0.45, 2, 0.92), (0.5, 10, 0.74), (0.6, 2, 4.22)],
+)
+def test_known_bounds_of_17750_frames(noise, exposure, percent):
+    there = point(exposure, noise)
+    assert 100 * precision(there, 17_750)["conversion_gain"] == pytest.approx(percent, abs=0.006)
+    asked = parse_target(f"conversion_gain={100 * precision(there, 17_750)['conversion_gain']}%")
+    assert frames_needed(asked, there) == pytest.approx(17_750, abs=1.5)
+
+
+def test_units_of_a_target_are_the_same_wish():
+    there = point()
+    for texts in (
+        ("conversion_gain=1%", f"conversion_gain={0.01 * GAIN}e-/DN"),
+        ("bias=0.02e-", "bias=0.22DN"),
+        ("read_noise_e=2%", "read_noise_e=0.0061e-"),
+        ("read_noise_dn=2%", f"read_noise_dn={0.02 * 0.305 * 11}DN"),
+        ("quanta_exposure=5%", "quanta_exposure=0.1e-", "dark_current=5%"),
+    ):
+        frames = {frames_needed(parse_target(text), there) for text in texts}
+        assert max(frames) - min(frames) <= 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("gain=1%", "gain is no parameter"),
+        ("conversion_gian=1%", "did you mean conversion_gain"),
+        ("conversion_gain", "give a number"),
+        ("conversion_gain=1", "give a number in % or e-/DN, such as conversion_gain=1%"),
+        ("bias=1%", "in e- or DN"),
+        ("bias=1.2.3e-", "give a number"),
+        ("bias=0e-", "no number of frames reaches it"),
+        ("read_noise_e=-1%", "no number of frames reaches it"),
+    ],
+)
+def test_a_wrong_target_gets_its_line(text, words):
+    with pytest.raises(ConfigError, match=words):
+        parse_target(text)
+
+
+def test_every_parameter_can_be_planned_for():
+    for name, units in TARGET_NAMES.items():
+        for unit in units:
+            assert 1 < frames_needed(parse_target(f"{name}=0.001{unit}"), point()) < 1e12
+
+
+@pytest.mark.parametrize(("text", "noise"), [("conversion_gain=1%", 0.8), ("read_noise_e=1%", 0.3)])
+def test_best_exposure_is_that_of_a_fine_grid(text, noise):
+    target = parse_target(text)
+    best, frames = best_exposure([target], point(noise=noise), 0.05, 10.0)
+    grid = np.geomspace(0.05, 10, 400)
+    needed = frames_grid(target, grid, np.array([noise]), GAIN)[0]
+    assert best == pytest.approx(grid[np.argmin(needed)], rel=0.1)  # the minimum is flat
+    assert frames <= needed.min() * 1.0001
+    assert 0.05 < best < 10
+
+
+def test_the_gap_to_the_neighbour_is_that_of_fitted_stacks():
+    """Nats at 17,750 frames that fits of simulated stacks have shown: 29, 11, and below 5."""
+    for exposure, noise, nats in ((12, 0.305, 29), (20, 0.305, 11)):
+        assert 17_750 * ambiguity([exposure], [1.0], noise).mean == pytest.approx(nats, abs=0.6)
+    assert 17_750 * ambiguity([5.0], [1.0], 0.5).mean < 5
+    assert 17_750 * ambiguity([2.0], [1.0], 0.305).mean > 300
+    # with bias frames the electron numbers are safe where they were not
+    assert ambiguity([0.0, 12.0], [0.3, 0.7], 0.305).frames() < 0.3 * ambiguity([12.0], [1.0], 0.305).frames()
+
+
+def test_frames_until_a_rival_is_out():
+    found = Ambiguity(0.01, 0.02)
+    n = found.frames()
+    assert n * 0.01 - 3 * np.sqrt(n * 0.02) == pytest.approx(5, abs=0.05)
+    assert Ambiguity(float("inf"), 0.0).frames() == 0
+    assert Ambiguity(0.0, 0.0).frames() == float("inf")
+
+
+def test_rounding_shifts_what_is_coarse_only():
+    assert (rounding_shift(point()) == 0).all()
+    there = replace(point(), conversion_gain=0.7)
+    shift = rounding_shift(there)
+    # known from fits: 0.009 e- of read noise at 0.7 e-/DN
+    assert there.read_noise_e * (shift[1] + shift[3]) == pytest.approx(0.0115, abs=0.003)
+    assert np.abs(rounding_shift(replace(point(), conversion_gain=0.4))).max() < 0.005
+
+
+def brute_force(informations, gradient, steps=60):
+    best = np.inf
+    for shares in itertools.product(range(steps + 1), repeat=len(informations) - 1):
+        if sum(shares) <= steps:
+            p = np.array([*shares, steps - sum(shares)]) / steps
+            covariance = inverse_information(np.einsum("j,jab->ab", p, informations))
+            value = gradient @ covariance @ gradient
+            best = min(best, value) if np.isfinite(value) else best
+    return best
+
+
+def test_the_best_split_is_that_of_brute_force():
+    there = point(noise=0.6)
+    lights = [0.0, 2.0, 8.0]
+    informations = np.stack([shared_information(h, 0.6) for h in lights])
+    for text, gradient in (("conversion_gain=1%", [1, 0, 0]), ("read_noise_e=1%", [1, 0, 1])):
+        target = parse_target(text)
+        split = best_split([target], lights, there)
+        assert sum(split.shares) == pytest.approx(1)
+        assert split.frames == pytest.approx(1e4 * brute_force(informations, np.array(gradient)), rel=2e-3)
+        assert split.frames <= split_frames([target], lights, [1 / 3] * 3, there)
+    both = best_split([ONE_PERCENT, parse_target("read_noise_e=1%")], lights, there)
+    alone = [
+        best_split([parse_target(t)], lights, there).frames for t in ("conversion_gain=1%", "read_noise_e=1%")
+    ]
+    assert max(alone) <= both.frames <= sum(alone)
+
+
+def test_chosen_exposures_are_no_worse_than_given_ones():
+    there = point(noise=0.6)
+    free = best_samples([ONE_PERCENT], there, 8.0)
+    assert free.frames <= best_split([ONE_PERCENT], [0.0, 2.0, 8.0], there).frames * 1.001
+    assert free.exposures[0] == 0
+    assert len(free.exposures) <= 4
+    assert max(free.exposures) <= 8.0001
+
+
+@pytest.mark.parametrize("lights", [[0.0, 0.0], [0.0, -1.0]])
+def test_wrong_samples_get_their_line(lights):
+    with pytest.raises(ConfigError, match="--samples"):
+        best_split([ONE_PERCENT], lights, point())
+
+
+def one(targets, there, *, given=True, budget=None, max_frames=1e7):
+    return plan_one_sample(
+        [parse_target(t) for t in targets],
+        there,
+        exposure_given=given,
+        budget=budget,
+        max_exposure=10.0,
+        max_frames=max_frames,
+    )
+
+
+def test_out_of_reach_says_why_and_what_would_help():
+    with pytest.raises(ConfigError, match=r"rounding to whole DN alone shifts it by 4.\d %"):
+        one(["read_noise_e=1%"], replace(point(), conversion_gain=0.7))
+    with pytest.raises(ConfigError, match=r"the bound asks for .*; several samples \(--samples best\) need"):
+        one(["conversion_gain=1%"], point(2.0, 1.5))
+    with pytest.raises(ConfigError, match=r"an exposure of .* e- needs"):
+        one(["conversion_gain=1%"], point(0.001, 0.3), max_frames=1e5)
+    with pytest.raises(ConfigError, match="no number of frames within --max-frames"):
+        plan_samples([ONE_PERCENT], [0.0, 1e-4], point(), budget=None, max_exposure=1, max_frames=1e7)
+    with pytest.raises(ConfigError, match="several samples are planned for what they share"):
+        plan_samples(
+            [parse_target("quanta_exposure=1%")],
+            [0.0, 1.0],
+            point(),
+            budget=None,
+            max_exposure=1,
+            max_frames=1e7,
+        )
+
+
+def test_electron_numbers_must_be_certain_for_bias_and_exposure_only():
+    plan = one(["conversion_gain=1%", "quanta_exposure=5%"], point(12.0, 0.305))
+    gain, exposure = plan.needs
+    assert gain.certain == 0
+    assert exposure.certain > 10 * exposure.bound
+    assert plan.frames == exposure.certain
+
+
+def test_few_frames_must_show_electrons_at_all():
+    plan = one(["bias=0.09e-"], point(0.05, 0.3))
+    assert plan.frames == plan.needs[0].seen > 5 * plan.needs[0].bound
+
+
+@pytest.mark.parametrize(
+    ("exposure", "noise", "gain"), [(0.0, 0.3, 0.1), (1.0, 0.0, 0.1), (1.0, np.nan, 0.1), (1, 0.2, 1.0)]
+)
+def test_impossible_pixels_get_their_line(exposure, noise, gain):
+    with pytest.raises(ConfigError, match="--"):
+        Point(exposure, noise, gain)
+
+
+def test_the_real_fit_confirms_a_plan():
+    target = parse_target("conversion_gain=0.5%")
+    there = point()
+    n = int(frames_needed(target, there))
+    found = verify([target], there, n, 600, 1)
+    check = found.checks[0]
+    assert (found.n_failed, found.n_frames) == (0, n)
+    assert abs(check.rmse / 0.005 - 1) < 5 / np.sqrt(2 * 600)
+    assert check.rmse_stderr == pytest.approx(0.005 / np.sqrt(1200), rel=0.2)
+    assert check.reached
+    # a tenth of the frames do not do, and it is seen
+    assert not verify([target], there, n // 10, 600, 1).checks[0].reached
+
+
+def test_the_joint_fit_confirms_a_split():
+    there = point(noise=0.6)
+    plan = plan_samples([ONE_PERCENT], [0.0, 8.0], there, budget=None, max_exposure=8, max_frames=1e7)
+    found = verify_samples([ONE_PERCENT], there, plan.split.exposures, plan.per_sample, 300, 1)
+    assert abs(found.checks[0].rmse / 0.01 - 1) < 5 / np.sqrt(2 * 300)
+    half = [n // 4 for n in plan.per_sample]
+    assert not verify_samples([ONE_PERCENT], there, plan.split.exposures, half, 300, 1).checks[0].reached
+
+
+def test_the_command_in_words_and_files(tmp_path):
+    request = PlanRequest(
+        read_noise_e=0.3,
+        quanta_exposure=2.0,
+        targets=("conversion_gain=1%",),
+        verify=True,
+        pixels=100,
+        figure=tmp_path / "plan.svg",
+        json=tmp_path / "plan.json",
+    )
+    text = make_plan(request)
+    content = json.loads((tmp_path / "plan.json").read_text())
+    assert f"{content['frames']:,.0f} frames" in text
+    assert content["frames"] == frames_needed(ONE_PERCENT, Point(2.0, 0.3, 0.09))
+    assert content["verified"][0]["frames"] == content["frames"]
+    assert (tmp_path / "plan.svg").read_bytes().startswith(b"<?xml")
+    assert "best exposure" in text
+
+
+def test_the_command_for_samples_and_budgets():
+    text = make_plan(
+        PlanRequest(read_noise_e=0.6, samples="0,2,8", targets=("conversion_gain=1%",), frames=5000)
+    )
+    assert "3 samples" in text
+    assert "evenly divided" in text
+    text = make_plan(PlanRequest(read_noise_e=0.3, frames=2000, targets=("bias=0.02e-",)))
+    assert "(the best)" in text
+    assert "2,000 frames are enough" in text
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, "--read-noise is missing"),
+        ({"read_noise_e": 0.3}, "--target is missing"),
+        ({"read_noise_e": 0.3, "samples": "2", "targets": ("bias=1DN",)}, "two or more exposures"),
+        ({"read_noise_e": 0.3, "samples": "a,b", "targets": ("bias=1DN",)}, "two or more exposures"),
+        ({"read_noise_e": 0.3, "samples": "0,2"}, "--target is missing"),
+        ({"read_noise_e": 0.3, "frames": 9, "figure": "x.gif"}, "cannot be drawn"),
+        ({"read_noise_e": 0.3, "quanta_exposure": 0.0, "frames": 9}, "--exposure 0"),
+    ],
+)
+def test_what_is_missing_gets_its_line(given, words, tmp_path):
+    if "figure" in given:
+        given = {**given, "figure": tmp_path / given["figure"]}
+    with pytest.raises(ConfigError, match=words):
+        make_plan(PlanRequest(**given))
