@@ -62,7 +62,7 @@ def _stage_command(name: str, summary: str) -> None:
     ) -> None:
         from pchem_pipeline.stages.session import find_run, run_stages
 
-        command = _command(
+        command = make_command(
             force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
             log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
         )  # fmt: skip
