@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 
 from pchem_pipeline import __version__
+from pchem_pipeline.cli_methods import methods
 from pchem_pipeline.cli_options import (
     Backend,
     DryRun,
@@ -109,7 +110,7 @@ def ingest(
     """Check the camera files; copy or reference their frames."""
     from pchem_pipeline.stages.session import cropped, find_run, run_stages
 
-    command = _command(
+    command = make_command(
         force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
         log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
     )  # fmt: skip
@@ -253,48 +254,7 @@ def joint(
         typer.echo(fit.store / "report.html")
 
 
-@app.command()
-def methods(
-    target: Target,
-    with_runs: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--with", help="store of a run of the same pixels at another exposure (dark first of all)"
-        ),
-    ] = None,
-    pixels: Annotated[
-        int | None, typer.Option(min=1, help="pixels to compare [default: methods.pixels]")
-    ] = None,
-    study_pixels: Annotated[
-        int | None,
-        typer.Option(min=0, help="simulated pixels at each read noise [default: methods.study_pixels]"),
-    ] = None,
-    force: Force = False,
-    dry_run: DryRun = False,
-    workers: Workers = None,
-    backend: Backend = None,
-    log_json: LogJson = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
-) -> None:
-    """Compare other characterisation methods with PCH-EM.
-
-    Photon transfer, EMVA 1288, PCH peaks and valleys, cumulants and others, on the same pixels and simulated.
-    """
-    from pchem_pipeline.stages.methods_result import compare_methods
-    from pchem_pipeline.stages.session import find_run
-
-    command = make_command(
-        force=force, dry_run=dry_run, tiles=None, roi=None, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet,
-    )  # fmt: skip
-    given = {"with_runs": with_runs, "pixels": pixels, "study_pixels": study_pixels}
-    known = {name: value for name, value in given.items() if value is not None}
-    text = compare_methods(find_run(target), command, known)
-    if text:
-        typer.echo(text)
-
-
+app.command()(methods)
 app.command()(plan)
 
 

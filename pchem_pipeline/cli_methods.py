@@ -1,0 +1,63 @@
+"""The command ``pchem methods``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pchem_pipeline.cli_options import (
+    Backend,
+    DryRun,
+    Force,
+    LogJson,
+    Progress,
+    Quiet,
+    Target,
+    Workers,
+    make_command,
+)
+
+__all__ = ["methods"]
+
+
+def methods(
+    target: Target,
+    with_runs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--with", help="store of a run of the same pixels at another exposure (dark first of all)"
+        ),
+    ] = None,
+    pixels: Annotated[
+        int | None, typer.Option(min=1, help="pixels to compare [default: methods.pixels]")
+    ] = None,
+    study_pixels: Annotated[
+        int | None,
+        typer.Option(min=0, help="simulated pixels at each read noise [default: methods.study_pixels]"),
+    ] = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    workers: Workers = None,
+    backend: Backend = None,
+    log_json: LogJson = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Compare other characterisation methods with PCH-EM.
+
+    Photon transfer, EMVA 1288, PCH peaks and valleys, cumulants and others, on the same pixels and simulated.
+    """
+    from pchem_pipeline.stages.methods_result import compare_methods
+    from pchem_pipeline.stages.session import find_run
+
+    command = make_command(
+        force=force, dry_run=dry_run, tiles=None, roi=None, workers=workers, backend=backend,
+        log_json=log_json, progress=progress, quiet=quiet,
+    )  # fmt: skip
+    given = {"with_runs": with_runs, "pixels": pixels, "study_pixels": study_pixels}
+    known = {name: value for name, value in given.items() if value is not None}
+    text = compare_methods(find_run(target), command, known)
+    if text:
+        typer.echo(text)
