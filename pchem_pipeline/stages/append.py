@@ -23,7 +23,7 @@ from pchem_pipeline.model.summaries import block_starts
 from pchem_pipeline.stages.base import StageContext, Swept, open_store
 from pchem_pipeline.stages.counting import BandCounter
 from pchem_pipeline.stages.fit_start import keep_fit
-from pchem_pipeline.stages.input_identity import keep_identity, kept_identity
+from pchem_pipeline.stages.input_identity import ingested_identity, keep_identity, known_identity
 from pchem_pipeline.stages.onepass import block_tasks, do_all, whole_mebibytes
 from pchem_pipeline.stages.pipeline import cpu_seconds, execute, setting_values
 from pchem_pipeline.stages.plan import allowed_bytes, sweep_bytes, sweep_rows
@@ -87,6 +87,7 @@ def _check_run(context: StageContext) -> None:
                 f"pchem run {quoted(store.path)}"
             )
     lacks = context.config.histogram.summaries and not store.has("summary/open_sums")
+    lacks |= ingested_identity(context) is None
     if context.sensor.kind != "frames" or lacks:
         raise StoreError(
             f"{store.path}: nothing can be appended to ready-made histograms or runs of earlier versions; "
@@ -98,15 +99,24 @@ def _added(
     context: StageContext, paths: list[Path], quick: dict[str, Any]
 ) -> tuple[list[Path], dict[str, Any]]:
     """Return the files that the run does not know, and the identity of those that it knows."""
-    known = kept_identity(context)
+    known = ingested_identity(context) or {}
     before = known["quick"]["files"]
-    if quick["files"][: len(before)] != before:
+    now = quick["files"][: len(before)]
+    same = now == before
+    if not same and [_fact(file) for file in now] == [_fact(file) for file in before]:
+        # touched, or copied elsewhere: their content counts
+        same = known_identity(context)["files"][: len(before)] == known["identity"]["files"]
+    if not same:
         raise InputError(
             f"the first {len(before)} files of input.files are not those of the run, or were changed; new "
             "files must come behind them in the order of their names; to do all again: "
             f"pchem run {quoted(context.store.path)}"
         )
     return paths[len(before) :], known["identity"]
+
+
+def _fact(file: dict[str, Any]) -> tuple[str, int]:
+    return file["name"], file["size"]
 
 
 def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path]) -> None:

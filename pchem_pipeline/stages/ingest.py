@@ -20,7 +20,7 @@ from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.stages.base import WHOLE, StageContext, nothing_left, open_store
 from pchem_pipeline.stages.declared import DECLARED
-from pchem_pipeline.stages.input_identity import known_identity, shortened
+from pchem_pipeline.stages.input_identity import keep_ingested, known_identity, shortened
 from pchem_pipeline.stages.sensor import SensorInfo
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ def run(context: StageContext) -> None:
     if message := reader.report.message():
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
+    keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)
         return

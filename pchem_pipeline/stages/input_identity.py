@@ -15,9 +15,10 @@ from pchem_pipeline.store.files import read_json, write_json
 
 __all__ = [
     "identity_is_new",
+    "ingested_identity",
     "inspect_input",
     "keep_identity",
-    "kept_identity",
+    "keep_ingested",
     "known_identity",
     "shortened",
 ]
@@ -61,16 +62,20 @@ def identity_is_new(context: StageContext) -> bool:
     return read_json(_place(context)) is None
 
 
-def kept_identity(context: StageContext) -> dict[str, Any]:
-    """Return what is kept of the input: its files (quick identity) and their content identity.
-
-    Raises:
-        StoreError: nothing is kept.
-    """
+def keep_ingested(context: StageContext) -> None:
+    """Remember the input as known now as that which the run holds, whatever is found in its place later."""
     known = read_json(_place(context))
-    if known is None:
-        raise StoreError(f"{context.store.path} knows no input yet; run: pchem ingest")
-    return dict(known)
+    if known is not None:
+        write_json(_ingested(context), known)
+
+
+def ingested_identity(context: StageContext) -> dict[str, Any] | None:
+    """Return the input that the run holds, ``quick`` and ``identity``; None where that was not kept."""
+    return read_json(_ingested(context))
+
+
+def _ingested(context: StageContext) -> Path:
+    return context.store.path / ".pchem" / "ingested.json"
 
 
 def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from pchem_pipeline.errors import InputError, StoreError
 from pchem_pipeline.stages.append import append_frames
 from pchem_pipeline.stages.base import open_store
 from pchem_pipeline.stages.fit_start import kept_fit
-from pchem_pipeline.stages.session import Command, Target, find_run, run_stages
+from pchem_pipeline.stages.session import Command, Target, find_run, run_stages, run_status
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(quiet=True)
@@ -89,6 +89,7 @@ def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
     run = target(tmp_path, "run.zarr")
     run_stages(run, ["ingest", "histogram"], QUIET)
     (tmp_path / "later").rename(tmp_path / "f1.npy")
+    assert [state.state for state in run_status(run)][:2] == ["stale", "stale"]  # a look changes nothing
     seen = []
     real = sequence.FrameSequence.pieces
     monkeypatch.setattr(
@@ -149,7 +150,8 @@ def test_what_cannot_be_appended_is_said(tmp_path, frames):
     earlier = target(tmp_path, "run.zarr", files=("a.npy", "f*.npy"))
     with pytest.raises(InputError, match="come behind them"):
         append_frames(earlier, QUIET)
-    # nothing of that harmed the run
+    # nothing of that harmed the run; files that were only touched are the same
+    (tmp_path / "f0.npy").touch()
     assert [state.state for state in append_frames(target(tmp_path, "run.zarr"), QUIET)] == ["complete"] * 2
 
 
