@@ -30,7 +30,7 @@ from pchem_pipeline.render.style import (
     plain,
     styled,
 )
-from pchem_pipeline.render.wording import count
+from pchem_pipeline.render.wording import count, power_of_ten
 
 __all__ = ["difference_map", "ensembles"]
 
@@ -59,31 +59,40 @@ def difference_map(
     ny, nx = found.z.shape
     known = finite(found.z)
     limit = _limit(known, _LEAST if not same_data else 0.0)
+    unit, label = _unit(limit)
     strip = min(ny, nx) < 2
     square = 0.25 <= ny / nx <= 4.0
     map_mm = 40.0 if strip else float(np.clip((width_mm - 24.0) * (ny / nx if square else 0.6), 26.0, 130.0))
     figure = new_figure(width_mm, map_mm + 46.0)
     top, bottom = figure.subplots(2, 1, height_ratios=(map_mm, 28.0))
     if strip:
-        z = found.z.ravel()
+        z = found.z.ravel() / unit
         top.axhspan(-2.0, 2.0, color=GRAY, alpha=0.4, linewidth=0)
         top.plot(np.arange(z.size), z, "o", color=BLUE, markersize=3)
-        top.set(xlabel="channel", ylabel="standard errors", xlim=(-0.5, z.size - 0.5))
+        top.set(xlabel="channel", ylabel=label, xlim=(-0.5, z.size - 0.5))
     else:
         top.set_facecolor(NO_VALUE)
         image = top.imshow(
-            found.z, cmap=_DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest",
-            aspect="equal" if square else "auto",
+            found.z / unit, cmap=_DIVERGING, vmin=-limit / unit, vmax=limit / unit,
+            interpolation="nearest", aspect="equal" if square else "auto",
         )  # fmt: skip
         top.set(xlabel="x (pixel)", ylabel="y (pixel)")
         for axis in (top.xaxis, top.yaxis):
             axis.set_major_locator(MaxNLocator(5, integer=True))
         bar = figure.colorbar(image, ax=top, fraction=0.05, pad=0.02, aspect=25, extend="both")
-        bar.set_label("standard errors")
+        bar.set_label(label)
     top.set_title(plain(title), fontsize=7.5)
     edge = limit if same_data else max(limit, FAR)
-    _distribution(bottom, found, edge, chance=not same_data)
+    _distribution(bottom, found.z / unit, edge / unit, chance=not same_data)
+    bottom.set_xlabel(f"difference ({label})")
+    note(bottom, f"{count(found.n_far, 'good pixel')} beyond ±{FAR:g}")
     return figure
+
+
+def _unit(limit: float) -> tuple[float, str]:
+    """Return a power of ten in which differences up to ``limit`` have few digits, and its words."""
+    power = int(np.floor(np.log10(limit))) if limit < 0.01 else 0
+    return 10.0**power, f"{power_of_ten(power)} standard errors".strip()
 
 
 def _limit(known: FloatArray, least: float) -> float:
@@ -95,21 +104,19 @@ def _limit(known: FloatArray, least: float) -> float:
     return max(least, quantile if quantile > 0 else float(sizes.max()))
 
 
-def _distribution(axes: Axes, found: MapDifference, edge: float, *, chance: bool) -> None:
-    known = finite(found.z)
+def _distribution(axes: Axes, z: FloatArray, edge: float, *, chance: bool) -> None:
+    known = finite(z)
     edges = np.linspace(-edge, edge, 61)
-    axes.stairs(np.histogram(np.clip(known, -edge, edge), edges)[0], edges, fill=True, color=GRAY)
-    highest = float(np.max(np.histogram(known, edges)[0], initial=1))
+    counts = np.histogram(np.clip(known, -edge, edge), edges)[0]
+    axes.stairs(counts, edges, fill=True, color=GRAY)
+    highest = float(np.max(counts, initial=1))
     if chance:
         x = np.linspace(-edge, edge, 601)
         normal = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
         axes.plot(x, normal, color=BLUE, linewidth=0.9)
         highest = max(highest, float(normal.max()))
     axes.set_yscale("log")
-    axes.set(
-        xlim=(-edge, edge), ylim=(0.5, 5.0 * highest), xlabel="difference (standard errors)", ylabel="pixels"
-    )
-    note(axes, f"{count(found.n_far, 'good pixel')} beyond ±{FAR:g}")
+    axes.set(xlim=(-edge, edge), ylim=(0.5, 5.0 * highest), ylabel="pixels")
 
 
 @styled

@@ -79,9 +79,10 @@ def _pair_sentence(pair: Pair, tolerance: float) -> str:
 
 def _largest_words(pair: Pair) -> str:
     """Say by how many standard errors maps of the same frames moved at most."""
-    if not pair.same_data or not pair.maps:
+    counted = {name: each for name, each in pair.maps.items() if each.n_counted}
+    if not pair.same_data or not counted:
         return ""
-    name, most = max(pair.maps.items(), key=lambda item: item[1].largest_z)
+    name, most = max(counted.items(), key=lambda item: item[1].largest_z)
     return (
         f" No good pixel moved by more than {short(most.largest_z, 2)} standard errors ({symbol(name)[1]})."
     )

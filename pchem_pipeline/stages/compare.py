@@ -82,6 +82,7 @@ def compare_runs(
         write_atomic(folder / name, text.encode())
     if found.changed:
         raise ChangedError(f"{sentence_of(found)} See {folder / COMPARE_PAGE}")
+    reporter.info(sentence_of(found))
     return [folder / name for name in files]
 
 

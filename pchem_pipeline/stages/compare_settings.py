@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pchem_pipeline.config.tree import RunConfig
@@ -20,11 +20,10 @@ _BESIDE = {"input.integration_time": ("maps",), "input.files": ("ingest",)}
 
 def settings_that_differ(one: RunConfig, other: RunConfig) -> list[Setting]:
     """Return the settings that differ, each with the stages whose results it decides."""
-    left, right = (_flat(config.model_dump(mode="json", by_alias=True)) for config in (one, other))
+    left, right = (config.model_dump(mode="json", by_alias=True) for config in (one, other))
     return [
-        Setting(name, _text(left, name), _text(right, name), _readers(name))
-        for name in sorted(left.keys() | right.keys())
-        if left.get(name) != right.get(name)
+        Setting(name, _text(before), _text(after), _readers(name))
+        for name, before, after in _differing(left, right)
     ]
 
 
@@ -32,7 +31,7 @@ def versions_that_differ(one: RunStore, other: RunStore) -> list[Setting]:
     """Return the versions of algorithms and programs that differ between the stages of two runs."""
     left, right = _versions(one), _versions(other)
     return [
-        Setting(name, _text(left, name), _text(right, name))
+        Setting(name, _text(left.get(name)), _text(right.get(name)))
         for name in sorted(left.keys() | right.keys())
         if left.get(name) != right.get(name)
     ]
@@ -50,21 +49,18 @@ def _versions(store: RunStore) -> dict[str, Any]:
     return {name: ", ".join(sorted(versions)) for name, versions in found.items()}
 
 
-def _flat(content: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in content.items():
-        name = f"{above}{key}"
-        if isinstance(value, Mapping) and value:
-            found |= _flat(value, f"{name}.")
-        else:
-            found[name] = value
-    return found
+def _differing(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield what differs, key by key; a section that only one has is one difference."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in sorted(one.keys() | other.keys()):
+            yield from _differing(one.get(key), other.get(key), f"{name}.{key}" if name else key)
+    elif one != other:
+        yield name, one, other
 
 
-def _text(found: Mapping[str, Any], name: str) -> str:
-    if name not in found:
-        return "not there"
-    value = found[name]
+def _text(value: Any) -> str:
+    if value is None:
+        return "not set"
     return value if isinstance(value, str) and value else json.dumps(value, ensure_ascii=False)
 
 

@@ -85,9 +85,14 @@ class Run:
         self.plot = Plots(lambda: self._data, target.config.report)
 
     def __repr__(self) -> str:
+        states = ", ".join(f"{state.stage} {state.state}" for state in run_status(self._target))
+        return f"<Run {self.path.name}: {self._size()}; {states}>"
+
+    def _size(self) -> str:
         ny, nx = self.shape
-        states = ", ".join(f"{stage}: {words}" for stage, words in self.status().items())
-        return f"<Run {self.path.name}: {ny} x {nx} pixels, {self.n_frames:,} frames; {states}>"
+        if self._sensor.kind == "histograms":
+            return f"{nx} channels of up to {self.n_frames:,} samples"
+        return f"{ny} x {nx} pixels, {self.n_frames:,} frames"
 
     def status(self) -> dict[str, str]:
         """Return how far each stage is, as ``pchem status`` says it."""

@@ -45,6 +45,8 @@ def numbers(shell, folder="compare"):
 def test_nothing_changed_is_proven_by_digests(shell, copies):
     result = shell.ok("compare", "a.zarr", "b.zarr")
     assert result.stdout.split() == ["compare/compare.html", "compare/compare.json"]
+    assert result.last.startswith("Nothing changed: ")
+    assert result.last.endswith(" are identical to the bit.")
     [pair] = numbers(shell)["comparisons"]
     assert (pair["same_data"], pair["changed"], pair["what"]) == (True, False, [])
     rows = {row["name"]: row for row in pair["arrays"]}

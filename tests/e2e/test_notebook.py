@@ -109,7 +109,8 @@ def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
         _ = run.truth
     with pytest.raises(ConfigError, match="does not exist"):
         pchem_pipeline.open_run(tmp_path / "none.zarr")
-    assert "report: complete" in repr(run)
+    assert repr(run).startswith("<Run run.zarr: 20 x 28 pixels, 1,200 frames; ingest complete, ")
+    assert run.status()["report"] == "complete"
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(MissingDependencyError, match=r'pip install "pchem-pipeline\[notebook\]"'):
         pchem_pipeline.open_run(finished)

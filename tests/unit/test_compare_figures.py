@@ -1,0 +1,73 @@
+"""The figures, tables and settings of a comparison of runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.model.differences import compare_maps
+from pchem_pipeline.render.compare_data import RunFacts
+from pchem_pipeline.render.compare_figures import difference_map, ensembles
+from pchem_pipeline.stages.compare_settings import settings_that_differ
+
+
+def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):
+    rng = np.random.default_rng(1)
+    one, error = rng.normal(10, 1, shape), np.full(shape, 0.1)
+    other = one + size * 0.1 * rng.standard_normal(shape)
+    one[0, 0] = np.nan
+    return compare_maps((one, error), (other, error), np.ones(shape, bool), same_data=same_data)
+
+
+@pytest.mark.parametrize("shape", [(12, 16), (1, 9), (40, 4)])
+def test_maps_of_differences_of_all_shapes(shape: tuple[int, int]) -> None:
+    found = difference(shape, 1.4)
+    figure = difference_map(found, "bias: B − A", same_data=False)
+    top, bottom = figure.axes[:2]
+    if min(shape) > 1:
+        np.testing.assert_allclose(np.asarray(top.images[0].get_array(), dtype=float), found.z)
+        assert top.images[0].get_clim() == (-4.0, 4.0)
+    assert sum(bottom.patches[0].get_data().values) == found.n_both
+    assert len(bottom.lines) == 1  # what chance gives
+
+
+def test_tiny_differences_of_the_same_frames_are_seen() -> None:
+    found = difference((12, 16), 3e-9, same_data=True)
+    figure = difference_map(found, "bias: B − A", same_data=True)
+    assert figure.axes[1].get_xlabel() == "difference (10⁻⁹ standard errors)"
+    assert 1.0 <= figure.axes[0].images[0].get_clim()[1] < 10.0
+    assert not figure.axes[1].lines
+    nothing = difference((12, 16), 0.0, same_data=True)
+    assert difference_map(nothing, "bias: B − A", same_data=True).axes[0].images[0].get_clim() == (-1.0, 1.0)
+
+
+def run_facts(label: str, mean: float) -> RunFacts:
+    rng = np.random.default_rng(2)
+    dn = np.arange(60, 140)
+    counts = np.histogram(rng.normal(mean, 8, 20_000), np.arange(59.5, 140.5))[0]
+    arrays = {"dn": dn, "counts": counts, "density": counts / counts.sum()}
+    return RunFacts(label, f"{label}$x$.zarr", (8, 8), 100, "", ensemble=arrays)
+
+
+def test_ensembles_lie_over_each_other() -> None:
+    figure = ensembles([run_facts("A", 100.0), run_facts("B", 104.0)])
+    top, strip = figure.axes
+    assert [line.get_label() for line in top.lines] == ["A (A\\$x\\$.zarr)", "B (B\\$x\\$.zarr)"]
+    z = np.asarray(strip.lines[0].get_ydata())
+    # f(x - 4) - f(x) of N(0, 8^2) is 0.0149 at most, sqrt(1050) / 20,000 its error: 9.2, and the largest of many
+    assert 7 < np.abs(z).max() < 13
+    assert len(ensembles([RunFacts("A", "a", (8, 8), 1, ""), run_facts("B", 1.0)]).axes) == 1
+
+
+def test_settings_that_differ_name_their_readers() -> None:
+    one = RunConfig.model_validate({"input": {"files": ["a.tif"], "integration_time": 1.0}})
+    other = RunConfig.model_validate(
+        {"input": {"files": ["a.tif"]}, "fit": {"gap_threshold": 6}, "simulate": {}}
+    )
+    rows = {row.name: row for row in settings_that_differ(one, other)}
+    assert set(rows) == {"input.integration_time", "fit.gap_threshold", "simulate"}
+    assert (rows["fit.gap_threshold"].one, rows["fit.gap_threshold"].other) == ("5.0", "6.0")
+    assert rows["input.integration_time"].stages == ("maps",)
+    assert (rows["simulate"].one, rows["simulate"].stages) == ("not set", ("simulate",))
+    assert settings_that_differ(one, one) == []
