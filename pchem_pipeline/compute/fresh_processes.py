@@ -132,8 +132,11 @@ def serve() -> None:
             outcome = Outcome(error=RuntimeError(f"{type(error).__name__}: {error}"))
         else:
             outcome = guarded(function, item)
-        answers.write(_pickled(outcome))
-        answers.flush()
+        try:
+            answers.write(_pickled(outcome))
+            answers.flush()
+        except BrokenPipeError:  # the one who asked is gone, and the rest of the answer with it
+            os._exit(0)
 
 
 def _pickled(outcome: Outcome) -> bytes:

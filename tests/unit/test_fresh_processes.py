@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from report_material import report_data
 
+from pchem_pipeline.compute import fresh_processes
 from pchem_pipeline.compute.executor import SerialExecutor, Stop
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
 from pchem_pipeline.errors import IncompleteRunError
@@ -76,6 +78,23 @@ def test_one_worker_draws_here_and_wide_figures_come_first() -> None:
     order = longest_first(exhibits(report_data((12, 16)), QUICK))
     assert {exhibit.name for exhibit in order} == set(EXHIBIT_NAMES)
     assert np.all(np.diff([exhibit.width_mm for exhibit in order]) <= 0)
+
+
+def test_a_process_whose_parent_is_gone_ends_without_a_word() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", fresh_processes.__name__],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+    )  # fmt: skip
+    assert process.stdin is not None
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    process.stdin.write(pickle.dumps((abs, -3)))
+    process.stdin.close()
+    assert process.stderr.read() == b""
+    assert process.wait(30) == 0
+    process.stderr.close()
 
 
 def test_a_script_without_a_guard_is_not_run_again(tmp_path: Path) -> None:
