@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.estep_numba import evaluate
 from pchem_pipeline.model.fisher_numba import to_natural
-from pchem_pipeline.model.outliers_numba import core_ends, cut, leave_out, total
+from pchem_pipeline.model.goodness_numba import normal_score
+from pchem_pipeline.model.outliers_numba import core_ends, cut, inner_ends, leave_out, total
 from pchem_pipeline.model.pchem_numba import (
+    CHI2,
     EVALUATIONS,
     EXPOSURE_AT_BOUND,
     FIT_NOT_CONVERGED,
@@ -25,6 +27,7 @@ from pchem_pipeline.model.pchem_numba import (
     NO_DATA,
     OUTLYING,
     STATUS,
+    SUSPICIOUS,
     TOO_FEW_BINS,
     fit_pixel,
 )
@@ -121,6 +124,20 @@ def _unexpected(
     return changed
 
 
+@nb.njit(nogil=True, cache=True)
+def _suspicious(
+    limits: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    out: NDArray[np.float64],
+    words: NDArray[np.int64],
+) -> bool:
+    """Tell whether a fit of all samples may have been led by outliers: by single samples or as a whole."""
+    if not (limits[FLOOR] > 0.0 and theta[1] > 0.0):
+        return False
+    misfit: float = normal_score(out[CHI2], words[FREEDOM])
+    return bool(out[OUTLYING] > 0.0 or misfit > SUSPICIOUS)
+
+
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def _fit_guarded(
     row: NDArray[np.generic],
@@ -133,35 +150,34 @@ def _fit_guarded(
     out: NDArray[np.float64],
     words: NDArray[np.int64],
 ) -> int:
-    """Fit a row whose tails hold samples that are not expected; return its status word.
+    """Fit a row that may hold outliers; return its status word.
 
-    Where that fails, or where they are too many to be a few outliers, it is the fit of all samples.
+    First without both ends of the histogram, as much of them as may be outliers; where that says nothing,
+    without the samples that a gap cuts off. What these parameters expect then comes back, until the samples
+    left out stay the same. Where that fails, or where they are too many to be a few outliers, it is the fit
+    of all samples.
     """
-    n = total(row)
-    if far:
-        histogram, centre, _ = load(row, room.weights, room.cumulative)
-        start = centre + int(histogram.first)
-        first, end = core_ends(histogram)
+    status: int
+    histogram, centre, _ = load(row, room.weights, room.cumulative)
+    n, start = histogram.n, centre + int(histogram.first)
+    inner, core = inner_ends(histogram, room.limits[MOST_OUTLIERS]), core_ends(histogram)
+    for attempt in range(2 if far else 1):
+        first, end = inner if attempt == 0 else core
         cut(row, start + first, start + end, kept)
-    else:
-        cut(row, 0, row.size, kept)
-        _unexpected(row, origin, n, room, parameters, kept)
-    left_out, status = 0.0, 0
-    for _ in range(_MOST_PASSES):
-        left_out = n - total(kept)
-        if left_out > room.limits[MOST_OUTLIERS] * n:
-            left_out = -1.0
-            break
-        status = _fit_row(kept, origin, room, parameters, covariance, out, words)
-        if room.theta[1] == 0.0 or status & (FIT_NOT_CONVERGED | GAIN_NOT_IDENTIFIED) != 0:
-            left_out = -1.0
-            break
-        if not _unexpected(row, origin, n - left_out, room, parameters, kept):
-            break
-    if left_out < 0.0:
-        status = _fit_row(row, origin, room, parameters, covariance, out, words)
-        left_out = 0.0
-    out[OUTLYING] = left_out
+        for _ in range(_MOST_PASSES):
+            left_out = n - total(kept)
+            if left_out > room.limits[MOST_OUTLIERS] * n:
+                break
+            status = _fit_row(kept, origin, room, parameters, covariance, out, words)
+            if room.theta[1] == 0.0 or status & (FIT_NOT_CONVERGED | GAIN_NOT_IDENTIFIED) != 0:
+                break
+            if not _unexpected(row, origin, n - left_out, room, parameters, kept):
+                out[OUTLYING] = left_out
+                return status
+    status = _fit_row(row, origin, room, parameters, covariance, out, words)
+    out[OUTLYING] = 0.0
+    if far and _suspicious(room.limits, room.theta, out, words):
+        status |= GAIN_NOT_IDENTIFIED  # only far samples speak for a gain, and it does not explain them
     return status
 
 
@@ -212,8 +228,7 @@ def fit_tile(
             status = _fit_row(
                 row, origin[pixel], room, parameters[pixel], covariance[pixel], out[pixel], words[pixel]
             )
-        few = 0.0 < out[pixel, OUTLYING] <= limits[MOST_OUTLIERS] * histogram.n and theta[1] > 0.0
-        if far or few:
+        if far or _suspicious(limits, theta, out[pixel], words[pixel]):
             status = _fit_guarded(
                 row, kept, origin[pixel], room, far,
                 parameters[pixel], covariance[pixel], out[pixel], words[pixel],

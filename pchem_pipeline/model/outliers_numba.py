@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.workspace_numba import Histogram
 
 _CORE_TAIL = 0.02  # share of the frames beyond either end of the core
-_FAR = 2.0  # widths of the core: a wider gap beyond it makes a sample far
+_FAR = 0.6  # widths of the core: a wider gap beyond it makes a sample far
 _FEW_DN = 4.0
 
 
@@ -35,10 +35,10 @@ def outlying(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def core_ends(histogram: Histogram) -> tuple[int, int]:
-    """Return first and end of the bins that a gap twice as wide as the core does not cut off.
+    """Return first and end of the bins that no gap cuts off from the core, which holds 96 % of the frames.
 
-    The core holds 96 % of the frames. The model has no say here: far samples would otherwise lead the search
-    for its parameters astray, where two peaks a thousand DN apart explain them.
+    The model has no say here: far samples would otherwise lead the search for its parameters astray, where
+    peaks hundreds of DN apart explain them.
     """
     weights, cumulative, n_bins, n = histogram.weights, histogram.cumulative, histogram.n_bins, histogram.n
     low = 0
@@ -60,6 +60,18 @@ def core_ends(histogram: Histogram) -> tuple[int, int]:
                 break
             last = i
     return first, last + 1
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def inner_ends(histogram: Histogram, share: float) -> tuple[int, int]:
+    """Return first and end of the bins left when a share of the frames is cut off, half at each end."""
+    cumulative, n_bins, n = histogram.cumulative, histogram.n_bins, histogram.n
+    low, high = 0, n_bins
+    while low < n_bins - 1 and cumulative[low + 1] <= 0.5 * share * n:
+        low += 1
+    while high > low + 1 and n - cumulative[high - 1] <= 0.5 * share * n:
+        high -= 1
+    return low, high
 
 
 @nb.njit(nogil=True, cache=True)

@@ -1,0 +1,245 @@
+"""Coverage of the intervals, calibration of the goodness of fit and cost of the tail guard, by simulation.
+
+Pixels are drawn from the exact quantised mass on a grid of quanta exposure, read noise and number of frames,
+10,000 in all, and fitted. Printed are
+
+* the share of normal (estimate -+ z stderr) and profile-likelihood intervals that hold the truth, where
+  ``fit_status`` is 0, and its distance from nominal in standard errors of that share;
+* the standard errors against the scatter of the estimates, with information and with sandwich errors;
+* p-values of the goodness of fit: shares below 1 %, 5 %, 50 %, and pixels called misfits at a rate of false
+  discoveries of 5 %;
+* the tail guard: its share of clean samples, its cost in efficiency, and how far outliers move the estimates
+  with and without it.
+
+    python scripts/validation/uncertainties.py            # about a minute
+    python scripts/validation/uncertainties.py --quick    # a tenth of the pixels
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.compute.environment import prepare_environment
+
+prepare_environment()
+
+from pchem_pipeline.model.discovery import false_discovery  # noqa: E402
+from pchem_pipeline.model.fisher import sandwich_covariance  # noqa: E402
+from pchem_pipeline.model.intervals import profile_intervals, quantile_of  # noqa: E402
+from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
+from pchem_pipeline.model.pchem import FitResult, fit_histograms  # noqa: E402
+from pchem_pipeline.model.settings import FitSettings  # noqa: E402
+
+Array = NDArray[np.float64]
+NAMES = ("H", "g", "mu", "sigma", "s_e")
+LEVELS = (0.68, 0.95)
+STEP = 11.0  # DN per electron
+GRID = tuple(itertools.product((0.1, 0.5, 2.0, 8.0), (0.2, 0.3, 0.4, 0.48), (2_000, 17_750)))
+GUARD_OFF = FitSettings(tail_guard=0)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Histograms and true (H, g, mu, sigma)."""
+
+    counts: NDArray[np.uint32]
+    origin: NDArray[np.int64]
+    truth: Array
+
+
+def draw(
+    rng: np.random.Generator,
+    n: int,
+    exposure: float,
+    noise: float,
+    n_frames: int,
+    spread: tuple[float, ...] = (1.0,),
+) -> Pixels:
+    """Draw pixels of one kind whose bias lies anywhere between two DN.
+
+    ``noise`` is in e-, quantisation included; ``spread`` holds factors of the exposure, equally likely in each
+    frame.
+    """
+    bias = rng.uniform(100.0, 101.0, n)
+    analog = np.sqrt(noise**2 - 1.0 / (12.0 * STEP**2))
+    first = int(np.floor(100.0 - 9.0 * noise * STEP))
+    width = int((exposure + 11.0 * np.sqrt(exposure) + 12.0 + 18.0 * noise) * STEP)
+    codes = first + np.arange(width)
+    parts = [pcd_mass(codes, exposure * each, 1.0 / STEP, bias[:, None], analog) for each in spread]
+    mass = np.mean(parts, axis=0)
+    counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True)).astype(np.uint32)
+    truth = np.column_stack([np.full(n, exposure), np.full(n, 1.0 / STEP), bias, np.full(n, noise * STEP)])
+    return Pixels(counts, np.full(n, first, np.int64), truth)
+
+
+def estimates(fit: FitResult) -> Array:
+    """Return (H, g, mu, sigma) by pixel."""
+    return np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+
+
+def with_noise_e(values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Append sigma_e- = g sigma; return values and standard errors, shape (n, 5) each."""
+    g, sigma = values[:, 1], values[:, 3]
+    error = sigma**2 * covariance[:, 1, 1] + 2 * g * sigma * covariance[:, 1, 3] + g**2 * covariance[:, 3, 3]
+    variances = np.column_stack([np.diagonal(covariance, axis1=1, axis2=2), error])
+    return np.column_stack([values, g * sigma]), np.sqrt(variances)
+
+
+def inside(truth: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Tell which intervals hold the truth."""
+    return (low <= truth) & (truth <= high)
+
+
+def coverage(pixels: Pixels, fit: FitResult) -> tuple[int, Array]:
+    """Return the number of good pixels and the covered shares by kind (normal, profile), level, quantity."""
+    good = fit.fit_status == 0
+    if not good.any():
+        return 0, np.full((2, len(LEVELS), len(NAMES)), np.nan)
+    values, errors = with_noise_e(estimates(fit)[good], fit.covariance[good])
+    truth = np.column_stack([pixels.truth, pixels.truth[:, 1] * pixels.truth[:, 3]])[good]
+    found = np.empty((2, len(LEVELS), len(NAMES)))
+    for place, level in enumerate(LEVELS):
+        z = quantile_of(level)
+        found[0, place] = inside(truth, values - z * errors, values + z * errors).mean(axis=0)
+        ends = profile_intervals(pixels.counts[good], pixels.origin[good], values[:, :4], level)
+        found[1, place] = inside(truth, ends[:, :, 0], ends[:, :, 1]).mean(axis=0)
+    return int(good.sum()), found
+
+
+def print_coverage(rng: np.random.Generator, n: int) -> None:
+    """Print the coverage at each point of the grid and over all of it."""
+    print(f"\nCoverage of nominal 68 % and 95 % intervals in %, {n} pixels a point, fit_status 0 only")
+    head = "".join(f"{name:>7s}" for name in NAMES)
+    print(f"{'H':>5s}{'s_e':>6s}{'N':>7s}{'good':>6s} {'':8s}|{head} |{head}")
+    total, worst = 0, 0.0
+    sums = np.zeros((2, len(LEVELS), len(NAMES)))
+    for exposure, noise, n_frames in GRID:
+        pixels = draw(rng, n, exposure, noise, n_frames)
+        good, found = coverage(pixels, fit_histograms(pixels.counts, pixels.origin))
+        if good < n / 2:
+            print(
+                f"{exposure:5g}{noise:6.2f}{n_frames:7d}{good:6d} few good pixels, chosen by chance: left out"
+            )
+            continue
+        for kind, rows in zip(("normal", "profile"), found, strict=True):
+            cells = " |".join("".join(f"{100 * v:7.1f}" for v in row) for row in rows)
+            print(f"{exposure:5g}{noise:6.2f}{n_frames:7d}{good:6d} {kind:8s}|{cells}")
+        total += good
+        sums += good * found
+        worst = np.maximum(worst, np.abs(deviations(found, good)).max(axis=(1, 2)))
+    for kind, rows, far in zip(("normal", "profile"), sums / total, worst, strict=True):
+        cells = " |".join("".join(f"{100 * v:7.2f}" for v in row) for row in rows)
+        print(f"{'all':18s}{total:6d} {kind:8s}|{cells}")
+        off = " |".join("".join(f"{v:7.1f}" for v in row) for row in deviations(rows, total))
+        print(f"{'standard errors from nominal':33s}|{off}; at most {far:.1f} at a point")
+
+
+def deviations(shares: Array, n: int) -> Array:
+    """Return the distance of covered shares from nominal in their standard errors, levels before the last."""
+    level = np.array(LEVELS)[:, None]
+    return (shares - level) / np.sqrt(level * (1.0 - level) / n)
+
+
+def print_errors(rng: np.random.Generator, n: int) -> None:
+    """Print standard errors over the scatter of the estimates, with the model right and wrong."""
+    print(f"\nMedian standard error over the scatter of the estimates, {n} pixels, H = 2, N = 17,750")
+    print(f"{'samples':34s}{'errors':13s}" + "".join(f"{name:>8s}" for name in NAMES[:4]))
+    for words, spread in (("of a PCD", (1.0,)), ("of two exposures, 1 and 3 e-", (0.5, 1.5))):
+        pixels = draw(rng, n, 2.0, 0.3, 17_750, spread)
+        fit = fit_histograms(pixels.counts, pixels.origin, settings=GUARD_OFF)
+        values = estimates(fit)
+        values[:, 2] -= pixels.truth[:, 2]
+        scatter = values.std(axis=0)
+        sandwich = sandwich_covariance(pixels.counts, pixels.origin, estimates(fit), fit.covariance)
+        for name, covariance in (("information", fit.covariance), ("sandwich", sandwich)):
+            errors = np.median(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), axis=0)
+            print(f"{words:34s}{name:13s}" + "".join(f"{v:8.3f}" for v in errors / scatter))
+
+
+def print_goodness(rng: np.random.Generator, n: int) -> None:
+    """Print how uniform the p-values are on clean pixels, and what false-discovery control makes of them."""
+    print(
+        f"\nGoodness of fit of clean pixels, {n} a point: share of p below 1, 5, 50 % (in %); misfits at 5 %"
+    )
+    print(f"{'H':>5s}{'s_e':>6s}{'N':>7s}{'1 %':>8s}{'5 %':>8s}{'50 %':>8s}{'misfits':>9s}")
+    for exposure, noise, n_frames in (
+        (0.1, 0.2, 600),
+        (2.0, 0.3, 600),
+        (0.1, 0.3, 17_750),
+        (2.0, 0.3, 17_750),
+    ):
+        pixels = draw(rng, n, exposure, noise, n_frames)
+        p = fit_histograms(pixels.counts, pixels.origin).goodness_p
+        shares = "".join(f"{100 * np.nanmean(p < limit):8.2f}" for limit in (0.01, 0.05, 0.5))
+        misfits = int((false_discovery(p) <= 0.05).sum())
+        print(f"{exposure:5g}{noise:6.2f}{n_frames:7d}{shares}{misfits:9d}")
+    print(f"standard errors of the shares: {100 * np.sqrt(0.01 * 0.99 / n):.2f}, ", end="")
+    print(f"{100 * np.sqrt(0.05 * 0.95 / n):.2f}, {50 / np.sqrt(n):.2f}")
+
+
+def print_guard(rng: np.random.Generator, n: int) -> None:
+    """Print what the tail guard costs on clean pixels, and what it is worth on others."""
+    print(f"\nTail guard: {n} clean pixels a point, then the same with 5 outliers in each")
+    head = "".join(f"{name:>8s}" for name in NAMES[:4])
+    print(f"{'H':>5s}{'s_e':>6s}{'N':>7s}{'hit':>8s}{'cost %':>8s} | on:{head} | off:{head}")
+    for exposure, noise, n_frames in (
+        (0.1, 0.2, 17_750),
+        (2.0, 0.3, 17_750),
+        (2.0, 0.3, 2_000),
+        (8.0, 0.4, 17_750),
+    ):
+        pixels = draw(rng, n, exposure, noise, n_frames)
+        on = fit_histograms(pixels.counts, pixels.origin)
+        off = fit_histograms(pixels.counts, pixels.origin, settings=GUARD_OFF)
+        errors = np.sqrt(np.diagonal(off.covariance, axis1=1, axis2=2))
+        mean_square = [
+            np.nanmean(((estimates(fit) - pixels.truth) / errors) ** 2, axis=0) for fit in (on, off)
+        ]
+        cost = 100.0 * (mean_square[0] / mean_square[1] - 1.0).max()
+        hit, good = spoiled(rng, pixels), off.fit_status == 0
+        shifts = []
+        for settings, clean in ((FitSettings(), on), (GUARD_OFF, off)):
+            moved = estimates(fit_histograms(hit.counts, hit.origin, settings=settings)) - estimates(clean)
+            shifts.append(np.nanquantile(np.abs(moved / errors)[good], 0.99, axis=0))
+        cells = [" ".join(f"{v:7.3f}" for v in row) for row in shifts]
+        share = np.mean(on.outlier_share > 0)
+        words = f"{exposure:5g}{noise:6.2f}{n_frames:7d}{share:8.4f}{cost:8.3f}"
+        print(f"{words} |     {cells[0]} |      {cells[1]}")
+    print("hit: share of clean pixels that lose a sample; cost: rise of the mean square error of the worst")
+    print("parameter; guard on and off: shift by the outliers that 99 % of the good pixels stay below, s.e.")
+
+
+def spoiled(rng: np.random.Generator, pixels: Pixels) -> Pixels:
+    """Add 5 frames anywhere up to 400 DN beyond either end of each histogram."""
+    n, width = pixels.counts.shape
+    counts = np.zeros((n, width + 800), np.uint32)
+    counts[:, 400 : 400 + width] = pixels.counts
+    for row in counts:
+        places = np.concatenate([rng.integers(0, 380, 2), rng.integers(width + 420, width + 800, 3)])
+        np.add.at(row, places, 1)
+    return Pixels(counts, pixels.origin - 400, pixels.truth)
+
+
+def main() -> None:
+    """Print all tables."""
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
+    parser.add_argument("--pixels", type=int, default=10_000, help="pixels of the coverage study")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="a tenth of the pixels")
+    options = parser.parse_args()
+    share = 10 if options.quick else 1
+    rng = np.random.default_rng(options.seed)
+    print_coverage(rng, max(30, options.pixels // share // len(GRID)))
+    print_errors(rng, 2000 // share)
+    print_goodness(rng, 4000 // share)
+    print_guard(rng, 2000 // share)
+
+
+if __name__ == "__main__":
+    main()
