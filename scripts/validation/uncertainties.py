@@ -62,8 +62,8 @@ def draw(
 ) -> Pixels:
     """Draw pixels of one kind whose bias lies anywhere between two DN.
 
-    ``noise`` is in e-, quantisation included; ``spread`` holds factors of the exposure, equally likely in each
-    frame.
+    ``noise`` is in e-, quantisation included; ``spread`` holds factors of the exposure, equally likely in
+    each frame.
     """
     bias = rng.uniform(100.0, 101.0, n)
     analog = np.sqrt(noise**2 - 1.0 / (12.0 * STEP**2))
@@ -149,7 +149,7 @@ def print_errors(rng: np.random.Generator, n: int) -> None:
     """Print standard errors over the scatter of the estimates, with the model right and wrong."""
     print(f"\nMedian standard error over the scatter of the estimates, {n} pixels, H = 2, N = 17,750")
     print(f"{'samples':34s}{'errors':13s}" + "".join(f"{name:>8s}" for name in NAMES[:4]))
-    for words, spread in (("of a PCD", (1.0,)), ("of two exposures, 1 and 3 e-", (0.5, 1.5))):
+    for words, spread in (("of a PCD", (1.0,)), ("of two exposures, 1.2 and 2.8 e-", (0.6, 1.4))):
         pixels = draw(rng, n, 2.0, 0.3, 17_750, spread)
         fit = fit_histograms(pixels.counts, pixels.origin, settings=GUARD_OFF)
         values = estimates(fit)

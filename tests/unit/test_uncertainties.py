@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.model import fit_tile_numba, information_numba, profile_numba
+from pchem_pipeline.model import information_numba, profile_numba
 from pchem_pipeline.model.discovery import false_discovery, misfit, poorest
 from pchem_pipeline.model.fisher import correlations, covariance_from, sandwich_covariance
 from pchem_pipeline.model.intervals import INTERVAL_NAMES, profile_intervals, quantile_of
@@ -268,5 +268,3 @@ def test_a_hit_pixel_goes_through_the_plain_loop_as_through_the_compiled() -> No
     np.testing.assert_allclose(estimates(fit), estimates(clean), rtol=1e-6)
     assert fit.outlier_share[0] == pytest.approx(2 / 502)
     assert clean.outlier_share[0] == 0
-    room = fit_tile_numba.inner_ends.py_func
-    assert callable(room)
