@@ -46,7 +46,7 @@ def write_run(folder: Path, data: ReportData, *, n_frames: int = 400) -> RunStor
 
 def inspected(store: RunStore, data: ReportData) -> ReportData:
     """Return the same report with its inspector."""
-    shown = [(0, 0), (1, 2)]
+    shown = [(0, 0)]
     return replace(
         data,
         inspector=gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, shown),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.stages.session import Command, find_run, run_stages, run_status
+from pchem_pipeline.stages.view import RunView
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS
 
@@ -144,6 +146,26 @@ def test_report_names_the_model(both) -> None:
     html = (path.parent / "run.zarr/report.html").read_text()
     assert f"The model is {words}." in html
     assert words in (path.parent / "run.zarr/report.json").read_text()
+
+
+def test_the_inspector_holds_the_law_of_the_grown_model(both) -> None:
+    store = RunStore.open(both[0].parent / "run.zarr")
+    pixel = RunView(store).answer("GET", "/api/pixel?y=3&x=4", {"host": "127.0.0.1:1"}, 1)
+    content = json.loads(pixel.content)
+    counts, mass = np.array(content["counts"]), np.array(content["mass"])
+    assert 0.97 < mass.sum() < 1.0001
+    expected = counts.sum() * mass
+    many = expected > 20
+    assert many.sum() > 20
+    assert np.abs((counts - expected)[many] / np.sqrt(expected[many])).max() < 5
+    fitted = [content["values"][f"maps/{name}"] for name in PARAMETERS]
+    # row noise makes the peaks wider than the pixel's own read noise
+    assert content["deciding"][3] > fitted[3] + 0.1
+    page = (store.path / "report.html").read_text(encoding="utf-8")
+    facts = json.loads(page.split('id="inspector-facts">', 1)[1].split("</script>", 1)[0])
+    assert facts["model"].startswith("PCD + ")
+    assert facts["sample"]["deciding"]
+    assert facts["sample"]["masses"] == 300
 
 
 def test_tiles_do_not_change_the_grown_fit(both, tmp_path: Path) -> None:

@@ -365,6 +365,47 @@ def test_the_status_map_has_its_words_and_selects_by_them(tab: Tab, store: RunSt
     assert selected(tab) == n
 
 
+def test_zoom_and_pan(tab: Tab) -> None:
+    tab.page.locator("#inspector-canvas").scroll_into_view_if_needed()
+    for _ in range(4):
+        tab.page.click("#inspector-in")
+    tab.page.locator("#inspector-canvas").scroll_into_view_if_needed()
+    box = tab.page.locator("#inspector-canvas").bounding_box()
+    scale = min(box["width"] / NX, box["height"] / NY) * 1.6**4
+    x, y = box["x"] + box["width"] / 2 + 1, box["y"] + box["height"] / 2 + 1
+    tab.page.mouse.click(x, y)
+    tab.wait(NY // 2 * NX + NX // 2)
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x + 3 * scale, y + 2 * scale, steps=3)
+    tab.page.mouse.up()
+    tab.page.mouse.click(x, y)
+    tab.wait((NY // 2 - 2) * NX + NX // 2 - 3)
+    tab.page.click("#inspector-whole")
+    tab.click(3, 5)
+
+
+def test_hovering_tells_the_value(tab: Tab, store: RunStore) -> None:
+    i = min(i for i in in_full(tab) if i > 1000 and store.read("fit/fit_status").ravel()[i] == 0)
+    tab.page.mouse.move(*tab.position(*divmod(i, NX)))
+    words = (
+        f"pixel y = {i // NX}, x = {i % NX}: read noise {shown_value(store, 'read_noise_e', i)} · good fit"
+    )
+    assert tab.text("#inspector-tip") == words
+
+
+def test_a_line_of_channels(open_tab: Any, tmp_path: Path) -> None:
+    names = ("dark", "red <b>", *(f"c{i}" for i in range(10)))
+    store = make_run(tmp_path, (1, 12), failed=0.0, n_frames=300, channel_names=names)
+    tab = open_tab(file_url(store))
+    assert tab.page.locator("#inspector-y").is_hidden()
+    tab.page.fill("#inspector-x", "1")
+    tab.page.keyboard.press("Enter")
+    tab.wait(1)
+    assert tab.text("#inspector-title") == "Channel 1 red <b>"
+    assert tab.page.locator("#inspector-canvas").bounding_box()["height"] >= 40
+
+
 def test_the_address_leads_to_the_pixel(open_tab: Any, store: RunStore) -> None:
     first = open_tab(file_url(store))
     first.show("maps/bias")
