@@ -17,10 +17,11 @@ from scipy.optimize import minimize
 from pchem_pipeline.model.pcd import QUANTISATION_VARIANCE, log_pcd, pcd_mass
 from pchem_pipeline.planning.point import FloatArray, Point
 
-__all__ = ["Ambiguity", "ambiguity", "rounding_shift"]
+__all__ = ["Ambiguity", "ambiguity", "gain_rival", "rounding_shift"]
 
 _COARSE = 0.9  # DN: rounding errors fall as exp(-2 pi^2 sigma^2), to 1e-7 here
 _OFFSETS = (1.0, 0.75, 0.5, 1.25)  # e- off at the brightest sample; the rival lies near 1
+_GAIN_CHANGES = (0.1, 0.2)  # of ln g
 _LEAST_EXPOSURE = 0.02
 
 
@@ -50,26 +51,28 @@ def ambiguity(exposures: Sequence[float], shares: Sequence[float], read_noise_e:
 
     The exposure of the brightest sample is held half an electron or more off, and everything else is fitted.
     With one sample the rival is the neighbour ``(H -+ 1, mu +- 1/g)``; with bias frames too it has another
-    gain. Where
-    there is no second maximum, the mean is infinite: the bound alone says what the samples tell.
+    gain. Where there is no second maximum, the mean is infinite: the bound alone says what the samples tell.
 
     Args:
         exposures: H of the samples, e-; 0 for bias frames.
         shares: of the frames that each has, adding up to 1.
         read_noise_e: s_e, e-.
     """
-    lit = [(float(h), float(p)) for h, p in zip(exposures, shares, strict=True) if h > 0 and p > 0]
-    dark = sum(float(p) for h, p in zip(exposures, shares, strict=True) if h == 0)
-    lit.sort()
-    laws = [_Law.of(h, p, read_noise_e) for h, p in lit]
-    top = lit[-1][0]
+    lights, laws, dark = _split_off_bias(exposures, shares, read_noise_e)
+    top, noise = lights[-1], np.log(read_noise_e)
     found = Ambiguity(float("inf"), 0.0)
     for side in (-1.0, 1.0):
         heights: list[tuple[float, Ambiguity]] = []
         step = None
         for offset in (offset for offset in _OFFSETS if top + side * offset >= _LEAST_EXPOSURE):
-            rival = _Rival(laws, dark, read_noise_e, top + side * offset)
-            starts = [step] if step is not None else rival.starts([h for h, _ in lit])
+            held = top + side * offset
+            rival = _Rival(laws, dark, read_noise_e, 2 + len(lights), float(np.log(held)))
+            shift, scale = held - top, held / top
+            starts = [rival.free([0.0, -shift, noise, *_logs([h + shift for h in lights])])]
+            if dark > 0 or len(lights) > 1:
+                starts.append(rival.free([np.log(scale), 0.0, noise, *_logs([h * scale for h in lights])]))
+            if step is not None:
+                starts = [step]
             step, _ = min((_descend(rival.cost, start) for start in starts), key=lambda end: end[1])
             heights.append((offset, rival.at(step)))
         heights.sort(key=lambda each: each[0])
@@ -78,6 +81,51 @@ def ambiguity(exposures: Sequence[float], shares: Sequence[float], read_noise_e:
             if farther.mean < min(nearer.mean, found.mean):
                 found = farther
     return found
+
+
+def gain_rival(
+    exposures: Sequence[float], shares: Sequence[float], read_noise_e: float, nearest: float = 0.1
+) -> Ambiguity:
+    """Return how well samples tell the truth from laws with quite another gain, per frame.
+
+    The bound looks at the peak of the likelihood alone. Where peaks of the histogram are weak and electrons
+    many, chance makes other gains as likely, and a fit ends there.
+
+    Args:
+        exposures: H of the samples, e-; 0 for bias frames.
+        shares: of the frames that each has, adding up to 1.
+        read_noise_e: s_e, e-.
+        nearest: smallest change of ln g to look at.
+    """
+    lights, laws, dark = _split_off_bias(exposures, shares, read_noise_e)
+    found = Ambiguity(float("inf"), 0.0)
+    for change in (side * offset for offset in _GAIN_CHANGES for side in (-1.0, 1.0)):
+        if abs(change) < nearest - 1e-9:
+            continue
+        rival = _Rival(laws, dark, read_noise_e, 0, change)
+        gain = np.exp(change)
+        # the same means and variances: H g^-2 and, without bias frames, mu + H/g stay
+        others = [h * gain**2 for h in lights]
+        bias = 0.0 if dark > 0 else float(np.mean(lights) * (1 - gain))
+        start = rival.free([change, bias, np.log(read_noise_e), *_logs(others)])
+        step, height = _descend(rival.cost, start)
+        if height < found.mean:
+            found = rival.at(step)
+    return found
+
+
+def _split_off_bias(
+    exposures: Sequence[float], shares: Sequence[float], noise: float
+) -> tuple[list[float], list[_Law], float]:
+    """Return the exposures with electrons, rising, their laws, and the share of bias frames."""
+    pairs = list(zip(map(float, exposures), map(float, shares), strict=True))
+    lit = sorted((h, p) for h, p in pairs if h > 0 and p > 0)
+    dark = sum(p for h, p in pairs if h == 0)
+    return [h for h, _ in lit], [_Law.of(h, p, noise) for h, p in lit], dark
+
+
+def _logs(exposures: Sequence[float]) -> list[float]:
+    return [float(np.log(max(h, _LEAST_EXPOSURE))) for h in exposures]
 
 
 @dataclass(frozen=True)
@@ -92,7 +140,7 @@ class _Law:
     @classmethod
     def of(cls, exposure: float, share: float, noise: float) -> _Law:
         width = 9 * np.sqrt(exposure) + 9
-        y = np.arange(max(0.0, exposure - width) - 8 * noise, exposure + width + 8 * noise, noise / 3)
+        y = np.arange(max(0.0, exposure - width) - 8 * noise, exposure + width + 8 * noise, noise / 2.5)
         log_density = log_pcd(y, exposure, 1.0, 0.0, noise)
         weights = np.exp(log_density)
         keep = weights > 1e-14 * weights.max()
@@ -101,59 +149,53 @@ class _Law:
 
 @dataclass(frozen=True)
 class _Rival:
-    """Laws with the brightest exposure held; free are (ln g, g mu, ln sigma, ln of the other H)."""
+    """Laws with one of (ln g, g mu, ln sigma, ln H of each lit sample) held, and the others free."""
 
     laws: Sequence[_Law]
     dark: float
     noise: float
-    brightest: float
+    place: int
+    value: float
 
-    def starts(self, exposures: Sequence[float]) -> list[FloatArray]:
-        """Return where to start: all electron numbers shifted, and all of them scaled."""
-        shift = self.brightest - exposures[-1]
-        shifted = [np.log(max(h + shift, _LEAST_EXPOSURE)) for h in exposures[:-1]]
-        scale = self.brightest / exposures[-1]
-        scaled = [np.log(h * scale) for h in exposures[:-1]]
-        noise = np.log(self.noise)
-        starts = [np.array([0.0, -shift, noise, *shifted])]
-        if self.dark > 0 or shifted:
-            starts.append(np.array([np.log(scale), 0.0, noise, *scaled]))
-        return starts
+    def free(self, theta: Sequence[float]) -> FloatArray:
+        """Return the parameters without the held one."""
+        return np.delete(np.asarray(theta, np.float64), self.place)
 
-    def gaps(self, step: FloatArray) -> list[FloatArray]:
-        """Return the log-likelihood ratios of truth and rival on the nodes of every sample."""
-        gain, bias, sigma = np.exp(step[0]), step[1], np.exp(step[2])
-        exposures = [*np.exp(step[3:]), self.brightest]
-        return [
+    def gaps(self, step: FloatArray) -> tuple[list[FloatArray], FloatArray]:
+        """Return the log-likelihood ratios of truth and rival on the nodes of every sample, and the rival."""
+        theta = np.insert(step, self.place, self.value)
+        gain, bias, sigma = np.exp(theta[0]), theta[1], np.exp(theta[2])
+        gaps = [
             law.log_density - log_pcd(law.y, h, gain, bias, sigma)
-            for law, h in zip(self.laws, exposures, strict=True)
+            for law, h in zip(self.laws, np.exp(theta[3:]), strict=True)
         ]
+        return gaps, theta
 
     def cost(self, step: FloatArray) -> float:
         """Return the expected gap per frame, nats."""
-        total = sum(
-            law.share * float(law.weights @ gap) for law, gap in zip(self.laws, self.gaps(step), strict=True)
-        )
-        return total + self.dark * self._dark_gap(step)[0]
+        gaps, theta = self.gaps(step)
+        total = sum(law.share * float(law.weights @ gap) for law, gap in zip(self.laws, gaps, strict=True))
+        return total + self.dark * self._dark_gap(theta)[0]
 
     def at(self, step: FloatArray) -> Ambiguity:
         """Return mean and variance of the gap per frame."""
-        variance = self.dark * self._dark_gap(step)[1]
-        for law, gap in zip(self.laws, self.gaps(step), strict=True):
+        gaps, theta = self.gaps(step)
+        variance = self.dark * self._dark_gap(theta)[1]
+        for law, gap in zip(self.laws, gaps, strict=True):
             mean = float(law.weights @ gap)
             variance += law.share * float(law.weights @ (gap - mean) ** 2)
         return Ambiguity(self.cost(step), variance)
 
-    def _dark_gap(self, step: FloatArray) -> tuple[float, float]:
+    def _dark_gap(self, theta: FloatArray) -> tuple[float, float]:
         """Return mean and variance of the gap of one bias frame: two normal laws."""
-        ratio, shift = np.exp(2 * (np.log(self.noise) - step[2])), step[1] / np.exp(step[2])
+        ratio, shift = np.exp(2 * (np.log(self.noise) - theta[2])), theta[1] / np.exp(theta[2])
         mean = 0.5 * (ratio - 1 - np.log(ratio) + shift**2)
         return float(mean), float(0.5 * (ratio - 1) ** 2 + ratio * shift**2)
 
 
 def _descend(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[FloatArray, float]:
     """Return the minimum next to a start, and its height."""
-    result = minimize(cost, start, method="BFGS", options={"gtol": 1e-6, "maxiter": 200})
+    result = minimize(cost, start, method="BFGS", options={"gtol": 1e-6, "maxiter": 100})
     return np.asarray(result.x, np.float64), float(result.fun)
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
-from pchem_pipeline.planning.likelihood_limits import ambiguity, rounding_shift
+from pchem_pipeline.planning.frames import best_exposure, exposure_grid, frames_needed, precision
+from pchem_pipeline.planning.likelihood_limits import ambiguity, gain_rival, rounding_shift
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import Target
@@ -20,7 +20,7 @@ __all__ = ["LEAST_SHARE", "Need", "Plan", "SamplesPlan", "plan_one_sample", "pla
 _COUNTED = ("quanta_exposure", "dark_current", "bias")
 #: Without so much knowledge of the gain, the bound says nothing about real fits.
 _SEEN = Target("conversion_gain", 25.0, "%")
-_BISECTIONS = 7
+_TRIED = 10  # exposures
 #: Smaller shares are not worth a sample.
 LEAST_SHARE = 1e-3
 
@@ -33,7 +33,8 @@ class Need:
         target: what is wanted.
         bound: frames by the Cramer-Rao bound.
         certain: frames until electron numbers are not off by one; 0 where that does not matter.
-        seen: frames until the gain is known to a quarter, below which one Gaussian fits as well.
+        seen: frames until the gain is known to a quarter, below which one Gaussian fits as well, and until no
+            other gain is as likely by chance.
         shift: systematic error by rounding; relative, of the bias in e-.
     """
 
@@ -114,7 +115,7 @@ def plan_one_sample(
         ConfigError: a target that no number of frames reaches.
     """
     aims = tuple(targets) or (Target("conversion_gain", 1.0, "%"),)
-    best, best_frames = _best(aims, point, max_exposure, budget)
+    best, best_frames = _best(aims, point, max_exposure)
     if not exposure_given:
         if not np.isfinite(best):
             raise ConfigError(_hopeless(aims[0], point, "at any exposure", ""))
@@ -132,7 +133,17 @@ def _need(target: Target, point: Point, shifts: FloatArray) -> Need:
     certain = 0.0
     if target.name in _COUNTED:
         certain = ambiguity([point.quanta_exposure], [1.0], point.read_noise_e).frames()
-    return Need(target, frames_needed(target, point, shift), certain, frames_needed(_SEEN, point), shift)
+    seen = max(frames_needed(_SEEN, point), _gain_certain([point.quanta_exposure], [1.0], [target], point))
+    return Need(target, frames_needed(target, point, shift), certain, seen, shift)
+
+
+def _gain_certain(
+    exposures: Sequence[float], shares: Sequence[float], targets: Sequence[Target], point: Point
+) -> float:
+    """Return the frames until no other gain, farther away than what is wanted of it, is as likely."""
+    wanted = [target.wanted(point) for target in targets if target.name == "conversion_gain"]
+    nearest = max(0.1, 4 * min(wanted, default=0.0))
+    return gain_rival(exposures, shares, point.read_noise_e, min(nearest, 0.2)).frames()
 
 
 def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frames: float) -> None:
@@ -176,32 +187,33 @@ def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
     )
 
 
-def _best(
-    targets: Sequence[Target], point: Point, max_exposure: float, budget: int | None
-) -> tuple[float, float]:
-    """Return the best exposure and its frames; electron numbers must be certain where a target needs them."""
+def _best(targets: Sequence[Target], point: Point, max_exposure: float) -> tuple[float, float]:
+    """Return the best exposure and its frames: those of the bound, and until gain and counts are certain.
+
+    Where the bound's best will not do, the others are tried in the order of their bounds, as long as these
+    promise anything.
+    """
     low = min(0.02, 0.1 * max_exposure)
-    targets = (*targets, _SEEN)
-    exposure, frames = best_exposure(targets, point, low, max_exposure)
-    if not np.isfinite(exposure) or not any(target.name in _COUNTED for target in targets):
-        return exposure, frames
-
-    def both(h: float) -> tuple[float, float]:
-        there = replace(point, quanta_exposure=h)
-        bound = max(frames_needed(target, there) for target in targets)
-        return bound, ambiguity([h], [1.0], point.read_noise_e).frames()
-
-    # the bound falls with the exposure up to its best, and certainty costs more and more frames
-    left, right = np.log(low), np.log(exposure)
-    bound, certain = both(exposure)
-    if certain <= max(bound, float(budget or 0)):
-        return exposure, max(bound, certain)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (left + right)
-        bound, certain = both(float(np.exp(middle)))
-        left, right = (middle, right) if certain <= max(bound, float(budget or 0)) else (left, middle)
-    found = float(np.exp(left))
-    return found, max(both(found))
+    aims = (*targets, _SEEN)
+    counted = any(target.name in _COUNTED for target in targets)
+    first, fewest = best_exposure(aims, point, low, max_exposure)
+    if not np.isfinite(first):
+        return first, fewest
+    others = [replace(point, quanta_exposure=float(h)) for h in exposure_grid(low, max_exposure, _TRIED)]
+    promises = [(max(frames_needed(target, there) for target in aims), there) for there in others]
+    promises.append((fewest, replace(point, quanta_exposure=first)))
+    promises.sort(key=lambda each: each[0])
+    best, frames = first, float("inf")
+    for bound, there in promises:
+        if bound >= frames:
+            break
+        h = there.quanta_exposure
+        certain = _gain_certain([h], [1.0], targets, there)
+        if counted and certain < frames:
+            certain = max(certain, ambiguity([h], [1.0], point.read_noise_e).frames())
+        if max(bound, certain) < frames:
+            best, frames = h, max(bound, certain)
+    return best, frames
 
 
 def plan_samples(
@@ -233,11 +245,11 @@ def plan_samples(
         split = best_split(aims, exposures, point)
     # too few frames to be worth a sample of their own
     kept = [(h, p) for h, p in zip(split.exposures, split.shares, strict=True) if p > LEAST_SHARE]
-    certain = (
-        ambiguity([h for h, _ in kept], [p for _, p in kept], point.read_noise_e).frames()
-        if _lit(kept)
-        else 0.0
-    )
+    certain = 0.0
+    if any(exposure > 0 for exposure, _ in kept):
+        used, parts = [h for h, _ in kept], [p for _, p in kept]
+        certain = ambiguity(used, parts, point.read_noise_e).frames()
+        certain = max(certain, _gain_certain(used, parts, targets, point))
     frames = max(split.frames, certain)
     if frames > max_frames:
         lights = ", ".join(f"{h:g}" for h in split.exposures)
@@ -249,7 +261,3 @@ def plan_samples(
     even = split_frames(aims, split.exposures, [1.0 / len(split.shares)] * len(split.shares), point)
     per_sample = tuple(int(np.ceil(share * total)) if share > LEAST_SHARE else 0 for share in split.shares)
     return SamplesPlan(point, split, even, certain, total, per_sample)
-
-
-def _lit(samples: Sequence[tuple[float, float]]) -> bool:
-    return any(exposure > 0 for exposure, _ in samples)

@@ -85,6 +85,12 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         ("methods",),
     ),
     (
+        "plan",
+        "How many frames are enough?",
+        "The information of one frame tells how many of them a precision needs, before they are taken.",
+        (),
+    ),
+    (
         "status",
         "Fit status",
         "Pixels that could not be fitted, or whose values deserve caution, and why.",

@@ -104,6 +104,7 @@ class ReportData:
         discrepancy: what the model is missing, or None where nobody looked.
         inspector: maps and pixels to look at in the browser, or None.
         methods: content of ``methods.json``, or None where nobody compared.
+        plan: frames that precisions need, or None where no pixel has a value.
     """
 
     title: str
@@ -135,6 +136,7 @@ class ReportData:
     discrepancy: DiscrepancyData | None = None
     inspector: InspectorData | None = None
     methods: Mapping[str, Any] | None = None
+    plan: Mapping[str, Any] | None = None
 
     @property
     def noun(self) -> str:

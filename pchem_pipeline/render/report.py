@@ -14,6 +14,7 @@ from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.inspector import content_policy, embedded, script
 from pchem_pipeline.render.method_exhibits import method_exhibits, method_tables
 from pchem_pipeline.render.pictures import DrawAll, Picture, draw_picture, longest_first, ready_picture
+from pchem_pipeline.render.plan_exhibits import plan_exhibits, plan_tables
 from pchem_pipeline.render.report_json import report_json
 from pchem_pipeline.render.sections import Material, page_sections
 from pchem_pipeline.render.settings import ReportSettings
@@ -54,7 +55,7 @@ def render_report(
     """
     settings = settings or ReportSettings()
     figures: dict[str, bytes] = {}
-    shown = [*exhibits(data, settings), *method_exhibits(data)]
+    shown = [*exhibits(data, settings), *method_exhibits(data), *plan_exhibits(data)]
     others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
     drawn = {} if draw is None else draw(longest_first([*shown, *others]), settings)
 
@@ -64,7 +65,7 @@ def render_report(
         return draw_picture(exhibit, settings, figures)
 
     pictures = [picture(exhibit) for exhibit in shown]
-    tables = [*result_tables(data), *method_tables(data)]
+    tables = [*result_tables(data), *method_tables(data), *plan_tables(data)]
     view: DiscrepancyView[Picture] | None = None
     if data.discrepancy is not None:
         view = discrepancy_view(data.discrepancy, picture)

@@ -16,6 +16,7 @@ from pchem_pipeline.render.exhibits import Exhibit, exhibits
 from pchem_pipeline.render.figure_data import figure_tables
 from pchem_pipeline.render.method_exhibits import method_exhibits
 from pchem_pipeline.render.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
+from pchem_pipeline.render.plan_exhibits import plan_exhibits
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.stages.drawing import drawing_executor
 from pchem_pipeline.stages.report import gather
@@ -86,7 +87,7 @@ def gather_run(target: Target) -> ReportData:
 def exhibits_of(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
     """Return the figures of the report and of the discrepancy page."""
     others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
-    return [*exhibits(data, settings), *method_exhibits(data), *others]
+    return [*exhibits(data, settings), *method_exhibits(data), *plan_exhibits(data), *others]
 
 
 def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:

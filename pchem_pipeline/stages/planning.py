@@ -160,7 +160,7 @@ def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[
     for need in plan.needs:
         words = f"{need.target!s:<34}{need.bound:>14,.0f} frames"
         if need.seen > max(need.bound, need.certain):
-            words += f"; {need.seen:,.0f} until electrons are told from noise at all"
+            words += f"; {need.seen:,.0f} until no other gain is as likely by chance"
         elif need.certain > need.bound:
             words += f"; {need.certain:,.0f} until electron numbers are not off by one"
         lines.append(words)

@@ -21,6 +21,7 @@ from pchem_pipeline.render.discrepancy_exhibits import DISCREPANCY_NAMES
 from pchem_pipeline.render.discrepancy_page import DISCREPANCY_PAGE
 from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
 from pchem_pipeline.render.method_exhibits import METHOD_FIGURE
+from pchem_pipeline.render.plan_exhibits import PLAN_FIGURE
 from pchem_pipeline.render.report import RenderedReport, render_report
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.declared import DECLARED
@@ -29,6 +30,7 @@ from pchem_pipeline.stages.drawing import draw_by_workers
 from pchem_pipeline.stages.fitted_model import fitted_effects
 from pchem_pipeline.stages.inspector import gather_inspector
 from pchem_pipeline.stages.methods_result import METHODS_FILE, read_methods
+from pchem_pipeline.stages.plan_section import plan_section
 from pchem_pipeline.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
 
 if TYPE_CHECKING:
@@ -167,6 +169,7 @@ def _write(
             *EXHIBIT_NAMES,
             *DISCREPANCY_NAMES,
             METHOD_FIGURE,
+            PLAN_FIGURE,
         ):
             old.unlink(missing_ok=True)
     for name, page in rendered.pages.items():
@@ -242,6 +245,7 @@ def gather(
         stages=list(stages),
         missing=_missing(maps, ensemble) | _not_compared(store),
         methods=read_methods(store),
+        plan=plan_section(maps, sensor.n_frames if sensor.kind == "frames" else None),
         discrepancy=discrepancy,
         inspector=gather_inspector(store, sensor, maps, fit, [(p.y, p.x) for p in pixels], suspects),
     )

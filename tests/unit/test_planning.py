@@ -10,7 +10,7 @@ import pytest
 from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.model.expected_information import inverse_information, shared_information
 from pchem_pipeline.planning.frames import best_exposure, frames_grid, frames_needed, precision
-from pchem_pipeline.planning.likelihood_limits import Ambiguity, ambiguity, rounding_shift
+from pchem_pipeline.planning.likelihood_limits import Ambiguity, ambiguity, gain_rival, rounding_shift
 from pchem_pipeline.planning.plan import plan_one_sample, plan_samples
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import best_samples, best_split, split_frames
@@ -277,3 +277,18 @@ def test_what_is_missing_gets_its_line(given, words, tmp_path):
         given = {**given, "figure": tmp_path / given["figure"]}
     with pytest.raises(ConfigError, match=words):
         make_plan(PlanRequest(**given))
+
+
+def test_weak_peaks_need_more_frames_than_the_bound_asks_for():
+    """At 0.4 e- and 8 e- the fit of as many frames as the bound asks for often ends at another gain."""
+    there = point(8.0, 0.4)
+    need = one(["conversion_gain=1%"], there).needs[0]
+    # the comb's height in the characteristic function, exp(-2 pi^2 s^2), squared: nats per frame
+    assert gain_rival([8.0], [1.0], 0.4).mean == pytest.approx(np.exp(-4 * np.pi**2 * 0.16), rel=0.3)
+    assert need.seen > 3 * need.bound
+    spoilt = verify([ONE_PERCENT], there, int(need.bound), 150, 1).checks[0]
+    good = verify([ONE_PERCENT], there, int(need.seen), 150, 1).checks[0]
+    assert spoilt.rmse > 0.03
+    assert good.rmse < 0.01 * np.sqrt(need.bound / need.seen) * (1 + 5 / np.sqrt(300))
+    easy = one(["conversion_gain=1%"], point()).needs[0]
+    assert easy.seen <= easy.bound

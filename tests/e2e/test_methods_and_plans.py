@@ -1,0 +1,103 @@
+"""``pchem methods`` and ``pchem plan`` as a user runs them."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from commands import Shell
+
+from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.store.run_store import RunStore
+
+
+@pytest.fixture(scope="module")
+def exposures(tmp_path_factory, kernels):
+    """Runs of the same 8 x 8 pixels: bright.zarr (fitted), dark.zarr and half.zarr (histograms)."""
+    shell = Shell(tmp_path_factory.mktemp("exposures"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    rng = np.random.default_rng(4)
+    step, bias = rng.normal(11, 0.5, (8, 8)), rng.normal(100, 2, (8, 8))
+    for name, light in (("bright", 2.0), ("dark", 0.0), ("half", 1.0)):
+        electrons = rng.poisson(light, (1500, 8, 8)) + 0.3 * rng.standard_normal((1500, 8, 8))
+        np.save(shell.folder / f"{name}.npy", np.rint(electrons * step + bias).astype(np.uint16))
+        text = f"run: {{store: {name}.zarr, tile: 8}}\ninput: {{files: [{name}.npy], bit_depth: 12}}\n"
+        (shell.folder / f"{name}.yaml").write_text(text)
+        for stage in ("ingest", "histogram"):
+            shell.ok(stage, f"{name}.yaml", "--quiet")
+    shell.ok("run", "bright.yaml", "--quiet")
+    return shell
+
+
+def test_methods_with_other_exposures(exposures):
+    result = exposures.ok(
+        "methods", "bright.zarr", "--with", "dark.zarr", "--with", "half.zarr", "--study-pixels", "0"
+    )
+    found = json.loads((exposures.folder / "bright.zarr" / "methods.json").read_text())
+    names = [method["name"] for method in found["methods"]]
+    assert names == list(methods())
+    assert all(not method["missing"] for method in found["methods"])
+    assert [sample["n_frames"] for sample in found["samples"]] == [1500] * 3
+    assert found["samples"][1]["quanta_exposure"] == pytest.approx(0, abs=0.02)
+    transfer = found["methods"][names.index("photon_transfer")]
+    # delta method: 5.5 % at 1500 frames; the fit itself errs by a sixth of that
+    assert transfer["errors"]["conversion_gain"]["rmse"] == pytest.approx(0.055, rel=5 / np.sqrt(128) + 0.1)
+    assert transfer["title"] in result.stdout
+    assert result.stdout.splitlines()[-1].endswith("report.html")
+    store = RunStore.open(exposures.folder / "bright.zarr")
+    gains = store.read("methods/conversion_gain")
+    assert gains.shape == (len(names), 64)
+    assert store.attributes("methods/conversion_gain")["methods"] == names
+    fit = store.read("fit/conversion_gain")[store.read("methods/pixel_y"), store.read("methods/pixel_x")]
+    np.testing.assert_array_equal(gains[names.index("pchem_em")], fit)
+    page = (exposures.folder / "bright.zarr" / "report.html").read_text()
+    assert "Other methods beside PCH-EM" in page
+    assert transfer["title"] in page
+    assert "methods     complete" in exposures.ok("status", "bright.zarr").stdout
+    # what is up to date is not done again, and a wrong sample costs nothing of it
+    before = (exposures.folder / "bright.zarr" / "methods.json").stat().st_mtime_ns
+    for others, words in (
+        (["bright.zarr"], "is the run itself"),
+        (["dark.zarr", "dark.zarr"], "is listed twice"),
+        (["none.zarr"], "there is no run at"),
+    ):
+        options = [option for name in others for option in ("--with", name)]
+        refused = exposures("methods", "bright.zarr", *options, "--quiet")
+        assert refused.code in (2, 4)
+        assert words in refused.last
+        assert len(refused.stderr.strip().splitlines()) == 1
+    assert (exposures.folder / "bright.zarr" / "methods.json").stat().st_mtime_ns == before
+
+
+def test_samples_of_other_pixels_or_the_same_frames_are_refused(exposures):
+    frames = np.load(exposures.folder / "dark.npy")
+    np.save(exposures.folder / "small.npy", frames[:, :4])
+    (exposures.folder / "small.yaml").write_text(
+        "run: {store: small.zarr, tile: 8}\ninput: {files: [small.npy]}\n"
+    )
+    (exposures.folder / "again.yaml").write_text(
+        "run: {store: again.zarr, tile: 8}\ninput: {files: [bright.npy]}\n"
+    )
+    for name in ("small", "again"):
+        for stage in ("ingest", "histogram"):
+            exposures.ok(stage, f"{name}.yaml", "--quiet")
+    refused = exposures("methods", "bright.zarr", "--with", "small.zarr", "--quiet")
+    assert refused.code == 4
+    assert "has 4 x 8 pixels, this run 8 x 8" in refused.last
+    refused = exposures("methods", "bright.zarr", "--with", "again.zarr", "--quiet")
+    assert refused.code == 4
+    assert "holds the same frames as bright.zarr" in refused.last
+
+
+def test_plan_answers_at_once_and_checks_itself(shell):
+    options = ("--read-noise", "0.3", "--exposure", "2", "--target", "conversion_gain=1%")
+    result = shell.ok(
+        "plan", *options, "--json", "plan.json", "--figure", "plan.png", "--verify", "--pixels", "200"
+    )
+    content = json.loads((shell.folder / "plan.json").read_text())
+    assert f"{content['frames']:,.0f} frames" in result.stdout
+    assert content["verified"][0]["checks"][0]["rmse"] == pytest.approx(0.01, rel=5 / np.sqrt(400))
+    assert (shell.folder / "plan.png").read_bytes().startswith(b"\x89PNG")
+    refused = shell("plan", "--read-noise", "2", "--exposure", "0.1", "--target", "conversion_gain=1%")
+    assert refused.code == 2
+    assert "no number of frames" in refused.last
+    assert refused.stdout == ""
