@@ -1,0 +1,108 @@
+"""What the benchmarks of whole runs share: starting them, reading their records, saying on what machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+__all__ = ["Outcome", "evict", "machine", "read_once", "run_pchem", "save_figure"]
+
+STAGES = ("ingest", "histogram", "fit", "maps", "ensemble", "report")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run took.
+
+    Attributes:
+        wall: seconds of the command, start-up included.
+        seconds: of each stage.
+        cpu: CPU seconds of each stage.
+        peak: largest resident memory of each stage's process so far, MiB.
+    """
+
+    wall: float
+    seconds: dict[str, float]
+    cpu: dict[str, float]
+    peak: dict[str, float]
+
+
+def machine() -> str:
+    """Return processor, cores, memory and versions in one line."""
+    name = platform.processor() or platform.machine()
+    facts = Path("/proc/cpuinfo")
+    if facts.exists():
+        found = re.search(r"model name\s*:\s*(.*)", facts.read_text())
+        name = found[1] if found else name
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    libraries = ", ".join(f"{each} {version(each)}" for each in ("numpy", "numba", "zarr", "pchem-pipeline"))
+    load = os.getloadavg()[0]
+    return (
+        f"{name}, {os.cpu_count()} processors, {memory:.0f} GiB, load {load:.1f}; "
+        f"Python {platform.python_version()}, {libraries}"
+    )
+
+
+def evict(path: Path) -> None:
+    """Ask the operating system to forget a file, so that it is read from the disk the next time."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+        os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def read_once(path: Path) -> float:
+    """Return the seconds that reading a file once with ``readinto`` takes: the floor of any method."""
+    buffer = memoryview(bytearray(64 << 20))
+    start = time.perf_counter()
+    with path.open("rb", buffering=0) as file:
+        while file.readinto(buffer):
+            pass
+    return time.perf_counter() - start
+
+
+_SOME_STAGES = """
+import sys
+from pathlib import Path
+from pchem_pipeline.compute.environment import prepare_environment
+prepare_environment()
+from pchem_pipeline.stages.session import Command, find_run, run_stages
+run_stages(find_run(Path(sys.argv[1])), sys.argv[2:], Command(quiet=True))
+"""
+
+
+def run_pchem(config: Path, stages: Sequence[str] = ()) -> Outcome:
+    """Run ``pchem run``, or some stages, in a process of its own; the store is ``<stem>.zarr`` beside it."""
+    command = [str(Path(sys.executable).with_name("pchem")), "run", str(config), "--quiet"]
+    if stages:
+        command = [sys.executable, "-c", _SOME_STAGES, str(config), *stages]
+    start = time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wall = time.perf_counter() - start
+    folder = config.with_suffix(".zarr") / ".pchem" / "stages"
+    records = {}
+    for name in STAGES:
+        if (folder / f"{name}.json").exists():
+            records[name] = json.loads((folder / f"{name}.json").read_text())
+    return Outcome(
+        wall,
+        {name: record["seconds"] for name, record in records.items()},
+        {name: record["cpu_seconds"] for name, record in records.items()},
+        {name: record["peak_rss_bytes"] / 2**20 for name, record in records.items()},
+    )
+
+
+def save_figure(figure: object, folder: Path, name: str) -> None:
+    """Save a figure as PNG and SVG, and say where."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for suffix in ("png", "svg"):
+        figure.savefig(folder / f"{name}.{suffix}", dpi=150, bbox_inches="tight")  # type: ignore[attr-defined]
+    print(f"figure: {folder / name}.png")
