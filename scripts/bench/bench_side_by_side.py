@@ -210,9 +210,13 @@ def draw(rows: list[Row], folder: Path, title: str) -> None:
     names = [row.what for row in rows]
     colours = ["tab:blue" if name.startswith("pchem") else "0.65" for name in names]
     bars = axes.barh(names, [row.seconds for row in rows], color=colours)
-    axes.bar_label(bars, [f" {row.seconds:.3g} s" for row in rows], fontsize=8)
+    axes.bar_label(
+        bars,
+        [f" {row.seconds:,.3g} s" if row.seconds < 100 else f" {row.seconds:,.0f} s" for row in rows],
+        fontsize=8,
+    )
     axes.set_xscale("log")
-    axes.set_xlim(right=axes.get_xlim()[1] * 4)
+    axes.set_xlim(right=axes.get_xlim()[1] * 10)
     axes.invert_yaxis()
     axes.set_xlabel("seconds for the whole stack")
     axes.set_title(title, fontsize=9)
