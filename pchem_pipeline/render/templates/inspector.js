@@ -31,7 +31,7 @@
   const cssColour = (name) => getComputedStyle(app).getPropertyValue(name).trim();
   const whole = (number) => number.toLocaleString("en-US");
   const minus = (text) => text.replace("-", "−");
-  const superscript = (power) => String(power).replace(/./g, (c) => "⁰¹²³⁴⁵⁶⁷⁸⁹"["0123456789".indexOf(c)] ?? "⁻");
+  const superscript = (power) => String(power).replace(/./g, (sign) => "⁰¹²³⁴⁵⁶⁷⁸⁹"["0123456789".indexOf(sign)] ?? "⁻");
   const plural = (count, noun) => `${whole(count)} ${noun}${count === 1 ? "" : "s"}`;
 
   // the same rounding as in the rest of the report
@@ -39,7 +39,8 @@
     if (!Number.isFinite(value)) return "not known";
     if (value === 0) return "0";
     const exponent = Math.floor(Math.log10(Math.abs(Number(value.toExponential(digits - 1)))));
-    if (exponent > -4 && exponent < Math.max(digits, 5)) return minus(value.toFixed(Math.max(digits - 1 - exponent, 0)));
+    const decimals = Math.max(digits - 1 - exponent, 0);
+    if (exponent > -4 && exponent < Math.max(digits, 5)) return minus(value.toFixed(decimals));
     return minus(`${(value / 10 ** exponent).toFixed(digits - 1)}×10`) + superscript(exponent);
   };
   const measured = (value, error, unit = "") => {
@@ -201,7 +202,9 @@
   const pack = (r, g, b, a) => (little ? (a << 24) | (b << 16) | (g << 8) | r : (r << 24) | (g << 16) | (b << 8) | a) >>> 0;
   const hex = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16));
   const ramp = Array.from({ length: 256 }, (_, i) => hex(`#${facts.colours.slice(6 * i, 6 * i + 6)}`));
-  const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#e69f00", "#56b4e9", "#cc79a7", "#8c6d31", "#7f3c8d", "#a50f15", "#41484f", "#b5cf6b"];
+  const PALETTE = [
+    "#0072b2", "#d55e00", "#009e73", "#e69f00", "#56b4e9", "#cc79a7", "#8c6d31", "#7f3c8d", "#a50f15", "#41484f", "#b5cf6b",
+  ];
   const categories = (fact) => {
     const keys = Object.keys(fact.words).map(Number);
     if (fact.kind === "bits") return [[0, "good fit"], ...keys.map((key) => [key, fact.words[key]])];
@@ -310,7 +313,8 @@
     const wasWhole = view.scale <= view.fit * 1.001;
     const frame = canvas.parentElement;
     view.width = Math.max(frame.clientWidth, 80);
-    view.height = Math.round(clamp((view.width * ny * tall) / nx, 40, Math.min(Math.max(window.innerHeight * 0.75, 300), view.width * 1.2)));
+    const most = Math.min(Math.max(window.innerHeight * 0.75, 300), view.width * 1.2);
+    view.height = Math.round(clamp((view.width * ny * tall) / nx, 40, most));
     view.ratio = Math.min(window.devicePixelRatio || 1, 2);
     canvas.style.height = `${view.height}px`;
     canvas.width = Math.round(view.width * view.ratio);
@@ -336,8 +340,8 @@
   const describe = (i) => {
     const { map, error } = state;
     const text = valueText(map.fact, valueAt(map, i), error ? valueAt(error, i) : NaN);
-    const status = state.status && map !== state.status ? ` · ${wordsOf(state.status.fact, valueAt(state.status, i))}` : "";
-    return `${place(i)}: ${map.fact.label} ${text}${status}`;
+    const status = state.status && map !== state.status ? wordsOf(state.status.fact, valueAt(state.status, i)) : "";
+    return `${place(i)}: ${map.fact.label} ${text}${status && ` · ${status}`}`;
   };
   const tip = byId("inspector-tip");
   const hover = (event) => {
@@ -348,7 +352,8 @@
     const bounds = canvas.getBoundingClientRect();
     const left = event.clientX - bounds.left, top = event.clientY - bounds.top;
     tip.style.left = `${clamp(left + 14, 0, Math.max(view.width - tip.offsetWidth, 0))}px`;
-    tip.style.top = `${top + 18 + tip.offsetHeight > view.height ? Math.max(top - tip.offsetHeight - 10, 0) : top + 18}px`;
+    const fits = top + 18 + tip.offsetHeight <= view.height;
+    tip.style.top = `${fits ? top + 18 : Math.max(top - tip.offsetHeight - 10, 0)}px`;
   };
 
   const pointers = new Map();
@@ -369,7 +374,8 @@
       const gap = (a) => Math.hypot(a.clientX - other.clientX, a.clientY - other.clientY);
       const bounds = canvas.getBoundingClientRect();
       drag.far = 99;
-      zoom(gap(event) / Math.max(gap(before), 1), (event.clientX + other.clientX) / 2 - bounds.left, (event.clientY + other.clientY) / 2 - bounds.top);
+      const [atX, atY] = [(event.clientX + other.clientX) / 2 - bounds.left, (event.clientY + other.clientY) / 2 - bounds.top];
+      zoom(gap(event) / Math.max(gap(before), 1), atX, atY);
     } else if (drag.rectangle) {
       const where = pixelAt(event);
       if (where) state.corner.to = where;
@@ -393,7 +399,11 @@
     if (drag.far <= 4) state.corner = null;
     drag = null;
   });
-  canvas.addEventListener("pointercancel", (event) => { pointers.delete(event.pointerId); drag = null; state.corner = null; });
+  canvas.addEventListener("pointercancel", (event) => {
+    pointers.delete(event.pointerId);
+    drag = null;
+    state.corner = null;
+  });
   canvas.addEventListener("pointerleave", () => hover(null));
   canvas.addEventListener("wheel", (event) => {
     // scrolling the page must not get stuck on the map
@@ -416,12 +426,15 @@
   };
   canvas.addEventListener("keydown", (event) => {
     const step = event.shiftKey ? 10 : 1;
-    const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step], Home: [-nx, 0], End: [nx, 0] };
+    const moves = {
+      ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step], Home: [-nx, 0], End: [nx, 0],
+    };
     const at = state.pixel >= 0 ? [state.pixel % nx, Math.floor(state.pixel / nx)] : null;
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     if (moves[event.key]) {
       const [dx, dy] = moves[event.key];
-      const centre = [Math.floor(view.x + view.width / view.scale / 2), Math.floor(view.y + view.height / (view.scale * tall) / 2)];
+      const halves = [view.width / view.scale / 2, view.height / (view.scale * tall) / 2];
+      const centre = [Math.floor(view.x + halves[0]), Math.floor(view.y + halves[1])];
       const [px, py] = at ? [at[0] + dx, at[1] + dy] : centre;
       const to = [clamp(px, 0, nx - 1), clamp(py, 0, ny - 1)];
       if (state.corner) state.corner.to = to;
@@ -432,7 +445,11 @@
     else if (event.key === "[" || event.key === "]") neighbour(event.key === "]" ? 1 : -1);
     else if (event.key === "s" && at) {
       if (state.corner) finishRectangle();
-      else { state.corner = { from: at, to: at }; say("First corner set; move to the other one and press s again."); redraw(); }
+      else {
+        state.corner = { from: at, to: at };
+        say("First corner set; move to the other one and press s again.");
+        redraw();
+      }
     } else if (event.key === "Escape") { state.corner = null; select(null); }
     else return;
     event.preventDefault();
@@ -480,7 +497,8 @@
       if (state.colours !== "all") labels = [`≤ ${labels[0]}`, ...labels.slice(1, 4), `≥ ${labels[4]}`];
     }
     const strip = el("div", { class: "strip" });
-    strip.style.background = `linear-gradient(to right, ${ramp.filter((_, i) => i % 15 === 0).map((c) => `rgb(${c})`).join(",")})`;
+    const stops = ramp.filter((_, i) => i % 15 === 0).map((colour) => `rgb(${colour})`);
+    strip.style.background = `linear-gradient(to right, ${stops.join(",")})`;
     bar.append(strip, el("div", { class: "ticks" }, ...labels.map((text) => el("span", {}, text))));
     const missing = map.counts[NONE];
     const unit = map.fact.unit ? `in ${map.fact.unit}` : "";
@@ -491,8 +509,9 @@
   const plot = byId("inspector-histogram");
   const axisOf = (map) => {
     const f = map.log ? Math.log10 : (v) => v, back = map.log ? (v) => 10 ** v : (v) => v;
-    const a = f(Math.max(quantile(map, map.counts, 0.002), map.log ? 1e-300 : -Infinity)), b = f(quantile(map, map.counts, 0.998));
-    const ends = [f(Math.max(quantile(map, map.counts, 0), map.log ? 1e-300 : -Infinity)), f(quantile(map, map.counts, 1))];
+    const least = map.log ? codeValue(map, FIRST) : -Infinity;
+    const [start, a, b, end] = [0, 0.002, 0.998, 1].map((share) => f(Math.max(quantile(map, map.counts, share), least)));
+    const ends = [start, end];
     let low = Math.max(a - 0.3 * (b - a), ends[0]), high = Math.min(b + 0.3 * (b - a), ends[1]);
     if (!(high > low)) { const pad = Math.abs(low) * 0.05 || 1e-9; [low, high] = [low - pad, high + pad]; }
     return { f, back, low, high };
@@ -501,10 +520,15 @@
     const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
     const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= rough);
     const found = [];
-    for (let t = Math.ceil(low / step) * step; t <= high + 1e-9 * step; t += step) found.push(Math.abs(t) < step * 1e-9 ? 0 : t);
+    for (let t = Math.ceil(low / step) * step; t <= high + 1e-9 * step; t += step) {
+      found.push(Math.abs(t) < step * 1e-9 ? 0 : t);
+    }
     return found;
   };
-  const tickText = (value) => (Math.abs(value) >= 1e5 || (value !== 0 && Math.abs(value) < 1e-4) ? short(value, 2) : minus(String(Number(value.toPrecision(6)))));
+  const tickText = (value) => {
+    const plain = value === 0 || (Math.abs(value) < 1e5 && Math.abs(value) >= 1e-4);
+    return plain ? minus(String(Number(value.toPrecision(6)))) : short(value, 2);
+  };
   const stairs = (heights, at, level, floor) => {
     let path = `M${at(0)} ${floor}`;
     heights.forEach((height, i) => { path += `V${level(height).toFixed(1)}H${at(i + 1).toFixed(1)}`; });
@@ -521,8 +545,9 @@
     const axis = axisOf(map), wanted = clamp(Math.round(2 * Math.cbrt(total(map.counts))), 8, 96);
     const each = Math.max(1, Math.round((axis.high - axis.low) / map.step / wanted));
     const firstCode = Math.floor((axis.low - map.low) / map.step + FIRST + 0.5);
-    const bins = Math.max(1, Math.ceil((axis.high - map.low - (firstCode - FIRST - 0.5) * map.step) / (each * map.step)));
-    axis.low = map.low + (firstCode - FIRST - 0.5) * map.step;
+    const start = map.low + (firstCode - FIRST - 0.5) * map.step;
+    const bins = Math.max(1, Math.ceil((axis.high - start) / (each * map.step)));
+    axis.low = start;
     axis.high = axis.low + bins * each * map.step;
     const some = selection ? countCodes(map, selection) : null;
     const bin = (counts) => {
@@ -551,7 +576,8 @@
       const x = left + ((right - left) * (t - axis.low)) / (axis.high - axis.low);
       const anchor = x < left + 14 ? "start" : x > right - 14 ? "end" : "middle";
       plot.append(svgEl("line", { x1: x, x2: x, y1: floor, y2: floor + 4, class: "axis" }));
-      plot.append(svgEl("text", { x, y: height - 6, "text-anchor": anchor }, tickText(map.log ? Number((10 ** t).toPrecision(2)) : t)));
+      const shown = map.log ? Number((10 ** t).toPrecision(2)) : t;
+      plot.append(svgEl("text", { x, y: height - 6, "text-anchor": anchor }, tickText(shown)));
     }
     if (state.pixel >= 0) {
       const x = clamp(xOf(valueAt(map, state.pixel)), left, right);
@@ -559,10 +585,11 @@
     }
     brush = { axis, left, right, width, floor };
     const median = quantile(map, map.counts, 0.5);
-    plot.setAttribute("aria-label", `Histogram of ${map.fact.label}: median ${short(median)} ${map.fact.unit}, 5 to 95 % from ` +
-      `${short(quantile(map, map.counts, 0.05))} to ${short(quantile(map, map.counts, 0.95))}; ${whole(outside)} outside the axis`);
-    byId("inspector-histogram-words").textContent =
-      `${map.fact.label}: median ${short(median)} ${map.fact.unit}` + (outside ? `; ${whole(outside)} outside the axis` : "");
+    const [p5, p95] = [0.05, 0.95].map((share) => short(quantile(map, map.counts, share)));
+    const words = `${map.fact.label}: median ${short(median)} ${map.fact.unit}`;
+    const beyond = outside ? `; ${whole(outside)} outside the axis` : "";
+    plot.setAttribute("aria-label", `Histogram of ${words}, 5 to 95 % from ${p5} to ${p95}${beyond}`);
+    byId("inspector-histogram-words").textContent = words + beyond;
   };
   const brushValue = (event) => {
     const bounds = plot.getBoundingClientRect();
@@ -636,7 +663,8 @@
     let text = `${plural(count, facts.noun)} selected (${percent(count, n)}): ${state.selectionWords}.`;
     const counts = countCodes(map, selection);
     if (!categorical(map.fact) && total(counts)) {
-      text += ` Median ${map.fact.label} ${short(quantile(map, counts, 0.5))} ${map.fact.unit}, of all ${short(quantile(map, map.counts, 0.5))}.`;
+      const [some, all] = [counts, map.counts].map((each) => short(quantile(map, each, 0.5)));
+      text += ` Median ${map.fact.label} ${some} ${map.fact.unit}, of all ${all}.`;
     }
     say(text);
   };
@@ -656,7 +684,8 @@
     if (mine === turn) showPixel(pixel);
   };
   const pixelData = async (i) => {
-    const found = { index: i, values: new Map(), counts: null, origin: 0, deciding: null, mass: null, trouble: "", exact: false };
+    const found = { index: i, values: new Map(), counts: null, origin: 0, deciding: null, mass: null };
+    Object.assign(found, { trouble: "", exact: false });
     const slot = sample.slot.get(i);
     for (const fact of facts.maps) {
       if (fact.here) found.values.set(fact.path, valueAt(await layer(fact.path), i));
@@ -672,13 +701,17 @@
       try {
         const answer = await ask(`api/pixel?y=${Math.floor(i / nx)}&x=${i % nx}`);
         for (const [path, value] of Object.entries(answer.values)) found.values.set(path, value ?? NaN);
-        Object.assign(found, { counts: answer.counts, origin: answer.origin, deciding: answer.deciding, mass: answer.mass, exact: true });
-      } catch (error) { found.trouble = `The server does not answer (${error.message}). Is ${facts.command} still running?`; }
+        const { counts, origin, deciding, mass } = answer;
+        Object.assign(found, { counts, origin, deciding, mass, exact: true });
+      } catch (error) {
+        found.trouble = `The server does not answer (${error.message}). Is ${facts.command} still running?`;
+      }
     }
     return found;
   };
   const parametersOf = (pixel) => {
-    const [h, g, mu] = ["maps/quanta_exposure", "maps/conversion_gain", "maps/bias"].map((path) => pixel.values.get(path) ?? NaN);
+    const paths = ["maps/quanta_exposure", "maps/conversion_gain", "maps/bias"];
+    const [h, g, mu] = paths.map((path) => pixel.values.get(path) ?? NaN);
     let sigma = pixel.values.get("maps/read_noise_dn") ?? NaN;
     if (!Number.isFinite(sigma)) sigma = (pixel.values.get("maps/read_noise_e") ?? NaN) / g;
     return [h, g, mu, sigma].every(Number.isFinite) && g > 0 && sigma > 0 && h >= 0 ? [h, g, mu, sigma] : null;
@@ -715,110 +748,154 @@
       if (below / all < 1 - 2e-4) last = i + 1;
     });
     const margin = Math.max(2, Math.floor((last - first) / 10));
-    return [pixel.origin + Math.max(first - margin, -2), pixel.origin + Math.min(last + margin, pixel.counts.length + 1)];
+    const [from, to] = [Math.max(first - margin, -2), Math.min(last + margin, pixel.counts.length + 1)];
+    return [pixel.origin + from, pixel.origin + to];
   };
-  const drawPixel = (pixel) => {
-    const figure = byId("inspector-plot");
-    figure.replaceChildren();
+  // Everything that the drawing of a pixel needs: geometry, functions from DN to place, and what is known.
+  const sketch = (pixel, figure) => {
     const theta = parametersOf(pixel), counts = pixel.counts;
     const all = counts ? counts.reduce((sum, count) => sum + count, 0) : 0;
-    figure.style.display = theta || all ? "" : "none";
-    if (!theta && !all) return;
+    if (!theta && !all) return null;
     const width = Math.max(figure.parentElement.clientWidth, 240), height = 330;
-    const [left, right, top, floor, stripTop, stripFloor] = [52, width - 10, 22, 212, 232, 292];
-    const [low, high] = shownRange(pixel, theta);
-    const x = (dn) => left + ((right - left) * (dn - low + 0.5)) / (high - low + 1);
-    const n_ = all || 1, countAt = (dn) => counts?.[dn - pixel.origin] ?? 0;
+    const area = { width, height, left: 52, right: width - 10, top: 22, floor: 212, stripTop: 232, stripFloor: 292 };
+    const [low, high] = shownRange(pixel, theta), scale = all || 1;
+    const bins = Array.from({ length: high - low + 1 }, (_, i) => low + i);
+    const countAt = (dn) => counts?.[dn - pixel.origin] ?? 0;
     const expectedAt = (dn) => {
       if (!theta) return NaN;
-      if (facts.model) return pixel.mass ? n_ * (pixel.mass[dn - pixel.origin] ?? 0) : NaN;
-      return n_ * density(dn, theta);
+      if (facts.model) return pixel.mass ? scale * (pixel.mass[dn - pixel.origin] ?? 0) : NaN;
+      return scale * density(dn, theta);
     };
-    figure.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    figure.setAttribute("height", height);
-    const bins = Array.from({ length: high - low + 1 }, (_, i) => low + i);
-    const curve = [];
-    if (theta && facts.model) { if (pixel.mass) bins.forEach((dn) => curve.push([dn, expectedAt(dn)])); }
-    else if (theta) for (let i = 0; i <= 600; i++) { const dn = low - 0.5 + ((high - low + 1) * i) / 600; curve.push([dn, n_ * density(dn, theta)]); }
+    let curve = [];
+    if (theta && facts.model) curve = pixel.mass ? bins.map((dn) => [dn, expectedAt(dn)]) : [];
+    else if (theta) {
+      const fine = Array.from({ length: 601 }, (_, i) => low - 0.5 + ((high - low + 1) * i) / 600);
+      curve = fine.map((dn) => [dn, scale * density(dn, theta)]);
+    }
     const heights = bins.map(countAt);
     const peak = Math.max(...heights, ...curve.map(([, v]) => v), 1e-12);
-    const logarithmic = byId("inspector-log-pixel").checked && all > 0;
-    const level = (v) => floor - (floor - top) * (logarithmic ? Math.log10(Math.max(v, 0.5) / 0.5) / Math.log10(peak / 0.5) : v / peak);
-    const clip = (v) => clamp(v, top, floor);
-    // bars, components, density
-    if (all) figure.append(svgEl("path", { d: stairs(heights, (i) => x(low - 0.5 + i), level, floor), class: "bars" }));
-    if (theta && !facts.model) {
-      const parts = new Map();
-      for (const [dn] of curve) for (const [k, part] of components(dn, theta)) {
-        if (n_ * part > peak * 2e-4) (parts.get(k) ?? parts.set(k, []).get(k)).push([dn, n_ * part]);
-      }
-      if (parts.size <= 60) for (const [k, line] of parts) {
-        figure.append(svgEl("path", { d: line.map(([dn, v], i) => `${i ? "L" : "M"}${x(dn).toFixed(1)} ${clip(level(v)).toFixed(1)}`).join(""), class: `part part${k % 2}` }));
-      }
-    }
-    if (curve.length) figure.append(svgEl("path", { d: curve.map(([dn, v], i) => `${i ? "L" : "M"}${x(dn).toFixed(1)} ${clip(level(v)).toFixed(1)}`).join(""), class: "curve" }));
-    // edges of the electron numbers
-    const deciding = pixel.deciding?.every(Number.isFinite) ? pixel.deciding : facts.model ? null : theta;
-    const edges = [];
-    if (deciding && deciding[0] > 0) {
-      for (let k = 0; k < 400 && edge(k, deciding) < high + 0.5; k++) if (edge(k, deciding) > low - 0.5) edges.push([k, edge(k, deciding)]);
-      const every = Math.max(1, Math.ceil(edges.length / (width / 26)));
-      edges.forEach(([k, dn], i) => {
-        figure.append(svgEl("line", { x1: x(dn), x2: x(dn), y1: top, y2: floor, class: "edge" }));
-        const from = i ? edges[i - 1][1] : low - 0.5;
-        if (k % every === 0 && x(dn) - x(from) > 8) figure.append(svgEl("text", { x: (x(from) + x(dn)) / 2, y: top - 8, "text-anchor": "middle", class: "number" }, k === 0 ? "k = 0" : String(k)));
-      });
-    }
-    // axes
-    figure.append(svgEl("line", { x1: left, x2: right, y1: floor, y2: floor, class: "axis" }));
-    const yTicks = logarithmic ? [1, 10, 100, 1e3, 1e4, 1e5, 1e6].filter((t) => t <= peak) : ticks(0, peak, 4);
-    for (const t of yTicks) {
-      figure.append(svgEl("line", { x1: left - 4, x2: left, y1: level(t), y2: level(t), class: "axis" }));
-      if (all) figure.append(svgEl("text", { x: left - 7, y: level(t) + 4, "text-anchor": "end" }, t >= 1e4 ? `${t / 1000}k` : tickText(t)));
-    }
-    for (const t of ticks(low, high, Math.floor(width / 80)).filter(Number.isInteger)) {
-      figure.append(svgEl("line", { x1: x(t), x2: x(t), y1: stripFloor, y2: stripFloor + 4, class: "axis" }));
-      figure.append(svgEl("text", { x: x(t), y: stripFloor + 16, "text-anchor": "middle" }, minus(String(t))));
-    }
-    figure.append(svgEl("text", { x: (left + right) / 2, y: height - 6, "text-anchor": "middle" }, "signal (DN)"));
-    figure.append(svgEl("text", { x: 12, y: (top + floor) / 2, "text-anchor": "middle", transform: `rotate(-90 12 ${(top + floor) / 2})` }, all ? `${facts.samples} per DN` : "density"));
-    // residuals
-    const residuals = all && theta ? bins.map((dn) => [dn, expectedAt(dn)]).filter(([, e]) => e >= 1).map(([dn, e]) => [dn, (countAt(dn) - e) / Math.sqrt(e)]) : [];
-    const largest = Math.max(0, ...residuals.map(([, r]) => Math.abs(r)));
-    if (residuals.length) {
-      const limit = clamp(1.15 * largest, 3.5, 12), middle = (stripTop + stripFloor) / 2;
-      const to = (r) => middle - (clamp(r, -limit, limit) / limit) * (stripFloor - stripTop) / 2;
-      figure.append(svgEl("rect", { x: left, width: right - left, y: to(2), height: to(-2) - to(2), class: "band" }));
-      figure.append(svgEl("line", { x1: left, x2: right, y1: middle, y2: middle, class: "axis" }));
-      figure.append(svgEl("path", { d: residuals.map(([dn, r]) => `M${x(dn).toFixed(1)} ${middle}V${to(r).toFixed(1)}`).join(""), class: "residual" }));
-      const far = residuals.filter(([, r]) => Math.abs(r) > limit);
-      for (const [dn, r] of far) figure.append(svgEl("text", { x: x(dn), y: to(r) + 4, "text-anchor": "middle", class: "far" }, "×"));
-      figure.append(svgEl("text", { x: left - 7, y: to(2) + 4, "text-anchor": "end" }, "2"), svgEl("text", { x: left - 7, y: to(-2) + 4, "text-anchor": "end" }, "−2"));
-      figure.append(svgEl("text", { x: 12, y: middle, "text-anchor": "middle", transform: `rotate(-90 12 ${middle})` }, "residual"));
-    }
-    const parts = [all ? `Histogram of ${whole(all)} ${facts.samples}` : "Fitted density without a histogram", `${low} to ${high} DN`];
-    if (theta) parts.push("fitted density");
-    if (edges.length) parts.push(`first edges of the electron numbers at ${edges.slice(0, 4).map(([, dn]) => short(dn, 4)).join(", ")} DN`);
-    if (residuals.length) parts.push(`largest residual ${short(largest, 2)} standard deviations`);
-    figure.setAttribute("aria-label", `${parts.join("; ")}.`);
-    byId("inspector-caption").textContent = [
-      all ? `Gray: ${whole(all)} ${facts.samples}.` : "",
-      curve.length ? `Line: ${facts.model ? `mass under the model ${facts.model}` : "fitted density; thin: its components, one for each electron number"}.` : "",
-      edges.length ? "Dashed: edges between the electron numbers k." : "",
-      residuals.length ? `Below: (observed − expected) / √expected, two standard deviations shaded; largest ${short(largest, 2)}.` : "",
-    ].filter(Boolean).join(" ");
-    fillCounts(pixel, bins, countAt, expectedAt, theta);
-  };
-  const fillCounts = (pixel, bins, countAt, expectedAt, theta) => {
-    const details = byId("inspector-counts"), body = details.querySelector("tbody");
-    details.hidden = !pixel.counts;
-    const fill = () => {
-      body.replaceChildren(...bins.map((dn) => {
-        const e = theta ? expectedAt(dn) : NaN;
-        const r = e >= 1 ? short((countAt(dn) - e) / Math.sqrt(e), 2) : "";
-        return el("tr", {}, el("th", { scope: "row" }, String(dn)), el("td", {}, whole(countAt(dn))), el("td", {}, Number.isFinite(e) ? short(e) : ""), el("td", {}, r));
-      }));
+    const logarithmic = byId("inspector-log-pixel").checked && all > 0 && peak > 1;
+    const share = (v) => (logarithmic ? Math.log10(Math.max(2 * v, 1)) / Math.log10(2 * peak) : v / peak);
+    const level = (v) => area.floor - (area.floor - area.top) * share(v);
+    const x = (dn) => area.left + ((area.right - area.left) * (dn - low + 0.5)) / (high - low + 1);
+    return {
+      pixel, figure, theta, all, scale, area, low, high, bins, heights, countAt, expectedAt, curve, peak, logarithmic, level, x,
     };
+  };
+  const put = (s, tag, attributes, ...text) => s.figure.append(svgEl(tag, attributes, ...text));
+  const putText = (s, x, y, anchor, text, more = {}) => put(s, "text", { x, y, "text-anchor": anchor, ...more }, text);
+  const putLine = (s, x1, y1, x2, y2, kind) => put(s, "line", { x1, y1, x2, y2, class: kind });
+  const putUpright = (s, y, text) => putText(s, 12, y, "middle", text, { transform: `rotate(-90 12 ${y})` });
+  const putCurve = (s, points, kind) => {
+    const at = ([dn, v]) => `${s.x(dn).toFixed(1)} ${clamp(s.level(v), s.area.top, s.area.floor).toFixed(1)}`;
+    if (points.length) put(s, "path", { d: `M${points.map(at).join("L")}`, class: kind });
+  };
+  const drawDensity = (s) => {
+    if (s.all) put(s, "path", { d: stairs(s.heights, (i) => s.x(s.low - 0.5 + i), s.level, s.area.floor), class: "bars" });
+    if (s.theta && !facts.model) {
+      const parts = new Map();
+      for (const [dn] of s.curve) {
+        for (const [k, part] of components(dn, s.theta)) {
+          if (s.scale * part < s.peak * 2e-4) continue;
+          if (!parts.has(k)) parts.set(k, []);
+          parts.get(k).push([dn, s.scale * part]);
+        }
+      }
+      if (parts.size <= 60) for (const [k, points] of parts) putCurve(s, points, `part part${k % 2}`);
+    }
+    putCurve(s, s.curve, "curve");
+  };
+  const drawEdges = (s) => {
+    const own = facts.model ? null : s.theta;
+    const deciding = s.pixel.deciding?.every(Number.isFinite) ? s.pixel.deciding : own;
+    const edges = [];
+    if (!deciding || !(deciding[0] > 0)) return edges;
+    for (let k = 0; k < 400 && edge(k, deciding) < s.high + 0.5; k++) {
+      if (edge(k, deciding) > s.low - 0.5) edges.push([k, edge(k, deciding)]);
+    }
+    const every = Math.max(1, Math.ceil(edges.length / (s.area.width / 26)));
+    edges.forEach(([k, dn], i) => {
+      putLine(s, s.x(dn), s.area.top, s.x(dn), s.area.floor, "edge");
+      const from = s.x(i ? edges[i - 1][1] : s.low - 0.5), to = s.x(dn);
+      if (k % every || to - from <= 8) return;
+      putText(s, (from + to) / 2, s.area.top - 8, "middle", k === 0 ? "k = 0" : String(k), { class: "number" });
+    });
+    return edges;
+  };
+  const drawAxes = (s) => {
+    const { width, height, left, right, top, floor, stripFloor } = s.area;
+    putLine(s, left, floor, right, floor, "axis");
+    const upward = s.logarithmic ? [1, 10, 100, 1e3, 1e4, 1e5, 1e6].filter((t) => t <= s.peak) : ticks(0, s.peak, 4);
+    for (const t of upward) {
+      putLine(s, left - 4, s.level(t), left, s.level(t), "axis");
+      if (s.all) putText(s, left - 7, s.level(t) + 4, "end", t >= 1e4 ? `${t / 1000}k` : tickText(t));
+    }
+    for (const t of ticks(s.low, s.high, Math.floor(width / 80)).filter(Number.isInteger)) {
+      putLine(s, s.x(t), stripFloor, s.x(t), stripFloor + 4, "axis");
+      putText(s, s.x(t), stripFloor + 16, "middle", minus(String(t)));
+    }
+    putText(s, (left + right) / 2, height - 6, "middle", "signal (DN)");
+    putUpright(s, (top + floor) / 2, s.all ? `${facts.samples} per DN` : "density");
+  };
+  const drawResiduals = (s) => {
+    if (!s.all || !s.theta) return null;
+    const expected = s.bins.map((dn) => [dn, s.expectedAt(dn)]).filter(([, e]) => e >= 1);
+    const residuals = expected.map(([dn, e]) => [dn, (s.countAt(dn) - e) / Math.sqrt(e)]);
+    if (!residuals.length) return null;
+    const { left, right, stripTop, stripFloor } = s.area;
+    const largest = Math.max(...residuals.map(([, r]) => Math.abs(r)));
+    const limit = clamp(1.15 * largest, 3.5, 12), middle = (stripTop + stripFloor) / 2;
+    const y = (r) => middle - ((clamp(r, -limit, limit) / limit) * (stripFloor - stripTop)) / 2;
+    put(s, "rect", { x: left, width: right - left, y: y(2), height: y(-2) - y(2), class: "band" });
+    putLine(s, left, middle, right, middle, "axis");
+    const strokes = residuals.map(([dn, r]) => `M${s.x(dn).toFixed(1)} ${middle}V${y(r).toFixed(1)}`);
+    put(s, "path", { d: strokes.join(""), class: "residual" });
+    for (const [dn, r] of residuals) if (Math.abs(r) > limit) putText(s, s.x(dn), y(r) + 4, "middle", "×", { class: "far" });
+    for (const r of [2, -2]) putText(s, left - 7, y(r) + 4, "end", minus(String(r)));
+    putUpright(s, middle, "residual");
+    return largest;
+  };
+  const describePlot = (s, edges, largest) => {
+    const frames = `${whole(s.all)} ${facts.samples}`, off = largest === null ? "" : short(largest, 2);
+    const first = edges.slice(0, 4).map(([, dn]) => short(dn, 4)).join(", ");
+    const parts = [s.all ? `Histogram of ${frames}` : "Fitted density without a histogram", `${s.low} to ${s.high} DN`];
+    if (s.theta) parts.push("fitted density");
+    if (first) parts.push(`first edges of the electron numbers at ${first} DN`);
+    if (off) parts.push(`largest residual ${off} standard deviations`);
+    s.figure.setAttribute("aria-label", `${parts.join("; ")}.`);
+    const line = facts.model
+      ? `mass under the model ${facts.model}`
+      : "fitted density; thin: its components, one for each electron number";
+    const below = "Below: (observed − expected) / √expected, two standard deviations shaded; largest";
+    const words = [s.all ? `Gray: ${frames}.` : ""];
+    if (s.curve.length) words.push(`Line: ${line}.`);
+    if (first) words.push("Dashed: edges between the electron numbers k.");
+    if (off) words.push(`${below} ${off}.`);
+    byId("inspector-caption").textContent = words.filter(Boolean).join(" ");
+  };
+  const drawPixel = (pixel) => {
+    const figure = byId("inspector-plot"), s = sketch(pixel, figure);
+    figure.replaceChildren();
+    figure.style.display = s ? "" : "none";
+    byId("inspector-caption").textContent = "";
+    byId("inspector-counts").hidden = !s || !s.all;
+    if (!s) return;
+    figure.setAttribute("viewBox", `0 0 ${s.area.width} ${s.area.height}`);
+    figure.setAttribute("height", s.area.height);
+    drawDensity(s);
+    const edges = drawEdges(s);
+    drawAxes(s);
+    describePlot(s, edges, drawResiduals(s));
+    fillCounts(s);
+  };
+  const fillCounts = (s) => {
+    const details = byId("inspector-counts"), body = details.querySelector("tbody");
+    const row = (dn) => {
+      const e = s.expectedAt(dn), cells = [whole(s.countAt(dn)), Number.isFinite(e) ? short(e) : ""];
+      cells.push(e >= 1 ? short((s.countAt(dn) - e) / Math.sqrt(e), 2) : "");
+      return el("tr", {}, el("th", { scope: "row" }, String(dn)), ...cells.map((text) => el("td", {}, text)));
+    };
+    const fill = () => body.replaceChildren(...s.bins.map(row));
     details.ontoggle = () => { if (details.open) fill(); };
     if (details.open) fill();
   };
@@ -855,8 +932,12 @@
     byId("inspector-others").querySelector("tbody").replaceChildren(...others);
     const notes = [];
     if (pixel.trouble) notes.push(pixel.trouble);
-    if (!pixel.exact) notes.push(`Values to ${facts.keptTo} of a standard error; this ${facts.noun}'s histogram is not in the file, which holds ${whole(facts.sample.n)} of ${whole(n)}. To see every one: ${facts.command}`);
-    else if (facts.model && !pixel.mass && parametersOf(pixel)) notes.push(`The curve of the model ${facts.model} is not in the file for this ${facts.noun}: ${facts.command}`);
+    if (!pixel.exact) {
+      notes.push(`Values to ${facts.keptTo} of a standard error; this ${facts.noun}'s histogram is not in the file, which`);
+      notes.push(`holds ${whole(facts.sample.n)} of ${whole(n)}. To see every one: ${facts.command}`);
+    } else if (facts.model && !pixel.mass && parametersOf(pixel)) {
+      notes.push(`The curve of the model ${facts.model} is not in the file for this ${facts.noun}: ${facts.command}`);
+    }
     byId("inspector-note").textContent = notes.join(" ");
     byId("inspector-nearest").hidden = pixel.counts !== null;
     byId("inspector-pixel").hidden = false;
@@ -865,7 +946,8 @@
     drawPixel(pixel);
     app.dataset.pixel = String(i);
   };
-  const hasTruth = facts.panel.some((path) => factOf.get(path.replace("maps/", "truth/"))?.here || (served && factOf.has(path.replace("maps/", "truth/"))));
+  const truths = facts.panel.map((path) => factOf.get(path.replace("maps/", "truth/"))).filter(Boolean);
+  const hasTruth = truths.some((fact) => fact.here || served);
   const inFull = () => [...sample.slot.keys()].sort((a, b) => a - b);
   const neighbour = (direction) => {
     const list = inFull();
@@ -898,9 +980,10 @@
   const fromAddress = () => {
     const asked = new URLSearchParams(location.hash.slice(1));
     const position = /^(\d+),(\d+)$/.exec(asked.get("pixel") ?? "");
+    const [y, x] = position ? [Number(position[1]), Number(position[2])] : [NaN, NaN];
     const colours = asked.get("colours"), path = asked.get("map");
     return {
-      pixel: position && Number(position[1]) < ny && Number(position[2]) < nx ? Number(position[1]) * nx + Number(position[2]) : -1,
+      pixel: y < ny && x < nx ? y * nx + x : -1,
       colours: colours in RANGES || colours === "beta" ? colours : null,
       path: factOf.has(path) ? path : null,
     };
@@ -947,7 +1030,9 @@
     const notable = byId("inspector-notable");
     for (const { words, pixels: where } of facts.notable) {
       const group = el("optgroup", { label: words });
-      for (const i of where) group.append(el("option", { value: i }, ny === 1 ? place(i) : `y ${Math.floor(i / nx)}, x ${i % nx}`));
+      for (const i of where) {
+        group.append(el("option", { value: i }, ny === 1 ? place(i) : `y ${Math.floor(i / nx)}, x ${i % nx}`));
+      }
       notable.append(group);
     }
     byId("inspector-y").max = ny - 1;
@@ -972,15 +1057,25 @@
     const go = () => {
       const y = ny === 1 ? 0 : Number(byId("inspector-y").value), x = Number(byId("inspector-x").value);
       if (Number.isInteger(y) && Number.isInteger(x) && y >= 0 && x >= 0 && y < ny && x < nx) choose(y * nx + x);
-      else byId("inspector-spoken").textContent = `There is no such ${facts.noun}: y is 0 to ${ny - 1}, x is 0 to ${nx - 1}.`;
+      else {
+        const ends = `y is 0 to ${ny - 1}, x is 0 to ${nx - 1}`;
+        byId("inspector-spoken").textContent = `There is no such ${facts.noun}: ${ends}.`;
+      }
     };
     byId("inspector-go").addEventListener("click", go);
-    for (const id of ["inspector-y", "inspector-x"]) byId(id).addEventListener("keydown", (event) => { if (event.key === "Enter") go(); });
-    byId("inspector-notable").addEventListener("change", (event) => { if (event.target.value !== "") choose(Number(event.target.value)); });
+    for (const id of ["inspector-y", "inspector-x"]) {
+      byId(id).addEventListener("keydown", (event) => { if (event.key === "Enter") go(); });
+    }
+    byId("inspector-notable").addEventListener("change", (event) => {
+      if (event.target.value !== "") choose(Number(event.target.value));
+    });
     for (const id of ["inspector-from", "inspector-to"]) byId(id).addEventListener("change", () => {
       const [from, to] = ["inspector-from", "inspector-to"].map((each) => byId(each).value);
       if (from === "" && to === "") select(null);
-      else if (brush) selectRange(from === "" ? brush.axis.back(brush.axis.low) : Number(from), to === "" ? brush.axis.back(brush.axis.high) : Number(to));
+      else if (brush) {
+        const { back, low, high } = brush.axis;
+        selectRange(from === "" ? back(low) : Number(from), to === "" ? back(high) : Number(to));
+      }
     });
     byId("inspector-clear").addEventListener("click", () => select(null));
     byId("inspector-previous").addEventListener("click", () => neighbour(-1));
