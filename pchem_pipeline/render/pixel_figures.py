@@ -179,7 +179,8 @@ def pixel_fits(pixels: Sequence[PixelFit], *, width_mm: float = PAGE_MM) -> Figu
         return _empty(figure, figure.add_subplot(), "no pixel to show")
     parts = figure.subfigures(rows, columns, squeeze=False)
     for i, pixel in enumerate(pixels):
-        _one_pixel(parts[i // columns, i % columns], pixel, _LETTERS[i % len(_LETTERS)], width_mm / columns)
+        letter = _LETTERS[i % len(_LETTERS)] if len(pixels) > 1 else ""
+        _one_pixel(parts[i // columns, i % columns], pixel, letter, width_mm / columns)
     return figure
 
 
@@ -242,8 +243,8 @@ def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) 
 
 
 def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
-    head = f"({letter}) {plain(_cut(pixel.label))}" if pixel.label else f"({letter})"
-    lines = [f"{head}: {pixel.place}"]
+    head = " ".join(part for part in (f"({letter})" if letter else "", plain(_cut(pixel.label))) if part)
+    lines = [f"{head}: {pixel.place}" if head else pixel.place]
     if has_fit(pixel.parameters):
         words = []
         for name in _TITLE_NAMES:

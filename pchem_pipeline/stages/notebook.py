@@ -130,8 +130,12 @@ class Run:
 
     @property
     def maps(self) -> xr.Dataset:
-        """The maps with their standard errors; ``quality`` and ``fit_status`` are coordinates."""
-        found = self.group("maps")
+        """The maps with their standard errors; ``quality`` and ``fit_status`` are coordinates.
+
+        What the store keeps with them beside the arrays is in ``run.group("maps").attrs``.
+        """
+        found = self.group("maps").copy(deep=False)
+        found.attrs = {}
         if self._store.has("fit/fit_status"):
             found = found.assign_coords(fit_status=self.group("fit").fit_status)
         return found.set_coords("quality")

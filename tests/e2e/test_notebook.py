@@ -37,6 +37,8 @@ def test_maps_are_lazy_and_know_their_units(run, store, finished):
     assert maps.bias.dims == ("y", "x")
     assert (maps.conversion_gain.attrs["units"], maps.x.attrs["units"]) == ("e-/DN", "pixel")
     assert {"quality", "fit_status", "y", "x"} <= set(maps.coords)
+    assert not maps.attrs
+    assert "summary" in run.group("maps").attrs
     np.testing.assert_array_equal(maps.bias.values, store.read("maps/bias"))
     np.testing.assert_array_equal(maps.fit_status.values, store.read("fit/fit_status"))
     assert maps.sel(y=3, x=5).bias.item() == store.read("maps/bias")[3, 5]
@@ -72,6 +74,7 @@ def test_a_pixel_is_that_of_the_store(run, store):
     assert abs((known**2).mean() - 1) < 5 * np.sqrt(2 / known.size)
     for figure in (pixel.plot(), pixel.plot_cells(width="60mm")):
         assert figure._repr_png_().startswith(b"\x89PNG")
+    assert pixel.plot().subfigs[0].axes[0].get_title("left").startswith(f"pixel y = {y}, x = {x}\n")
     assert len(run.pixels([(0, 0), (1, 2)])) == 2
 
 
