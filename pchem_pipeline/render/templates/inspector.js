@@ -154,7 +154,9 @@
   const categorical = (fact) => fact.kind === "bits" || fact.kind === "words";
   const valueText = (fact, value, error) => {
     if (!Number.isFinite(value)) return "no value";
-    return categorical(fact) ? wordsOf(fact, value) : measured(value, error, fact.unit);
+    if (categorical(fact)) return wordsOf(fact, value);
+    const counted = Number.isInteger(value) && Math.abs(value) < 1e9 && !Number.isFinite(error);
+    return counted ? minus(whole(value)) + (fact.unit && ` ${fact.unit}`) : measured(value, error, fact.unit);
   };
 
   // -- state ---------------------------------------------------------------------------------
@@ -510,7 +512,7 @@
   const axisOf = (map) => {
     const f = map.log ? Math.log10 : (v) => v, back = map.log ? (v) => 10 ** v : (v) => v;
     const least = map.log ? codeValue(map, FIRST) : -Infinity;
-    const [start, a, b, end] = [0, 0.002, 0.998, 1].map((share) => f(Math.max(quantile(map, map.counts, share), least)));
+    const [start, a, b, end] = [0, 0.01, 0.99, 1].map((share) => f(Math.max(quantile(map, map.counts, share), least)));
     const ends = [start, end];
     let low = Math.max(a - 0.3 * (b - a), ends[0]), high = Math.min(b + 0.3 * (b - a), ends[1]);
     if (!(high > low)) { const pad = Math.abs(low) * 0.05 || 1e-9; [low, high] = [low - pad, high + pad]; }
