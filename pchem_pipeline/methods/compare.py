@@ -68,6 +68,8 @@ class MethodResult:
         n_answered: pixels with a gain.
         reasons: why others have none, or a doubtful one.
         seconds_per_pixel: processor time.
+        medians: of the estimates (H, g, mu, s_e) over the pixels, by name of :data:`COMPARED`, in e-, e-/DN,
+            DN and e-; None where no pixel has one.
         errors: by parameter of :data:`COMPARED`; empty where nothing is known.
         estimates: (H, g, mu, sigma), shape (n, 4); None if it was not run.
     """
@@ -82,6 +84,7 @@ class MethodResult:
     n_answered: int = 0
     reasons: Mapping[str, int] | None = None
     seconds_per_pixel: float | None = None
+    medians: Mapping[str, float | None] | None = None
     errors: Mapping[str, ErrorSummary] | None = None
     estimates: FloatArray | None = None
 
@@ -89,6 +92,7 @@ class MethodResult:
         """Return everything but the estimates as plain data."""
         found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "estimates"}
         found["reasons"] = dict(self.reasons or {})
+        found["medians"] = dict(self.medians or {})
         found["errors"] = {name: asdict(summary) for name, summary in (self.errors or {}).items()}
         return found
 
@@ -146,9 +150,20 @@ def _run(
         int(np.count_nonzero(np.isfinite(estimates.parameters[:, 1]))),
         estimates.reasons,
         seconds,
+        _medians(estimates.parameters),
         errors,
         estimates.parameters,
     )
+
+
+def _medians(parameters: FloatArray) -> dict[str, float | None]:
+    """Return the median of each estimate over the pixels that have it."""
+    columns = (*parameters[:, :3].T, parameters[:, 1] * parameters[:, 3])
+    known = [values[np.isfinite(values)] for values in columns]
+    return {
+        name: float(np.median(values)) if values.size else None
+        for name, values in zip(COMPARED, known, strict=True)
+    }
 
 
 def _first_pixel(pixels: PixelSamples) -> PixelSamples:

@@ -17,7 +17,9 @@ from pchem_pipeline.model.pcd import pcd
 from pchem_pipeline.render.data import MAP_NAMES, PixelFit, ReportData
 from pchem_pipeline.render.exhibits import UNCERTAIN, Exhibit
 from pchem_pipeline.render.map_figures import is_strip, map_bins, status_counts
+from pchem_pipeline.render.method_exhibits import METHOD_FIGURE
 from pchem_pipeline.render.pixel_figures import PAPER_EXAMPLE, cell_range, has_fit
+from pchem_pipeline.render.plan_exhibits import PLAN_FIGURE
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.trust_figures import noise_shares
 from pchem_pipeline.render.wording import stored_unit
@@ -229,6 +231,37 @@ def _components(data: ReportData, _: ReportSettings) -> list[DataTable]:
     return [DataTable("", columns)]
 
 
+def _methods(data: ReportData, _: ReportSettings) -> list[DataTable]:
+    result = data.methods or {"study": [], "methods": []}
+    tables = []
+    if result["study"]:
+        study = result["study"]
+        columns: dict[str, Any] = {"read_noise_e (e-)": [point["read_noise_e"] for point in study]}
+        for name in study[0]["methods"]:
+            gain = [point["methods"][name]["errors"]["conversion_gain"] for point in study]
+            columns[f"{name}: rms error of g"] = [_number(each["rmse"]) for each in gain]
+        for name in study[0]["bounds"]:
+            columns[f"limit, {name}"] = [_number(point["bounds"][name]) for point in study]
+        tables.append(DataTable("simulated", columns))
+    known = [method for method in result["methods"] if method["errors"]]
+    gain = [method["errors"]["conversion_gain"] for method in known]
+    rows = {"method": [method["name"] for method in known]}
+    numbers = {key: [_number(each[key]) for each in gain] for key in ("bias", "rmse", "robust_sd", "bound")}
+    return [*tables, DataTable("run", rows | numbers)]
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _frames_needed(data: ReportData, _: ReportSettings) -> list[DataTable]:
+    contours = (data.plan or {})["contours"]
+    noise, exposure = np.meshgrid(contours["read_noises"], contours["exposures"], indexing="ij")
+    columns = {"read_noise_e (e-)": noise.ravel(), "quanta_exposure (e-)": exposure.ravel()}
+    frames = {f"frames for {words}": np.ravel(values) for words, values in contours["frames"].items()}
+    return [DataTable("", columns | frames)]
+
+
 _MAKERS: dict[str, Callable[[ReportData, ReportSettings], list[DataTable]]] = {
     "cluster_edges_example": _example,
     "cluster_edges_pixel": _first_fitted,
@@ -242,4 +275,6 @@ _MAKERS: dict[str, Callable[[ReportData, ReportSettings], list[DataTable]]] = {
     "electron_numbers": _electrons,
     "component_widths": _components,
     "fit_status": _status,
+    METHOD_FIGURE: _methods,
+    PLAN_FIGURE: _frames_needed,
 }

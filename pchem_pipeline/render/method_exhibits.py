@@ -25,6 +25,7 @@ _CAPTION = (
 _HEAD = (
     "method",
     "pixels with an answer",
+    "median g (e⁻/DN)",
     "bias of g (%)",
     "rms error of g (%)",
     "bound (%)",
@@ -40,7 +41,7 @@ def method_exhibits(data: ReportData) -> list[Exhibit]:
     result = data.methods
     if result is None:
         return []
-    words = [f"{row[0]}: {row[3]} %" for row in method_rows(result) if len(row) > 2 and row[3]]
+    words = [f"{row[0]}: {row[4]} %" for row in method_rows(result) if len(row) > 2 and row[4]]
     crossing = f" {verdict_words(result['study'])}." if result["study"] else ""
     return [
         Exhibit(

@@ -12,7 +12,17 @@ from pchem_pipeline.render.wording import short
 
 __all__ = ["bound_crossing", "measured_crossing", "method_rows", "methods_text", "verdict_words"]
 
-_COLUMNS = ("pixels", "g bias %", "g rmse %", "g bound %", "rmse/bound", "s_e rmse %", "H rmse %", "us/pixel")
+_COLUMNS = (
+    "pixels",
+    "g, e-/DN",
+    "g bias %",
+    "g rmse %",
+    "g bound %",
+    "rmse/bound",
+    "s_e rmse %",
+    "H rmse %",
+    "us/pixel",
+)
 
 
 def methods_text(result: Mapping[str, Any]) -> str:
@@ -74,7 +84,9 @@ def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
                 *(_percent(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")),
             ]
         time = f"{1e6 * method['seconds_per_pixel']:.0f}"
-        rows.append((method["title"], f"{method['n_answered']:,}", *cells, time))
+        gain_value = method["medians"]["conversion_gain"]
+        value = "-" if gain_value is None else f"{gain_value:.5g}"
+        rows.append((method["title"], f"{method['n_answered']:,}", value, *cells, time))
     return rows
 
 

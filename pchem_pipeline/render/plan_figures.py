@@ -73,4 +73,4 @@ def _panel(axes: Axes, x: Any, y: Any, frames: Any, words: str, mark: tuple[floa
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.set_title(f"frames for {words.replace('_', ' ').replace('e-', 'e⁻')}")
+    axes.set_title(f"frames for {words.replace('_e to', ' to').replace('_', ' ').replace('e-', 'e⁻')}")

@@ -183,6 +183,9 @@ def test_methods_say_which_samples_they_lack():
     assert results["photon_transfer_series"].missing.startswith("needs a series")
     assert results["pchem_em"].missing == ""
     assert results["photon_transfer"].estimates is None
+    told = results["pchem_em"].as_json()["medians"]
+    assert told["conversion_gain"] == pytest.approx(1 / 11, rel=0.05)
+    assert told["read_noise_e"] == pytest.approx(0.3, rel=0.1)
 
 
 def test_bounds_are_those_of_the_samples_given():

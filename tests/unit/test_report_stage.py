@@ -14,6 +14,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.model.fit_status import FitStatus
 from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
+from pchem_pipeline.render.plan_exhibits import PLAN_FIGURE
 from pchem_pipeline.render.report import RenderedReport
 from pchem_pipeline.render.report_json import report_numbers
 from pchem_pipeline.render.verdict import flags
@@ -93,7 +94,8 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     context = make_context(folder, {"figure_formats": ["svg"]}, title="My <sensor>")
     assert execute("report", context).state == "complete"
     store = folder / "run.zarr"
-    assert {path.name for path in (store / "figures").iterdir()} == {f"{name}.svg" for name in EXHIBIT_NAMES}
+    names = {f"{name}.svg" for name in (*EXHIBIT_NAMES, PLAN_FIGURE)}
+    assert {path.name for path in (store / "figures").iterdir()} == names
     numbers = json.loads((store / "report.json").read_text())
     median = float(np.nanmedian(context.store.read("maps/read_noise_e")))
     assert numbers["summary"]["read_noise_e"]["median"] == pytest.approx(median)
