@@ -19,6 +19,7 @@ from pchem_pipeline.model.pchem_numba import (
     EXPOSURE_AT_BOUND,
     FIT_NOT_CONVERGED,
     FLOOR,
+    FRAMES,
     FREEDOM,
     GAIN_NOT_IDENTIFIED,
     HIGHEST_DN,
@@ -27,12 +28,12 @@ from pchem_pipeline.model.pchem_numba import (
     NO_DATA,
     OUTLYING,
     STATUS,
-    SUSPICIOUS,
     TOO_FEW_BINS,
     fit_pixel,
 )
 from pchem_pipeline.model.polish_numba import MAX_STEP, min_log_variance
 from pchem_pipeline.model.workspace_numba import (
+    Histogram,
     Workspace,
     copy,
     load,
@@ -42,6 +43,7 @@ from pchem_pipeline.model.workspace_numba import (
 )
 
 _MOST_PASSES = 8  # of the tail guard
+_MISFIT = 5.0  # standard normal: a goodness of fit that outliers may be to blame for
 
 
 class Room(NamedTuple):
@@ -79,6 +81,23 @@ def _fit_row(
 ) -> int:
     """Fit one row of counts; return its status word."""
     histogram, centre, occupied = load(row, room.weights, room.cumulative)
+    status: int = _fit_loaded(histogram, centre, occupied, origin, room, parameters, covariance, out, words)
+    return status
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _fit_loaded(
+    histogram: Histogram,
+    centre: int,
+    occupied: int,
+    origin: int,
+    room: Room,
+    parameters: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    out: NDArray[np.float64],
+    words: NDArray[np.int64],
+) -> int:
+    """Fit a histogram that lies in the room; return its status word."""
     room.theta[1] = 0.0
     for i in range(out.size):
         out[i] = math.nan
@@ -135,7 +154,7 @@ def _suspicious(
     if not (limits[FLOOR] > 0.0 and theta[1] > 0.0):
         return False
     misfit: float = normal_score(out[CHI2], words[FREEDOM])
-    return bool(out[OUTLYING] > 0.0 or misfit > SUSPICIOUS)
+    return bool(out[OUTLYING] > 0.0 or misfit > _MISFIT)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -152,18 +171,23 @@ def _fit_guarded(
 ) -> int:
     """Fit a row that may hold outliers; return its status word.
 
-    First without both ends of the histogram, as much of them as may be outliers; where that says nothing,
-    without the samples that a gap cuts off. What these parameters expect then comes back, until the samples
-    left out stay the same. Where that fails, or where they are too many to be a few outliers, it is the fit
-    of all samples.
+    A good fit of all samples says itself which it does not expect. Otherwise both ends of the histogram are
+    left out first, as much of them as may be outliers; where that says nothing, the samples that a gap cuts
+    off. What these parameters expect then comes back, until the samples left out stay the same. Where that
+    fails, or where they are too many to be a few outliers, it is the fit of all samples.
     """
     status: int
     histogram, centre, _ = load(row, room.weights, room.cumulative)
     n, start = histogram.n, centre + int(histogram.first)
     inner, core = inner_ends(histogram, room.limits[MOST_OUTLIERS]), core_ends(histogram)
-    for attempt in range(2 if far else 1):
-        first, end = inner if attempt == 0 else core
-        cut(row, start + first, start + end, kept)
+    good = not far and normal_score(out[CHI2], words[FREEDOM]) <= _MISFIT
+    for attempt in range(0 if good else 1, 3 if far else 2):
+        if attempt == 0:
+            cut(row, 0, row.size, kept)
+            _unexpected(row, origin, n, room, parameters, kept)
+        else:
+            first, end = inner if attempt == 1 else core
+            cut(row, start + first, start + end, kept)
         for _ in range(_MOST_PASSES):
             left_out = n - total(kept)
             if left_out > room.limits[MOST_OUTLIERS] * n:
@@ -216,8 +240,9 @@ def fit_tile(
         row = counts[pixel]
         if start.shape[0] > 0:
             copy(start[pixel], near)
-        histogram, centre, _ = load(row, weights, cumulative)
+        histogram, centre, occupied = load(row, weights, cumulative)
         dn = origin[pixel] + centre + int(histogram.first)
+        words[pixel, FRAMES] = int(histogram.n)
         words[pixel, LOWEST_DN], words[pixel, HIGHEST_DN] = dn, dn + histogram.n_bins - 1
         far = False
         if limits[FLOOR] > 0.0:
@@ -225,9 +250,10 @@ def fit_tile(
             far = first > 0 or end < histogram.n_bins
         status = 0
         if not far:
-            status = _fit_row(
-                row, origin[pixel], room, parameters[pixel], covariance[pixel], out[pixel], words[pixel]
-            )
+            status = _fit_loaded(
+                histogram, centre, occupied, origin[pixel], room,
+                parameters[pixel], covariance[pixel], out[pixel], words[pixel],
+            )  # fmt: skip
         if far or _suspicious(limits, theta, out[pixel], words[pixel]):
             status = _fit_guarded(
                 row, kept, origin[pixel], room, far,

@@ -26,8 +26,9 @@ __all__ = ["EmTrace", "FitResult", "em_trace", "fit_histograms"]
 
 WARM_UP = 1  # EM steps before the first Newton step
 
-#: Frames below which merging bins for the chi-square test hides part of what the parameters know.
-_FEW_FRAMES = 5000
+# Frames and degrees of freedom below which it matters that merging bins for the chi-square test hides part of
+# what the parameters know: it is half a degree of freedom or so.
+_FEW_FRAMES, _FEW_GROUPS = 5000, 40
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ def fit_histograms(
         out,
         words,
     )
-    frames = np.asarray(counts.sum(axis=1), np.float64)
+    frames = words[:, pchem_numba.FRAMES].astype(np.float64)
     outliers = np.nan_to_num(out[:, pchem_numba.OUTLYING])
     chi2, dof = out[:, pchem_numba.CHI2], _freedom(words, frames - outliers, parameters, covariance)
     probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
@@ -181,7 +182,7 @@ def _freedom(
     groups determine (Chernoff and Lehmann 1954). Many frames leave few DN merged, and that is all four.
     """
     freedom = words[:, pchem_numba.FREEDOM].astype(np.float64)
-    few = np.flatnonzero((freedom > 0) & (frames < _FEW_FRAMES))
+    few = np.flatnonzero((freedom > 0) & (freedom < _FEW_GROUPS) & (frames < _FEW_FRAMES))
     if few.size:
         known = np.empty(few.size)
         ends = (words[few, pchem_numba.LOWEST_DN], words[few, pchem_numba.HIGHEST_DN])

@@ -40,11 +40,11 @@ LOG_LIKELIHOOD, GAP, CHI2, OUTLYING = 0, 1, 2, 3
 N_OUT = 4
 
 # columns of `words`
-STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN = range(5)
-N_WORDS = 5
+STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN, FRAMES = range(6)
+N_WORDS = 6
 
 _CLEAR_GAP = 30.0  # nats: a neighbour this far below is not polished to the end
-SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
+_SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
 _CLEAR_LOBE = 3.0  # standard errors: a side lobe of the characteristic function that settles the gain
 _MOST_MOVES = 40
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
@@ -193,7 +193,7 @@ def fit_pixel(
         if outcome == CONVERGED:
             evaluate(histogram, trial, at_best, histogram.n)
             out[CHI2], freedom = _compare(histogram, at_best, limits[FLOOR], out)
-            if normal_score(out[CHI2], freedom) < SUSPICIOUS:
+            if normal_score(out[CHI2], freedom) < _SUSPICIOUS:
                 copy(trial, best)
                 out[LOG_LIKELIHOOD], out[GAP] = loglik, loglik - gaussian
                 return _judge(best, loglik, -math.inf, gaussian, limits), used + 1, freedom
@@ -221,7 +221,7 @@ def fit_pixel(
         runner_up = max(beside, runner_up)
         best_loglik = evaluate(histogram, best, at_best, histogram.n)
         out[CHI2], freedom = _compare(histogram, at_best, limits[FLOOR], out)
-        if normal_score(out[CHI2], freedom) < SUSPICIOUS and side_lobe(histogram, best) > _CLEAR_LOBE:
+        if normal_score(out[CHI2], freedom) < _SUSPICIOUS and side_lobe(histogram, best) > _CLEAR_LOBE:
             break
     if not best[1] > 0.0:
         return GAIN_NOT_IDENTIFIED if degenerate else FIT_NOT_CONVERGED, used, 0
