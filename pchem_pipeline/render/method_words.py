@@ -100,13 +100,13 @@ def _ratio(value: float | None, bound: float | None) -> str:
 
 def _study_lines(study: Sequence[Mapping[str, Any]]) -> list[str]:
     titles = {name: method["title"] for name, method in study[0]["methods"].items()}
-    lines = [f"{'read noise, e-':<34}" + "".join(f"{point['read_noise_e']:>8g}" for point in study)]
+    lines = [f"{'read noise, e-':<34}" + "".join(f"{point['read_noise_e']:>9g}" for point in study)]
     for name, title in titles.items():
         cells = [_percent(_rmse(point, name)) for point in study]
-        lines.append(f"{title:<34}" + "".join(f"{cell:>8}" for cell in cells))
+        lines.append(f"{title:<34}" + "".join(f"{cell:>9}" for cell in cells))
     for name in ("one sample", "a dark and a bright sample"):
         cells = [_percent(point["bounds"][name]) for point in study]
-        lines.append(f"{'bound, ' + name:<34}" + "".join(f"{cell:>8}" for cell in cells))
+        lines.append(f"{'bound, ' + name:<34}" + "".join(f"{cell:>9}" for cell in cells))
     return lines
 
 
