@@ -100,6 +100,7 @@ class ReportData:
             ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``, ``p``, ``q``), ``pixels_with_outliers``.
         worst: the pixels of the poorest fit.
         intervals: by quantity the ends of its profile intervals, (y, x) each, where they were asked for.
+        interval_level: probability that these cover the truth.
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
         inspector: maps and pixels to look at in the browser, or None.
@@ -132,6 +133,7 @@ class ReportData:
     misfits: Mapping[str, Any] = field(default_factory=dict)
     worst: Sequence[PixelFit] = ()
     intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    interval_level: float = 0.6827
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
     inspector: InspectorData | None = None

@@ -320,7 +320,10 @@ def _intervals(data: ReportData) -> Table:
         )
     profile = ("profile: below", "profile: above") if data.intervals else ()
     head = ("quantity", f"error of a {data.noun}", "of the value", "noise in the map", *profile)
-    words = " Ends of the profile-likelihood intervals below and above the estimate, in standard errors."
+    words = (
+        f" Ends of the {100 * data.interval_level:g} % profile-likelihood intervals below and above the "
+        "estimate, in standard errors."
+    )
     return Table(
         "uncertainties",
         "Uncertainties",

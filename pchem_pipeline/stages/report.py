@@ -227,6 +227,7 @@ def gather(
         misfits=misfits,
         worst=read_pixels(store, worst, sensor, maps, fit),
         intervals=intervals,
+        interval_level=config.fit.interval_level,
         ensemble=ensemble,
         ensemble_facts=facts,
         component_cases=[case_name(case) for case in cases],
