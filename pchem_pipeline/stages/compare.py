@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.errors import ChangedError, ConfigError, StoreError, quoted
 from pchem_pipeline.model.differences import LIMIT, compare_maps, reasons_of_change
 from pchem_pipeline.model.maps import CAUTION, GOOD, NO_VALUE
@@ -18,7 +17,7 @@ from pchem_pipeline.render.compare_page import COMPARE_JSON, COMPARE_PAGE, rende
 from pchem_pipeline.render.wording import count, short, symbol
 from pchem_pipeline.stages.compare_arrays import compare_arrays
 from pchem_pipeline.stages.compare_settings import settings_that_differ, versions_that_differ
-from pchem_pipeline.stages.drawing import draw_by_workers
+from pchem_pipeline.stages.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.stages.figures import warn_if_old
 from pchem_pipeline.stages.reporting import ProgressMode, Reporter
 from pchem_pipeline.stages.sensor import SensorInfo
@@ -58,7 +57,7 @@ def compare_runs(
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
-        workers: processes that draw; None: the processors that this process may use.
+        workers: processes that draw; None: as the first run's section ``compute`` says.
         progress: auto | on | off.
 
     Returns:
@@ -71,7 +70,7 @@ def compare_runs(
     """
     reporter = Reporter(progress)
     found = comparison_of(paths, tolerance, reporter)
-    draw = draw_by_workers(workers or available_workers(), reporter, "figures")
+    draw = draw_by_workers(drawing_workers(workers, find_run(paths[0]).config.compute), reporter, "figures")
     page, numbers = render_comparison(found, draw)
     files = {COMPARE_PAGE: page, COMPARE_JSON: numbers}
     try:

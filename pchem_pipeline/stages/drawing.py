@@ -8,18 +8,26 @@ from collections.abc import Mapping, Sequence
 from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
+from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.render.exhibits import Exhibit
 from pchem_pipeline.render.pictures import DrawAll, Drawn, draw_exhibit
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.stages.reporting import Reporter
 
-__all__ = ["draw_by_workers", "drawing_executor"]
+__all__ = ["draw_by_workers", "drawing_executor", "drawing_workers"]
 
 
 def drawing_executor(workers: int, n_figures: int) -> Executor:
     """Return who draws: processes, since drawing shares its settings within one; here, if one is enough."""
     count = min(workers, available_workers(), n_figures)
     return FreshProcessExecutor(count) if count > 1 else SerialExecutor()
+
+
+def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
+    """Return how many processes may draw: as asked for, else as the run's section ``compute`` says."""
+    if wanted is not None:
+        return wanted
+    return available_workers() if settings.workers == "auto" else settings.workers
 
 
 def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import Outcome
 from pchem_pipeline.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.render.data import ReportData
@@ -18,7 +17,7 @@ from pchem_pipeline.render.method_exhibits import method_exhibits
 from pchem_pipeline.render.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.render.plan_exhibits import plan_exhibits
 from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.stages.drawing import drawing_executor
+from pchem_pipeline.stages.drawing import drawing_executor, drawing_workers
 from pchem_pipeline.stages.report import gather
 from pchem_pipeline.stages.reporting import ProgressMode, Reporter
 from pchem_pipeline.stages.sensor import SensorInfo
@@ -43,7 +42,7 @@ class Wanted:
         style: path or name of a matplotlib style sheet.
         only: names of figures; empty: all.
         dpi: resolution of PNG and of maps, dots per inch.
-        workers: processes that draw; None: the processors that this process may use.
+        workers: processes that draw; None: as the run's section ``compute`` says.
         progress: auto | on | off.
     """
 
@@ -121,7 +120,8 @@ def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
         PaperFigure(each, figure_tables(each, data, settings), kinds, width, wanted.dpi, sheet)
         for each in _chosen(exhibits_of(data, settings), wanted.only)
     ]
-    return _drawn(jobs, folder, wanted)
+    workers = drawing_workers(wanted.workers, target.config.compute)
+    return _drawn(jobs, folder, workers, Reporter(wanted.progress))
 
 
 def _chosen(found: list[Exhibit], only: Sequence[str]) -> list[Exhibit]:
@@ -132,7 +132,7 @@ def _chosen(found: list[Exhibit], only: Sequence[str]) -> list[Exhibit]:
     return [exhibit for exhibit in found if not only or exhibit.name in only]
 
 
-def _drawn(jobs: list[PaperFigure], folder: Path, wanted: Wanted) -> list[Path]:
+def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Reporter) -> list[Path]:
     """Draw with several processes and write each figure when it is there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,6 @@ def _drawn(jobs: list[PaperFigure], folder: Path, wanted: Wanted) -> list[Path]:
         raise storage_error(error, folder) from error
     written: dict[str, list[Path]] = {}
     errors: list[BaseException] = []
-    reporter = Reporter(wanted.progress)
     with reporter.progress("figures", len(jobs), "figure") as advance:
 
         def on_result(job: PaperFigure, outcome: Outcome) -> None:
@@ -152,7 +151,7 @@ def _drawn(jobs: list[PaperFigure], folder: Path, wanted: Wanted) -> list[Path]:
             for name, content in outcome.value.items():
                 write_atomic(folder / name, content)
 
-        executor = drawing_executor(wanted.workers or available_workers(), len(jobs))
+        executor = drawing_executor(workers, len(jobs))
         executor.map(draw_paper_figure, jobs, on_result)
     if errors:
         raise errors[0]
