@@ -10,14 +10,13 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.compute.environment import available_workers, prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.errors import ConfigError, IncompleteRunError, MissingDependencyError, PchEmError
+from pchem_pipeline.errors import ConfigError, IncompleteRunError, PchEmError
 
-__all__ = ["Executor", "Outcome", "Stop", "make_executor"]
+__all__ = ["Executor", "OnResult", "Outcome", "Stop", "guarded", "make_executor"]
 
 T = TypeVar("T")
 
@@ -126,81 +125,6 @@ class DaskPoolExecutor:
         """The pool lives only during :meth:`map`."""
 
 
-class DistributedExecutor:
-    """A dask.distributed cluster: local, at an address, or made by a class from the settings."""
-
-    shares_memory = False
-
-    def __init__(self, settings: ComputeSettings, workers: int) -> None:
-        try:
-            import distributed
-        except ImportError as error:
-            raise MissingDependencyError(
-                'compute.backend: distributed needs another library: pip install "pchem-pipeline[cluster]"'
-            ) from error
-        self._cluster: Any = None
-        try:
-            if settings.scheduler is not None:
-                self._client = distributed.Client(**_address(settings.scheduler), timeout="20s")
-            elif settings.cluster is not None:
-                self._cluster = _cluster_class(settings.cluster.cls)(**settings.cluster.kwargs)
-                self._cluster.scale(settings.cluster.scale)
-                self._client = distributed.Client(self._cluster)
-            else:
-                self._cluster = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
-                )
-                self._client = distributed.Client(self._cluster)
-        except OSError as error:
-            raise ConfigError(
-                f"compute.scheduler: no scheduler answers at {settings.scheduler} ({error}); "
-                "start one with: dask scheduler"
-            ) from error
-        self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
-        self._client.run(prepare_environment)
-
-    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
-        """See :class:`Executor`."""
-        from distributed import as_completed
-
-        todo = list(items)
-        futures = self._client.map(guarded, [function] * len(todo), todo, pure=False)
-        item_of = {future.key: item for future, item in zip(futures, todo, strict=True)}
-        try:
-            for future in as_completed(futures):
-                error = future.exception()
-                outcome = Outcome(error=error, trace=str(error)) if error else future.result()
-                on_result(item_of[future.key], outcome)
-        except Stop:
-            self._client.cancel(futures)
-            raise
-
-    def close(self) -> None:
-        """Leave the cluster, and end it if this run made it."""
-        self._client.close()
-        if self._cluster is not None:
-            self._cluster.close()
-
-
-def _address(scheduler: str) -> dict[str, str]:
-    """Return how to name a scheduler: by address, or by its file (for which dask would wait for ever)."""
-    if "://" in scheduler:
-        return {"address": scheduler}
-    if not Path(scheduler).exists():
-        raise FileNotFoundError("no such scheduler file")
-    return {"scheduler_file": scheduler}
-
-
-def _cluster_class(name: str) -> Any:
-    import importlib
-
-    module, _, attribute = name.rpartition(".")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"compute.cluster.class: cannot import {name} ({error})") from error
-
-
 def make_executor(settings: ComputeSettings) -> Executor:
     """Return the executor that the settings ask for.
 
@@ -218,5 +142,7 @@ def make_executor(settings: ComputeSettings) -> Executor:
         case "processes":
             return DaskPoolExecutor(workers, processes=True)
         case "distributed":
+            from pchem_pipeline.compute.cluster import DistributedExecutor
+
             return DistributedExecutor(settings, workers)
     raise PchEmError(f"unknown backend {settings.backend}")
