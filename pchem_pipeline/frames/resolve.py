@@ -8,6 +8,7 @@ from pathlib import Path
 from pchem_pipeline.errors import ConfigError, InputError
 from pchem_pipeline.frames.raw import RawReader, find_sidecar
 from pchem_pipeline.frames.registry import frame_suffixes
+from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
 
 __all__ = ["HISTOGRAM_SUFFIXES", "input_paths", "natural_key", "resolve_files"]
@@ -39,6 +40,9 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")
     found: list[Path] = []
     for entry in settings.files:
+        if is_remote(entry):
+            found += fetch(entry)
+            continue
         path = Path(entry).expanduser()
         path = path if path.is_absolute() else base_dir / path
         if path.is_dir() and not _is_zarr(path):

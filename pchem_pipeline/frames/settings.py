@@ -20,7 +20,8 @@ class InputSettings(Section):
 
     files: tuple[str, ...] = Field(
         default=(),
-        description="camera files, globs or folders, relative to this YAML file; "
+        description="camera files, globs or folders, relative to this YAML file, or URLs such as "
+        "s3://bucket/frames/*.tif; "
         "read in natural order of their names (frame2 before frame10)",
     )
     format: str = Field(
