@@ -51,6 +51,7 @@ def fetch(url: str) -> list[Path]:
             f'{url}: reading from there needs another library ({error}); pip install "pchem-pipeline[s3]"'
         ) from error
     try:
+        storage.invalidate_cache()
         names = _names(storage, path)
         found = [_fetched(storage, name) for name in names if not name.endswith(_SIDECARS)]
         for name in names:
