@@ -129,6 +129,7 @@ def _joint() -> list[Variable]:
         ("goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of all samples, bins merged", ""),
         ("goodness_dof", _MAP, "int32", "1", "degrees of freedom of goodness_chi2", ""),
         ("goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds", ""),
+        ("outlier_share", _MAP, "float64", "1", "share of all frames that the tail guard left out", ""),
     ]
     return [Variable(f"joint/{name}", *rest) for name, *rest in found]  # type: ignore[arg-type]
 

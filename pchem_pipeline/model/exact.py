@@ -129,7 +129,7 @@ def _exact(
     pixels = np.flatnonzero(coarse)
     if pixels.size == 0:
         return result
-    exact = settings.model_copy(update={"likelihood": "exact"})
+    exact = settings.model_copy(update={"likelihood": "exact", "tail_guard": 0.0})
     other = _single(fit_joint([counts[pixels]], [origin[pixels]], settings=exact, adc_limits=adc_limits))
     other.fit_status[:] |= plain.fit_status[pixels] & np.uint16(int(_OF_DATA))
     return _likelier(result, other, pixels, settings)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from pchem_pipeline.model.fisher import cramer_rao
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.grown_inputs import pack
 from pchem_pipeline.model.grown_types_numba import N_LOBE_ROWS
+from pchem_pipeline.model.joint_guard import guarded, without_extremes
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.model.start import kernel_counts
@@ -29,6 +31,7 @@ __all__ = ["JointFit", "fit_joint", "joint_cramer_rao"]
 FloatArray = NDArray[np.float64]
 
 WARM_UP = 2  # EM steps before the first Newton step
+_GUARD_ROUNDS = 3
 _LOOSE = 0.1  # relative standard error of the gain beyond which the samples do not determine it
 _COARSE_NOISE, _COARSE_STEP = 0.6, 2.5  # DN, DN per electron: as for one sample
 
@@ -54,6 +57,7 @@ class JointFit:
         n_iterations: evaluations of the joint likelihood, int32, shape (n,).
         goodness_chi2, goodness_dof, goodness_p: Pearson chi-square of all samples, its degrees of freedom,
             and the probability of a larger one, shape (n,).
+        outlier_share: share of all frames that the tail guard left out, shape (n,).
     """
 
     quanta_exposure: FloatArray
@@ -70,6 +74,7 @@ class JointFit:
     goodness_chi2: FloatArray
     goodness_dof: NDArray[np.int32]
     goodness_p: FloatArray
+    outlier_share: FloatArray
 
 
 def fit_joint(
@@ -103,15 +108,71 @@ def fit_joint(
     settings = settings or FitSettings()
     dark = [False] * len(counts) if dark is None else list(dark)
     _check(counts, origins, dark)
-    n, n_samples = counts[0].shape[0], len(counts)
+    if settings.tail_guard == 0:
+        found = _climb(counts, origins, dark, settings, adc_limits)
+        share = np.zeros(found.words.shape[0])
+    else:
+        found, share = _climb_guarded(counts, origins, dark, settings, adc_limits)
+    return _result(found, share, settings, adc_limits, outside)
+
+
+class _Found(NamedTuple):
+    """What the loops fill."""
+
+    parameters: FloatArray
+    covariance: FloatArray
+    moments: FloatArray
+    out: FloatArray
+    words: NDArray[np.int64]
+
+
+def _climb_guarded(
+    counts: Sequence[NDArray[np.integer]],
+    origins: Sequence[NDArray[np.integer]],
+    dark: list[bool],
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+) -> tuple[_Found, FloatArray]:
+    """Fit without the samples that the fit does not expect; return also their share."""
+    used: Sequence[NDArray[np.integer]] = without_extremes(counts)
+    found = _climb(used, origins, dark, settings, adc_limits)
+    share = np.zeros(found.words.shape[0])
+    for _ in range(_GUARD_ROUNDS):
+        kept, share = guarded(
+            counts, origins, found.parameters, settings.tail_guard, settings.tail_guard_share
+        )
+        changed = np.zeros(share.size, np.bool_)
+        for now, before in zip(kept, used, strict=True):
+            changed |= (now != before).any(axis=1)
+        pixels = np.flatnonzero(changed)
+        if pixels.size == 0:
+            break
+        part = [sample[pixels] for sample in kept]
+        again = _climb(part, [origin[pixels] for origin in origins], dark, settings, adc_limits)
+        for mine, theirs in zip(found, again, strict=True):
+            mine[pixels] = theirs
+        used = kept
+    return found, share
+
+
+def _climb(
+    counts: Sequence[NDArray[np.integer]],
+    origins: Sequence[NDArray[np.integer]],
+    dark: list[bool],
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+) -> _Found:
+    """Fit all samples as they are."""
+    n, size = counts[0].shape[0], len(counts) + 3
     places = np.concatenate([[0], np.cumsum([sample.shape[1] for sample in counts])]).astype(np.int64)
     low, high = adc_limits or (None, None)
-    law = pack(MarginalModel(clip_low=low, clip_high=high), 1)
-    parameters = np.full((n, n_samples + 3), np.nan)
-    covariance = np.full((n, n_samples + 3, n_samples + 3), np.nan)
-    moments = np.full((n, n_samples, 2), np.nan)
-    out = np.full((n, joint_search_numba.N_OUT), np.nan)
-    words = np.zeros((n, joint_numba.N_WORDS), np.int64)
+    found = _Found(
+        np.full((n, size), np.nan),
+        np.full((n, size, size), np.nan),
+        np.full((n, len(counts), 2), np.nan),
+        np.full((n, joint_search_numba.N_OUT), np.nan),
+        np.zeros((n, joint_numba.N_WORDS), np.int64),
+    )
     joint_numba.fit_joint_tile(
         kernel_counts(np.concatenate(counts, axis=1)),
         places,
@@ -119,15 +180,11 @@ def fit_joint(
         np.array(dark, np.bool_),
         regression_basis(),
         _limits(settings),
-        law,
+        pack(MarginalModel(clip_low=low, clip_high=high), 1),
         np.empty((N_LOBE_ROWS, 1)),
-        parameters,
-        covariance,
-        moments,
-        out,
-        words,
+        *found,
     )
-    return _result(parameters, covariance, moments, out, words, settings, adc_limits, outside)
+    return found
 
 
 def _check(
@@ -156,16 +213,14 @@ def _limits(settings: FitSettings) -> FloatArray:
 
 
 def _result(
-    parameters: FloatArray,
-    covariance: FloatArray,
-    moments: FloatArray,
-    out: FloatArray,
-    words: NDArray[np.int64],
+    found: _Found,
+    outlier_share: FloatArray,
     settings: FitSettings,
     adc_limits: tuple[int, int] | None,
     outside: NDArray[np.integer] | None,
 ) -> JointFit:
     """Add to the status what the loops do not know, and blank what failed."""
+    parameters, covariance, moments, out, words = found
     n_samples = parameters.shape[1] - 3
     chi2, dof = out[:, joint_search_numba.CHI2], words[:, joint_numba.FREEDOM]
     probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
@@ -202,6 +257,7 @@ def _result(
         goodness_chi2=chi2.copy(),
         goodness_dof=dof.astype(np.int32),
         goodness_p=probability,
+        outlier_share=outlier_share,
     )
 
 

@@ -50,6 +50,8 @@ _LARGEST_SHARE = 3.0  # beyond it an EM step is taken, where there is one
 _MOST_SHARE = 1e6
 _CLEAR_GAP = 30.0  # nats: a neighbour this far below is not polished to the end
 _MOST_MOVES = 20
+_N_BESIDE = 4  # neighbours of a maximum
+_LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -163,9 +165,14 @@ def _take_step(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def same_place(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
-    """Tell whether two points belong to one maximum: bias within 0.3 e-, step within 10 %."""
+    """Tell whether two points belong to one maximum: bias and mean of the brightest sample within 0.3 e-."""
     n = left.size - 3
-    same: bool = abs(left[n + 1] - right[n + 1]) < 0.3 * left[n] and abs(left[n] - right[n]) < 0.1 * left[n]
+    a = left[n]
+    brightest = left[0]
+    for j in range(1, n):
+        brightest = max(brightest, left[j])
+    most = max(math.exp(brightest), _LEAST_BRIGHT)
+    same: bool = abs(left[n + 1] - right[n + 1]) < 0.3 * a and abs(a - right[n]) * most < 0.3 * a
     return same
 
 
@@ -251,6 +258,36 @@ def climb_joint(
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
+def _beside(which: int, samples: Samples, theta: NDArray[np.float64], out: NDArray[np.float64]) -> bool:
+    """Fill ``out`` with a neighbour of ``theta``: one electron fewer or more (odd ``which``).
+
+    The first two move the bias: all H_j -+ 1, mu +- 1/g. The others keep it and move the gain, so that the
+    brightest sample alone has an electron less or more: the combs agree at the bias and there.
+    """
+    n_samples = samples.dark.size
+    direction = 1.0 if which % 2 else -1.0
+    brightest = -math.inf
+    for j in range(n_samples):
+        if not samples.dark[j]:
+            brightest = max(brightest, theta[j])
+    most = math.exp(brightest)
+    if not most + direction > 0.03:
+        return False
+    for i in range(theta.size):
+        out[i] = theta[i]
+    if which < 2:
+        for j in range(n_samples):
+            out[j] = math.log(max(math.exp(theta[j]) + direction, 0.01))
+        out[n_samples + 1] -= direction * theta[n_samples]
+        return True
+    factor = (most + direction) / most
+    for j in range(n_samples):
+        out[j] += math.log(factor)
+    out[n_samples] /= factor
+    return most > _LEAST_BRIGHT
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
 def climb_beside(
     samples: Samples,
     middle: int,
@@ -261,46 +298,37 @@ def climb_beside(
     bench: Bench,
     answers: Answers,
 ) -> tuple[float, float, int]:
-    """Move to a neighbour (all H_j -+ 1, mu +- 1/g) while one is more likely.
+    """Move to a neighbour, see `_beside`, while one is more likely.
 
     Returns:
         Log-likelihood of the best, that of the best other one (-inf without one), evaluations.
     """
-    n_samples = samples.dark.size
     trial = np.empty(best.size)
     runner_up = -math.inf
-    used = 0
-    for direction in (-1.0, 1.0):
-        moves = 0
-        while moves < _MOST_MOVES:
-            highest = 0.0
-            for j in range(n_samples):
-                exposure = math.exp(best[j]) + direction
-                highest = max(highest, 0.0 if samples.dark[j] else exposure)
-                trial[j] = math.log(max(exposure, 0.01))
-            if not highest > 0.03:
-                break
-            for i in range(n_samples, best.size):
-                trial[i] = best[i]
-            trial[n_samples + 1] -= direction * best[n_samples]
-            outcome, loglik, count = climb_joint(
-                samples, middle, trial, limits, exact, best_loglik - _CLEAR_GAP, bench, answers
-            )
-            used += count
-            if outcome == DEGENERATE:
-                break
-            if same_place(best, trial):
-                if outcome == CONVERGED and loglik > best_loglik:
-                    copy(trial, best)
-                    best_loglik = loglik
-                break
-            if not (outcome == CONVERGED and loglik > best_loglik):
-                runner_up = max(runner_up, loglik)
-                break
+    used = moves = which = 0
+    while which < _N_BESIDE:
+        if not _beside(which, samples, best, trial):
+            which += 1
+            continue
+        outcome, loglik, count = climb_joint(
+            samples, middle, trial, limits, exact, best_loglik - _CLEAR_GAP, bench, answers
+        )
+        used += count
+        higher = outcome == CONVERGED and loglik > best_loglik
+        if outcome == DEGENERATE or same_place(best, trial):
+            if higher:
+                copy(trial, best)
+                best_loglik = loglik
+            which += 1
+        elif higher and moves < _MOST_MOVES:
             runner_up = max(runner_up, best_loglik)
             copy(trial, best)
             best_loglik = loglik
             moves += 1
+            which = which - which % 2  # on in both directions
+        else:
+            runner_up = max(runner_up, loglik)
+            which += 1
     return best_loglik, runner_up, used
 
 

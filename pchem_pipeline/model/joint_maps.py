@@ -87,6 +87,7 @@ def joint_maps(fit: JointFit, x: FloatArray | None, against: str, exposed: NDArr
         "goodness_chi2": fit.goodness_chi2,
         "goodness_dof": fit.goodness_dof,
         "goodness_p": fit.goodness_p,
+        "outlier_share": fit.outlier_share,
     }
     maps: dict[str, NDArray[Any]] = {}
     for i, name in enumerate(SHARED_MAPS[:3]):

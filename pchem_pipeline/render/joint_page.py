@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
-from matplotlib.figure import Figure
 
 from pchem_pipeline.render.captions import MAP_READING
-from pchem_pipeline.render.exhibits import Exhibit
+from pchem_pipeline.render.exhibits import Exhibit, drawing
 from pchem_pipeline.render.inspector import content_policy
 from pchem_pipeline.render.joint_data import AXES, JointData, middle
 from pchem_pipeline.render.joint_figures import exposure_figure, photon_transfer
@@ -65,24 +61,13 @@ def joint_exhibits(data: JointData, settings: ReportSettings) -> list[Exhibit]:
                 f"{sample.name} {short(middle(values)[0])} DN²"
                 for sample, values in zip(data.samples, data.joint["variance"], strict=True)
             ),
-            _at(photon_transfer, data),
+            drawing(photon_transfer, data),
         )
     )
     for name in _MAPS:
         if name in data.maps and finite(data.maps[name]).size:
             found.append(_map(data, name, settings))
     return [*found, _status(data)]
-
-
-def _at(draw: Callable[..., Figure], *args: object, **kwargs: object) -> Callable[[float], Figure]:
-    """Return a drawing that waits only for its width."""
-    return partial(_with_width, draw, args, kwargs)
-
-
-def _with_width(
-    draw: Callable[..., Figure], args: tuple[object, ...], kwargs: dict[str, object], width_mm: float
-) -> Figure:
-    return draw(*args, **kwargs, width_mm=width_mm)
 
 
 def _exposures(data: JointData) -> Exhibit:
@@ -96,7 +81,7 @@ def _exposures(data: JointData) -> Exhibit:
         f"Quanta exposure against {words} with the median line of the pixels; below, the median "
         "residual with its standard error.",
         f"Exposures on a line; median {noun} {measured(slope, error, symbol(name)[2])}.",
-        _at(exposure_figure, data),
+        drawing(exposure_figure, data),
     )
 
 
@@ -109,7 +94,7 @@ def _map(data: JointData, name: str, settings: ReportSettings) -> Exhibit:
         words.capitalize(),
         f"Map and histogram of the {words}.",
         f"Median {measured(centre, error, unit)}.",
-        _at(
+        drawing(
             map_and_histogram,
             data.maps[name],
             name,
@@ -130,7 +115,7 @@ def _status(data: JointData) -> Exhibit:
         "Fit status",
         "Where the joint fit failed or deserves caution.",
         f"{percent(good, status.size)} of the pixels have a good fit.",
-        _at(fit_status_map, status, dict(data.status_words)),
+        drawing(fit_status_map, status, dict(data.status_words)),
         raster=True,
     )
 

@@ -267,3 +267,27 @@ def test_plain_em_climbs_to_the_same_place():
     errors = np.sqrt(newton.covariance[:, 2, 2])
     assert (np.abs(em.conversion_gain - newton.conversion_gain) < 0.01 * errors).all()
     assert (em.n_iterations > newton.n_iterations).all()
+
+
+def test_a_few_glitches_do_not_move_the_estimates():
+    series = draw_series(np.random.default_rng(12), [0.6, 3.0, 0.0], 0.4, 6)
+    clean = fit_joint(series.counts, series.origins, dark=series.dark)
+    assert (clean.outlier_share == 0).all()
+    counts = [np.pad(sample, ((0, 0), (0, 3000))) for sample in series.counts]
+    for j, place in ((0, 2500), (1, 900), (2, 1700)):
+        counts[j][:, place] += 2
+    errors = np.sqrt(np.diagonal(clean.covariance, axis1=1, axis2=2))[:, [0, 1, 3, 4, 5]]
+    shifts = {}
+    for guard in (1e-3, 0.0):
+        found = fit_joint(
+            counts, series.origins, dark=series.dark, settings=FitSettings(tail_guard=guard)
+        )
+        mine, others = (
+            np.column_stack([f.quanta_exposure[:, :2], f.conversion_gain, f.bias, f.read_noise_dn])
+            for f in (found, clean)
+        )
+        shifts[guard] = np.abs(mine - others) / errors
+        if guard:
+            np.testing.assert_allclose(found.outlier_share, 6 / (3 * 4000 + 6), rtol=1e-9)
+    assert shifts[1e-3].max() < 0.1
+    assert not (shifts[0.0].max(axis=1) < 2.0).any()

@@ -1,0 +1,140 @@
+"""How near the joint fit of several exposures comes to its Cramer-Rao bound, up to a read noise of 1 e-.
+
+Prints a table and draws it: pixels are drawn from the exact quantised law at each read noise, fitted jointly, and
+their errors compared with the joint bound; beside it one sample of the middle exposure with all the frames.
+
+    python scripts/validation/joint_efficiency.py --figure joint_efficiency.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from pchem_pipeline.compute.environment import prepare_environment
+
+prepare_environment()
+
+import numpy as np  # noqa: E402
+
+from pchem_pipeline.model.fisher import cramer_rao  # noqa: E402
+from pchem_pipeline.model.joint import fit_joint, joint_cramer_rao  # noqa: E402
+from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
+from pchem_pipeline.model.pchem import fit_histograms  # noqa: E402
+from pchem_pipeline.render.style import BLUE, GRAY, GREEN, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
+
+NOISES = (0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 1.0)
+EXPOSURES = (0.5, 3.0, 12.0)
+STEP, BIAS = 10.0, 100.3
+
+
+class Row(NamedTuple):
+    """Results at one read noise; errors of g relative to g."""
+
+    noise: float
+    bound: float
+    ratios: tuple[float, ...]
+    pulls: float
+    good: float
+    single_bound: float
+    single_error: float
+    single_good: float
+
+
+def draw(rng, exposure, noise, n_pixels, n_frames):
+    """Return histograms and their first DN, drawn from the exact law."""
+    analog = np.sqrt(noise**2 - 1 / (12 * STEP**2))
+    first = int(BIAS - 9 * noise * STEP)
+    last = int(BIAS + (exposure + 9 * np.sqrt(exposure) + 9 + 9 * noise) * STEP)
+    mass = pcd_mass(np.arange(first, last), exposure, 1 / STEP, BIAS, analog)
+    counts = rng.multinomial(n_frames, mass / mass.sum(), size=n_pixels)
+    return counts.astype(np.uint32), np.full(n_pixels, first)
+
+
+def row(noise, n_pixels, n_frames):
+    """Simulate and fit at one read noise."""
+    rng = np.random.default_rng(int(1000 * noise))
+    exposures = (*EXPOSURES, 0.0)
+    drawn = [draw(rng, exposure, noise, n_pixels, n_frames) for exposure in exposures]
+    counts, origins = zip(*drawn, strict=True)
+    found = fit_joint(counts, origins, dark=[exposure == 0 for exposure in exposures])
+    j = len(exposures)
+    bound = np.sqrt(np.diagonal(joint_cramer_rao(exposures, 1 / STEP, noise * STEP, n_frames)))
+    errors = {
+        j: found.conversion_gain - 1 / STEP,
+        j + 1: found.bias - BIAS,
+        j + 2: found.read_noise_dn - noise * STEP,
+        2: found.quanta_exposure[:, 2] - EXPOSURES[2],
+    }
+    ratios = tuple(float(np.sqrt(np.nanmean(values**2)) / bound[place]) for place, values in errors.items())
+    pulls = errors[j] / np.sqrt(found.covariance[:, j, j])
+    total = n_frames * j
+    one = cramer_rao(EXPOSURES[1], 1 / STEP, noise * STEP, total)
+    single = fit_histograms(*draw(rng, EXPOSURES[1], noise, n_pixels, total))
+    error = single.conversion_gain * STEP - 1
+    known = error[np.isfinite(error)]
+    return Row(
+        noise,
+        float(bound[j]) * STEP,
+        ratios,
+        float(np.nanstd(pulls)),
+        float((found.fit_status == 0).mean()),
+        float(np.sqrt(one[1, 1])) * STEP,
+        float(np.sqrt((known**2).mean())) if known.size else float("nan"),
+        float(((single.fit_status & ~np.uint16(64)) == 0).mean()),
+    )
+
+
+@styled
+def figure(rows):
+    """Draw the relative error of g against the read noise."""
+    drawn = new_figure(120.0, 75.0)
+    axes = drawn.add_subplot()
+    noise = [each.noise for each in rows]
+    axes.plot(noise, [100 * each.single_bound for each in rows], color=VERMILION, label="one sample: bound")
+    single = [100 * each.single_error for each in rows]
+    axes.plot(noise, single, "x", color=VERMILION, label="one sample: fitted (where it has a value)")
+    axes.plot(noise, [100 * each.bound for each in rows], color=BLUE, label="jointly: bound")
+    joint = [100 * each.bound * each.ratios[0] for each in rows]
+    axes.plot(noise, joint, "o", color=BLUE, markersize=3.5, label="jointly: fitted")
+    axes.axvline(0.5, color=GRAY, linewidth=0.8, linestyle=":")
+    axes.axhline(10.0, color=GREEN, linewidth=0.8, linestyle=":", label="10 %")
+    axes.set(yscale="log", xlabel="read noise (e⁻)", ylabel="error of the conversion gain (%)")
+    axes.legend(loc="upper left")
+    return drawn
+
+
+def main(arguments=None):
+    """Print the table; draw it where asked to."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--pixels", type=int, default=300)
+    parser.add_argument("--frames", type=int, default=4000, help="of each sample")
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args(arguments)
+    write = sys.stdout.write
+    write(
+        f"samples H = {EXPOSURES} e- and a bias, {options.frames} frames each, {options.pixels} pixels, "
+        f"{STEP:g} DN/e-; one sample: H = {EXPOSURES[1]:g} with all {4 * options.frames} frames\n"
+        f"a ratio is known to {1 / np.sqrt(2 * options.pixels):.3f}\n"
+        "          joint bound   RMSE / bound of              pull   good | one sample: bound   RMSE   good\n"
+        "   s_e     sd(g)/g %      g     mu  sigma     H3    sd(g)      % |       sd(g)/g %      %      %\n"
+    )
+    rows = []
+    for noise in NOISES:
+        rows.append(row(noise, options.pixels, options.frames))
+        r = rows[-1]
+        write(
+            f"{r.noise:6.2f} {100 * r.bound:13.3f} {r.ratios[0]:6.3f} {r.ratios[1]:6.3f} {r.ratios[2]:6.3f} "
+            f"{r.ratios[3]:6.3f} {r.pulls:8.3f} {100 * r.good:6.1f} | {100 * r.single_bound:15.3f} "
+            f"{100 * r.single_error:6.2f} {100 * r.single_good:6.1f}\n"
+        )
+        sys.stdout.flush()
+    if options.figure is not None:
+        options.figure.write_bytes(figure_bytes(figure(rows), "png", dpi=150))
+        write(f"{options.figure}\n")
+
+
+if __name__ == "__main__":
+    main()

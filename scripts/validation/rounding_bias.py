@@ -1,0 +1,132 @@
+"""Bias of the density's and of the exact estimates against the number of DN per electron, 0.7 to 20.
+
+Prints a table and draws it. At each 1/g pixels with biases over a whole DN are drawn from the exact quantised law
+and fitted with both likelihoods; beside it the bias that the density is predicted to have. All in standard errors
+of one pixel, the median over the pixels of the four parameters, the largest of the four.
+
+    python scripts/validation/rounding_bias.py --figure rounding_bias.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from pchem_pipeline.compute.environment import prepare_environment
+
+prepare_environment()
+
+import numpy as np  # noqa: E402
+
+from pchem_pipeline.model.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias  # noqa: E402
+from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
+from pchem_pipeline.model.pchem import fit_histograms  # noqa: E402
+from pchem_pipeline.model.settings import FitSettings  # noqa: E402
+from pchem_pipeline.render.style import BLUE, GRAY, GREEN, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
+
+STEPS = (0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
+NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+
+
+class Row(NamedTuple):
+    """Results at one number of DN per electron, in standard errors."""
+
+    step: float
+    predicted: float
+    density: float
+    exact: float
+    density_known: float
+    exact_known: float
+    flagged: float
+
+
+def row(step, exposure, noise, n_pixels, n_frames):
+    """Simulate and fit at one number of DN per electron; ``noise`` is analog, e-."""
+    rng = np.random.default_rng(int(1000 * step))
+    bias = 100.0 + (np.arange(n_pixels) + 0.5) / n_pixels
+    x = np.arange(int(95 - 9 * noise * step), int(106 + (exposure + 9 * np.sqrt(exposure) + 9) * step) + 5)
+    mass = pcd_mass(x[None, :], exposure, 1 / step, bias[:, None], noise)
+    counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True)).astype(np.uint32)
+    origin = np.full(n_pixels, x[0])
+    truth = [np.full(n_pixels, exposure), np.full(n_pixels, 1 / step), bias]
+    truth.append(np.full(n_pixels, np.sqrt((noise * step) ** 2 + 1 / 12)))
+    frames = np.full(n_pixels, float(n_frames))
+    plain = fit_histograms(counts, origin)
+    exact = refine(counts, origin, plain, FitSettings(likelihood="exact"))
+    errors = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    good = exact.fit_status == 0
+    predicted = np.abs(rounding_bias(truth, frames)).max(axis=1)
+    shifts = []
+    for fit in (plain, exact):
+        usable = good & np.isfinite(fit.conversion_gain)
+        medians = [
+            np.median((getattr(fit, name) - truth[i])[usable] / errors[usable, i])
+            if usable.sum() > 9
+            else np.nan
+            for i, name in enumerate(NAMES)
+        ]
+        shifts.append(float(np.max(np.abs(medians))))
+    known = np.isfinite(plain.conversion_gain)
+    named = biased_by_rounding([getattr(plain, name) for name in NAMES], frames)
+    return Row(
+        step, float(np.median(predicted)), *shifts, float(known.mean()), float(good.mean()),
+        float(named.sum() / max(known.sum(), 1)),
+    )  # fmt: skip
+
+
+@styled
+def figure(rows, n_pixels):
+    """Draw the biases against 1/g."""
+    drawn = new_figure(120.0, 75.0)
+    axes = drawn.add_subplot()
+    step = [each.step for each in rows]
+    axes.plot(
+        step, [each.predicted for each in rows], color=VERMILION, label="density, predicted (typical bias)"
+    )
+    axes.plot(step, [each.density for each in rows], "x", color=VERMILION, label="density, fitted")
+    axes.plot(step, [each.exact for each in rows], "o", color=BLUE, markersize=3.5, label="exact, fitted")
+    axes.axhline(LARGEST_BIAS, color=GREEN, linewidth=0.9, linestyle=":", label=f"limit {LARGEST_BIAS:g}")
+    # the largest of four medians of pure noise
+    axes.axhspan(1e-5, 2.2 * 1.2533 / np.sqrt(n_pixels), color=GRAY, alpha=0.3, linewidth=0, label="noise")
+    axes.set(xscale="log", yscale="log", ylim=(1e-4, 100.0))
+    axes.set(xlabel="1/g (DN per electron)", ylabel="largest bias (standard errors)")
+    axes.set_xticks([0.7, 1, 2, 5, 10, 20], labels=["0.7", "1", "2", "5", "10", "20"])
+    axes.legend(loc="upper right")
+    return drawn
+
+
+def main(arguments=None):
+    """Print the table; draw it where asked to."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--pixels", type=int, default=400)
+    parser.add_argument("--frames", type=int, default=17_750)
+    parser.add_argument("--exposure", type=float, default=2.0, help="H, e-")
+    parser.add_argument("--read-noise", type=float, default=0.3, help="analog, e-")
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args(arguments)
+    write = sys.stdout.write
+    write(
+        f"H = {options.exposure:g} e-, analog read noise {options.read_noise:g} e-, {options.frames} frames, "
+        f"{options.pixels} pixels; largest of the four median biases, in standard errors of a pixel "
+        f"(noise: {2.2 * 1.2533 / np.sqrt(options.pixels):.2f})\n"
+        "   1/g   density    density     exact   density    exact   named\n"
+        "  DN/e- predicted    fitted    fitted   fitted %  good %  biased %\n"
+    )
+    rows = []
+    for step in STEPS:
+        rows.append(row(step, options.exposure, options.read_noise, options.pixels, options.frames))
+        r = rows[-1]
+        write(
+            f"{r.step:7.2f} {r.predicted:9.3g} {r.density:9.3g} {r.exact:9.3g} {100 * r.density_known:10.1f} "
+            f"{100 * r.exact_known:7.1f} {100 * r.flagged:9.1f}\n"
+        )
+        sys.stdout.flush()
+    if options.figure is not None:
+        options.figure.write_bytes(figure_bytes(figure(rows, options.pixels), "png", dpi=150))
+        write(f"{options.figure}\n")
+
+
+if __name__ == "__main__":
+    main()
