@@ -134,6 +134,12 @@ CAPTIONS: dict[str, str] = {
         "predicted density of the ensemble (black), its standard error from those of the maps (blue), and "
         "the sampling noise of the data it is compared with (light blue)."
     ),
+    "rounding": (
+        "Bias that rounding gives to estimates from the density of the PCD, in standard errors of one pixel, "
+        "at the median quanta exposure and read noise of this run and its number of frames; the worst of all "
+        "places of the bias between two whole DN. Above the dotted line (0.05) "
+        "fit.likelihood: auto fits with the exact masses."
+    ),
     "read_noise_histogram": (
         "Read noise, quantisation included. The blue line is the median, the shaded part holds the pixels"
         " from 5 to 95 %. {below} of the {noun}s with a value lie below 0.4 e⁻."

@@ -11,7 +11,13 @@ from matplotlib.figure import Figure
 
 from pchem_pipeline.model.electrons import thresholds
 from pchem_pipeline.model.maps import summarise
-from pchem_pipeline.render import ensemble_figures, map_figures, pixel_figures, trust_figures
+from pchem_pipeline.render import (
+    ensemble_figures,
+    map_figures,
+    pixel_figures,
+    rounding_figures,
+    trust_figures,
+)
 from pchem_pipeline.render.captions import CAPTIONS, highlighted_cases
 from pchem_pipeline.render.data import MAP_NAMES, PixelFit, ReportData
 from pchem_pipeline.render.ranges import finite
@@ -35,6 +41,7 @@ EXHIBIT_NAMES = (
     "electron_numbers",
     "component_widths",
     "uncertainty",
+    "rounding",
     "fit_status",
 )
 
@@ -71,7 +78,7 @@ def exhibits(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
     """Return the figures that the data allow, in the order of the report."""
     makers = (
         _cells, _pixels, _goodness, _left_out, _read_noise, _maps, _ensemble, _electrons, _components,
-        _uncertainty, _status,
+        _uncertainty, _rounding, _status,
     )  # fmt: skip
     return [exhibit for make in makers for exhibit in make(data, settings)]
 
@@ -237,6 +244,27 @@ def _uncertainty(data: ReportData, _: ReportSettings) -> list[Exhibit]:
             f"Part of the variance of the maps that is noise of the estimates: {words}.",
             drawing(trust_figures.uncertainty, shares, data.ensemble),
             PAGE_MM,
+        )
+    ]
+
+
+def _rounding(data: ReportData, _: ReportSettings) -> list[Exhibit]:
+    curves = rounding_figures.rounding_curves(data.maps, data.n_frames)
+    if not curves or not data.has_values("conversion_gain"):
+        return []
+    step = 1.0 / float(np.median(finite(data.maps["conversion_gain"])))
+    known = {name: values for name, values in curves.items() if name != "step"}
+    words = [
+        f"{name} {short(float(np.interp(step, curves['step'], values)), 2)}" for name, values in known.items()
+    ]
+    return [
+        Exhibit(
+            "rounding",
+            "uncertainty",
+            "Bias by rounding to whole DN",
+            CAPTIONS["rounding"],
+            f"At {short(step)} DN per electron, in standard errors of a pixel: {', '.join(words)}.",
+            drawing(rounding_figures.rounding, curves, data.maps["conversion_gain"]),
         )
     ]
 

@@ -20,6 +20,7 @@ from pchem_pipeline.render.map_figures import is_strip, map_bins, status_counts
 from pchem_pipeline.render.method_exhibits import METHOD_FIGURE
 from pchem_pipeline.render.pixel_figures import PAPER_EXAMPLE, cell_range, has_fit
 from pchem_pipeline.render.plan_exhibits import PLAN_FIGURE
+from pchem_pipeline.render.rounding_figures import rounding_curves
 from pchem_pipeline.render.settings import ReportSettings
 from pchem_pipeline.render.trust_figures import noise_shares
 from pchem_pipeline.render.wording import stored_unit
@@ -153,6 +154,12 @@ def _uncertainty(data: ReportData, _: ReportSettings) -> list[DataTable]:
     return [DataTable("maps", columns), DataTable("ensemble", {"dn (DN)": data.ensemble["dn"], **curves})]
 
 
+def _rounding(data: ReportData, _: ReportSettings) -> list[DataTable]:
+    curves = rounding_curves(data.maps, data.n_frames)
+    headings = {name: f"{name} (standard errors)" for name in curves} | {"step": "1/g (DN/e-)"}
+    return [DataTable("", {headings[name]: values for name, values in curves.items()})]
+
+
 def _worst(data: ReportData, settings: ReportSettings) -> list[DataTable]:
     return _pixels(replace(data, pixels=data.worst), settings)
 
@@ -270,6 +277,7 @@ _MAKERS: dict[str, Callable[[ReportData, ReportSettings], list[DataTable]]] = {
     "worst_pixels": _worst,
     "left_out": _left_out,
     "uncertainty": _uncertainty,
+    "rounding": _rounding,
     "read_noise_histogram": _read_noise,
     "ensemble": _ensemble,
     "electron_numbers": _electrons,

@@ -1,8 +1,8 @@
 """Bias of the density's and of the exact estimates against the number of DN per electron, 0.7 to 20.
 
-Prints a table and draws it. At each 1/g pixels with biases over a whole DN are drawn from the exact quantised law
-and fitted with both likelihoods; beside it the bias that the density is predicted to have. All in standard errors
-of one pixel, the median over the pixels of the four parameters, the largest of the four.
+Prints a table and draws it. At each 1/g pixels with biases over a whole DN are drawn from the exact
+quantised law and fitted with both likelihoods; beside it the bias that the density is predicted to have. All
+in standard errors of one pixel, the median over the pixels of the four parameters, the largest of the four.
 
     python scripts/validation/rounding_bias.py --figure rounding_bias.png
 """

@@ -1,7 +1,10 @@
 """``pchem joint``: runs of one sensor at several exposures, from the command line to maps and report."""
 
 import json
+import os
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,15 +43,15 @@ def camera(folder, name, seed, time, dead=0.0):
 @pytest.fixture(scope="module")
 def joint(tmp_path_factory, kernels):
     """Three exposures and a bias, fitted with one command in a folder of their own; do not change it."""
-    import os
-
     folder = tmp_path_factory.mktemp("exposures")
     for seed, time in enumerate((1.0, 2.0, 5.0)):
-        camera(folder, f"t{time:g}", 10 + seed, time)
+        camera(folder, f"dark_{time:g}s", 10 + seed, time)
     camera(folder, "bias", 20, 0.001, dead=1.0)
     shell = Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
-    result = shell.ok("joint", "t1.yaml", "t2.yaml", "t5.yaml", "--bias", "bias.yaml", "--store", "all.zarr")
-    assert result.stdout.strip() == "all.zarr/report.html" or result.stdout.strip().endswith("report.html")
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    [command] = re.findall(r"```shell\n(pchem joint .*)\n```", readme)
+    result = shell.ok(*command.split()[1:])
+    assert result.stdout.strip() == str(folder.resolve() / "dark.zarr" / "report.html")
     return folder
 
 
@@ -62,11 +65,11 @@ def write(folder, name, samples, **joint):
 
 
 def test_dark_current_is_the_slope_and_the_pulls_are_normal(joint):
-    store = RunStore.open(joint / "all.zarr")
+    store = RunStore.open(joint / "dark.zarr")
     status = store.read("joint/fit_status")
     good = status == 0
     assert good.mean() > 0.9
-    truth = RunStore.open(joint / "t1.zarr")
+    truth = RunStore.open(joint / "dark_1s.zarr")
     wanted = {name: truth.read(f"truth/{name}") for name in ("conversion_gain", "bias", "read_noise_dn")}
     wanted |= {"dark_current": truth.read("truth/quanta_exposure"), "spurious_charge": np.zeros(good.shape)}
     for name, values in wanted.items():
@@ -85,26 +88,31 @@ def test_dark_current_is_the_slope_and_the_pulls_are_normal(joint):
 
 
 def test_report_numbers_and_yaml_are_there(joint):
-    numbers = json.loads((joint / "all.zarr" / "report.json").read_text())
+    numbers = json.loads((joint / "dark.zarr" / "report.json").read_text())
     assert [each["integration_time"] for each in numbers["samples"]] == [1.0, 2.0, 5.0, None]
     assert 0.3 < numbers["maps"]["dark_current"]["median"] < 0.7
-    page = (joint / "all.zarr" / "report.html").read_text()
-    for words in ("Dark current as the slope of H", "Variance against mean", "spurious charge", "t5.zarr"):
+    page = (joint / "dark.zarr" / "report.html").read_text()
+    for words in (
+        "Dark current as the slope of H",
+        "Variance against mean",
+        "spurious charge",
+        "dark_5s.zarr",
+    ):
         assert words in page
-    assert (joint / "all.zarr" / "figures" / "exposures.svg").exists()
-    assert "kind: bias" in (joint / "all.yaml").read_text()
+    assert (joint / "dark.zarr" / "figures" / "exposures.svg").exists()
+    assert "kind: bias" in (joint / "dark.yaml").read_text()
 
 
 def test_nothing_is_done_twice_and_tiles_do_not_matter(joint):
-    before = (joint / "all.zarr" / "joint" / "bias").exists(), RunStore.open(joint / "all.zarr")
-    fit = find_joint([joint / "all.zarr"])
+    before = (joint / "dark.zarr" / "joint" / "bias").exists(), RunStore.open(joint / "dark.zarr")
+    fit = find_joint([joint / "dark.zarr"])
     record = before[1].records.read("joint")
     run_joint(fit, QUIET)
     assert before[1].records.read("joint") == record
     other = write(
         joint,
         "wide",
-        [("t1.zarr", ""), ("t2.zarr", ""), ("t5.zarr", ""), ("bias.zarr", "kind: bias")],
+        [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "kind: bias")],
         tile=16,
     )
     run_joint(find_joint([other]), QUIET)
@@ -115,13 +123,11 @@ def test_nothing_is_done_twice_and_tiles_do_not_matter(joint):
 
 
 def test_a_changed_time_fits_again_and_status_knows(joint, kernels):
-    import os
-
-    shutil.copytree(joint / "t1.zarr", joint / "copy1.zarr")
-    path = write(joint, "again", [("t1.zarr", ""), ("t2.zarr", "")])
+    shutil.copytree(joint / "dark_1s.zarr", joint / "copy1.zarr")
+    path = write(joint, "again", [("dark_1s.zarr", ""), ("dark_2s.zarr", "")])
     run_joint(find_joint([path]), QUIET)
     first = RunStore.open(joint / "again.zarr").read("maps/dark_current")
-    write(joint, "again", [("t1.zarr", "integration_time: 0.5"), ("t2.zarr", "")])
+    write(joint, "again", [("dark_1s.zarr", "integration_time: 0.5"), ("dark_2s.zarr", "")])
     run_joint(find_joint([path]), QUIET)
     assert (RunStore.open(joint / "again.zarr").read("maps/dark_current") != first).all()
     shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
@@ -135,7 +141,7 @@ def test_a_changed_time_fits_again_and_status_knows(joint, kernels):
 
 
 def test_light_levels_and_no_line(joint):
-    samples = [("t1.zarr", "light_level: 10"), ("t2.zarr", "light_level: 20")]
+    samples = [("dark_1s.zarr", "light_level: 10"), ("dark_2s.zarr", "light_level: 20")]
     run_joint(find_joint([write(joint, "light", samples, against="light_level")]), QUIET)
     store = RunStore.open(joint / "light.zarr")
     assert 0.03 < np.nanmedian(store.read("maps/charge_per_level")) < 0.07
@@ -149,30 +155,50 @@ def test_light_levels_and_no_line(joint):
 @pytest.mark.parametrize(
     ("samples", "joint_settings", "words"),
     [
-        ([("t1.zarr", ""), ("t1.yaml", "")], {}, "samples.1.run: t1.yaml is the run of samples.0 again"),
-        ([("t2.zarr", ""), ("t1.zarr", "")], {}, "integration time 1 is not above the 2 of samples.0"),
-        ([("t1.zarr", ""), ("t2.zarr", "integration_time: 1")], {}, "is not above the 1 of samples.0"),
-        ([("t1.zarr", ""), ("small.yaml", "")], {}, "has 8 x 8 pixels, samples.0 (t1.zarr) 8 x 12"),
-        ([("t1.zarr", ""), ("twelve.yaml", "")], {}, "has codes of 12 bits, samples.0 (t1.zarr) of 14"),
-        ([("t1.zarr", ""), ("twin.yaml", "")], {}, "holds the same frames as samples.0 (t1.zarr)"),
         (
-            [("timeless.yaml", ""), ("t2.zarr", "")],
+            [("dark_1s.zarr", ""), ("dark_1s.yaml", "")],
+            {},
+            "samples.1.run: dark_1s.yaml is the run of samples.0 again",
+        ),
+        (
+            [("dark_2s.zarr", ""), ("dark_1s.zarr", "")],
+            {},
+            "integration time 1 is not above the 2 of samples.0",
+        ),
+        (
+            [("dark_1s.zarr", ""), ("dark_2s.zarr", "integration_time: 1")],
+            {},
+            "is not above the 1 of samples.0",
+        ),
+        (
+            [("dark_1s.zarr", ""), ("smdark.yaml", "")],
+            {},
+            "has 8 x 8 pixels, samples.0 (dark_1s.zarr) 8 x 12",
+        ),
+        (
+            [("dark_1s.zarr", ""), ("twelve.yaml", "")],
+            {},
+            "has codes of 12 bits, samples.0 (dark_1s.zarr) of 14",
+        ),
+        ([("dark_1s.zarr", ""), ("twin.yaml", "")], {}, "holds the same frames as samples.0 (dark_1s.zarr)"),
+        (
+            [("timeless.yaml", ""), ("dark_2s.zarr", "")],
             {},
             "(timeless.yaml) has no integration time, so there is no",
         ),
-        ([("t1.zarr", ""), ("bias.zarr", "kind: bias")], {}, "a slope needs two exposures"),
+        ([("dark_1s.zarr", ""), ("bias.zarr", "kind: bias")], {}, "a slope needs two exposures"),
         (
-            [("t1.zarr", ""), ("t2.zarr", "")],
+            [("dark_1s.zarr", ""), ("dark_2s.zarr", "")],
             {"against": "light_level"},
-            "samples.0 (t1.zarr) has no light_level",
+            "samples.0 (dark_1s.zarr) has no light_level",
         ),
         ([("bias.zarr", "kind: bias")], {}, "every sample is a bias"),
-        ([("t1.zarr", "knd: bias")], {}, "samples.0.knd: unknown key; did you mean kind?"),
-        ([("nowhere.yaml", ""), ("t1.zarr", "")], {}, "nowhere.yaml: no such file"),
+        ([("dark_1s.zarr", "knd: bias")], {}, "samples.0.knd: unknown key; did you mean kind?"),
+        ([("nowhere.yaml", ""), ("dark_1s.zarr", "")], {}, "nowhere.yaml: no such file"),
     ],
 )
 def test_samples_that_do_not_belong_together_get_one_line(joint, samples, joint_settings, words):
-    frames = "input: {files: [t1-frames/*.npy], format: npy"
+    frames = "input: {files: [dark_1s-frames/*.npy], format: npy"
     others = {
         "small": f"{frames}, integration_time: 7, roi: [0, 8, 0, 8]}}",
         "twelve": f"{frames}, integration_time: 7, bit_depth: 12}}",
@@ -191,11 +217,11 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, joint_
 
 
 def test_what_is_no_joint_fit_says_so(joint):
-    with pytest.raises(ConfigError, match=r"t1\.yaml is a single run, and a joint fit needs several"):
-        find_joint([joint / "t1.yaml"])
+    with pytest.raises(ConfigError, match=r"dark_1s\.yaml is a single run, and a joint fit needs several"):
+        find_joint([joint / "dark_1s.yaml"])
     with pytest.raises(ConfigError, match="only for runs"):
-        find_joint([joint / "all.yaml"], store=joint / "x.zarr")
+        find_joint([joint / "dark.yaml"], store=joint / "x.zarr")
     with pytest.raises(ConfigError, match="exists with other settings"):
-        find_joint([joint / "t1.yaml", joint / "t2.yaml"], store=joint / "all.zarr")
+        find_joint([joint / "dark_1s.yaml", joint / "dark_2s.yaml"], store=joint / "dark.zarr")
     with pytest.raises(ConfigError, match="no such file"):
         find_joint([joint / "nothing.yaml"])

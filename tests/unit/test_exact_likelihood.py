@@ -12,6 +12,8 @@ from pchem_pipeline.model.fit_status import FitStatus
 from pchem_pipeline.model.pcd import log_pcd, pcd_mass
 from pchem_pipeline.model.pchem import fit_histograms
 from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.stages.session import Command, find_run, run_stages
+from pchem_pipeline.store.run_store import RunStore
 
 EXACT, AUTO = FitSettings(likelihood="exact"), FitSettings(likelihood="auto")
 
@@ -123,3 +125,24 @@ def test_nothing_to_fit_stays_nothing():
     found = refine(counts, np.zeros(2, np.int64), plain, EXACT)
     assert found.fit_status.tolist() == plain.fit_status.tolist()
     assert np.isnan(found.conversion_gain).all()
+
+
+def test_a_run_says_how_many_pixels_rounding_biases(tmp_path):
+    drawn = draw(np.random.default_rng(3), [1.0, 2.0, 1.5], 2.5, 0.3)
+    dn = drawn.origin[0] + np.arange(drawn.counts.shape[1])
+    np.savez(tmp_path / "h.npz", dn=dn, counts=drawn.counts)
+    gains = {}
+    for likelihood, words in (("density", "biases 100.0% of the pixels by more than 0.05"), ("auto", "")):
+        path = tmp_path / "run.yaml"
+        path.write_text(
+            "run: {store: run.zarr, tile: 8}\ninput: {files: [h.npz]}\n"
+            f"fit: {{likelihood: {likelihood}}}\n"
+        )
+        run_stages(find_run(path), ["ingest", "histogram", "fit"], Command(quiet=True, progress="off"))
+        store = RunStore.open(tmp_path / "run.zarr")
+        record = store.records.read("fit")
+        assert record is not None
+        assert words in " ".join(record.notes)
+        assert ("rounding" in " ".join(record.notes)) == bool(words)
+        gains[likelihood] = store.read("fit/conversion_gain")
+    assert (gains["density"] != gains["auto"]).all()

@@ -279,9 +279,7 @@ def test_a_few_glitches_do_not_move_the_estimates():
     errors = np.sqrt(np.diagonal(clean.covariance, axis1=1, axis2=2))[:, [0, 1, 3, 4, 5]]
     shifts = {}
     for guard in (1e-3, 0.0):
-        found = fit_joint(
-            counts, series.origins, dark=series.dark, settings=FitSettings(tail_guard=guard)
-        )
+        found = fit_joint(counts, series.origins, dark=series.dark, settings=FitSettings(tail_guard=guard))
         mine, others = (
             np.column_stack([f.quanta_exposure[:, :2], f.conversion_gain, f.bias, f.read_noise_dn])
             for f in (found, clean)
