@@ -171,7 +171,7 @@ def test_light_levels_and_no_line(joint):
             "is not above the 1 of samples.0",
         ),
         (
-            [("dark_1s.zarr", ""), ("smdark.yaml", "")],
+            [("dark_1s.zarr", ""), ("small.yaml", "")],
             {},
             "has 8 x 8 pixels, samples.0 (dark_1s.zarr) 8 x 12",
         ),
