@@ -17,6 +17,8 @@ __all__ = ["rounding", "rounding_curves"]
 
 _STEPS = np.geomspace(1.5, 30.0, 40)  # DN per electron
 _PHASES = 8  # biases over a whole DN
+_NEEDED = ("quanta_exposure", "conversion_gain", "read_noise_e")
+_LEAST_NOISE = 0.01  # e-
 _NAMES = ("quanta exposure", "conversion gain", "bias", "read noise")
 
 
@@ -24,17 +26,18 @@ def rounding_curves(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> d
     """Return the largest bias by rounding of each parameter against 1/g, at the median H and read noise.
 
     Args:
-        maps: of the run; the median quanta exposure and analog read noise are taken.
+        maps: of the run; the medians of H, g and the read noise are taken.
         n_frames: frames of a pixel.
 
     Returns:
         ``step``, DN per electron, and for each parameter the bias in standard errors of a pixel; empty where
         the run does not know what is needed.
     """
-    needed = [finite(maps[name]) for name in ("quanta_exposure", "analog_read_noise_e") if name in maps]
-    if len(needed) < 2 or not n_frames or any(values.size == 0 for values in needed):
+    needed = [finite(maps[name]) for name in _NEEDED if name in maps]
+    if len(needed) < len(_NEEDED) or not n_frames or any(values.size == 0 for values in needed):
         return {}
-    exposure, noise = (float(np.median(values)) for values in needed)
+    exposure, gain, total = (float(np.median(values)) for values in needed)
+    noise = np.sqrt(max(total**2 - gain**2 / 12.0, _LEAST_NOISE**2))
     steps = np.repeat(_STEPS, _PHASES)
     phases = np.tile(np.arange(_PHASES) / _PHASES, _STEPS.size)
     sigma = np.sqrt((noise * steps) ** 2 + 1.0 / 12.0)
