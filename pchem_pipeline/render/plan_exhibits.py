@@ -53,14 +53,13 @@ def plan_tables(data: ReportData) -> list[Table]:
         reached = plan["reached"].get(row["name"])
         unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
         now = "" if reached is None else f"{short(scale * reached, 2)} {unit}"
-        best = "" if math.isnan(row["best_exposure"]) else f"{short(row['best_exposure'], 2)} e⁻"
-        rows.append((_words(row["target"]), _count(row["frames"]), now, best, _count(row["best_frames"])))
+        rows.append((_words(row["target"]), _count(row["frames"]), now))
     exposure, noise = plan["mark"]
     caption = (
-        f"For the median pixel, H = {short(exposure)} e⁻ and read noise {short(noise)} e⁻; exposures up to "
-        "10 e⁻ are looked at. For other sensors and samples, and to check by simulation: pchem plan."
+        f"For the median pixel, H = {short(exposure)} e⁻ and read noise {short(noise)} e⁻, by the bound. For "
+        "the best exposure, other sensors, several samples, and a check by simulation: pchem plan."
     )
-    head = ("precision", "frames needed", "this run's", "best exposure", "frames there")
+    head = ("precision", "frames needed", "this run's")
     return [Table("plan-table", "Frames for a precision", caption, head, tuple(rows), section="plan")]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
+from pchem_pipeline.planning.frames import frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.stages.planning import contour_data
@@ -20,7 +20,6 @@ __all__ = ["plan_section"]
 _TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
 _DRAWN = _TARGETS[:2]
 _FINE = 22  # points along each axis of the figure
-_HIGHEST = 10.0  # e-: largest exposure that is recommended
 
 
 def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
@@ -39,18 +38,10 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         point = Point(exposure, noise, gain)
     except ConfigError:
         return None
-    rows = []
-    for target in map(parse_target, _TARGETS):
-        best, fewest = best_exposure([target], point, 0.02, _HIGHEST)
-        rows.append(
-            {
-                "target": str(target),
-                "name": target.name,
-                "frames": frames_needed(target, point),
-                "best_exposure": best,
-                "best_frames": fewest,
-            }
-        )
+    rows = [
+        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
+        for target in map(parse_target, _TARGETS)
+    ]
     reached = {} if n_frames is None else precision(point, n_frames)
     mark = (exposure, noise)
     return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}

@@ -16,6 +16,11 @@ from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import verify, verify_samples
+from pchem_pipeline.render.data import ReportData
+from pchem_pipeline.render.figure_data import csv_text, figure_tables
+from pchem_pipeline.render.plan_exhibits import plan_exhibits, plan_tables
+from pchem_pipeline.render.settings import ReportSettings
+from pchem_pipeline.stages.plan_section import plan_section
 from pchem_pipeline.stages.planning import PlanRequest, make_plan
 
 GAIN = 1 / 11
@@ -292,3 +297,24 @@ def test_weak_peaks_need_more_frames_than_the_bound_asks_for():
     assert good.rmse < 0.01 * np.sqrt(need.bound / need.seen) * (1 + 5 / np.sqrt(300))
     easy = one(["conversion_gain=1%"], point()).needs[0]
     assert easy.seen <= easy.bound
+
+
+def test_the_section_of_the_report_is_of_the_median_pixel():
+    maps = {
+        "quanta_exposure": np.array([[2.0, 2.0], [2.0, np.nan]]),
+        "read_noise_e": np.array([[0.305, 0.305], [0.305, np.nan]]),
+        "conversion_gain": np.full((2, 2), GAIN),
+    }
+    section = plan_section(maps, 17_750)
+    assert section["rows"][0]["frames"] == frames_needed(ONE_PERCENT, point())
+    assert section["reached"]["conversion_gain"] == pytest.approx(0.0028, abs=5e-5)
+    data = ReportData(title="a run", shape=(2, 2), plan=section)
+    [exhibit] = plan_exhibits(data)
+    assert exhibit.draw(88.0).axes
+    [table] = plan_tables(data)
+    assert table.rows[0][2] == "0.28 %"
+    assert {len(row) for row in table.rows} == {len(table.head)}
+    [numbers] = figure_tables(exhibit, data, ReportSettings())
+    assert len(csv_text(numbers).splitlines()) == 1 + section["contours"]["exposures"].size ** 2
+    assert plan_section({name: np.full((2, 2), np.nan) for name in maps}, 10) is None
+    assert plan_exhibits(ReportData(title="a run", shape=(2, 2))) == []
