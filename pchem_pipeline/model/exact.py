@@ -140,9 +140,9 @@ def _likelier(
 ) -> FitResult:
     """Keep the likelier of two fits of some pixels; where they lie apart, one limits the gap of the other."""
     mine = _of(result, pixels)
-    rise = _height(other) - _height(mine)
-    better = rise > 0
     with np.errstate(invalid="ignore"):
+        rise = _height(other) - _height(mine)
+        better = rise > 0
         step = np.abs(other.conversion_gain / mine.conversion_gain - 1.0) > _SAME_GAIN
         apart = step | (np.abs(other.bias - mine.bias) * mine.conversion_gain > _SAME_BIAS)
     kept = _with(mine, _of(other, np.flatnonzero(better)), np.flatnonzero(better))
