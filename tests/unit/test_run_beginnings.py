@@ -43,7 +43,7 @@ def test_the_region_is_written_into_the_yaml(tmp_path, file):
 
 
 def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
-    tifffile.imwrite(file, np.full((9, 8), 100, np.uint16))
+    tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(cli.app, ["run", str(file), "--dry-run"], catch_exceptions=False)
     assert result.exit_code == 0
