@@ -152,6 +152,10 @@ def run(
         Literal["copy", "reference"] | None,
         typer.Option(help="camera files: copy them into the store, or leave them where they are"),
     ] = None,
+    until: Annotated[
+        Literal["simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"],
+        typer.Option(help="last stage to be done"),
+    ] = "report",
     force: Force = False,
     dry_run: DryRun = False,
     tiles: Tiles = None,
@@ -167,7 +171,7 @@ def run(
 
     What is up to date is not done again.
     """
-    from pchem_pipeline.stages.session import cropped, run_stages
+    from pchem_pipeline.stages.session import cropped, run_stages, up_to
     from pchem_pipeline.stages.start import find_or_start
 
     command = make_command(
@@ -179,9 +183,10 @@ def run(
     target, is_new = find_or_start(targets, store, known, command.options.roi, write=not dry_run)
     if is_new:
         target, command = cropped(target, command)
-    run_stages(target, target.stages, command)
+    stages = up_to(until, target.stages)
+    run_stages(target, stages, command)
     if not dry_run:
-        typer.echo(target.store / "report.html")
+        typer.echo(target.store / "report.html" if "report" in stages else target.store)
 
 
 @app.command()

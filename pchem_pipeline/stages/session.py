@@ -28,7 +28,7 @@ from pchem_pipeline.store.beacon import Beacon
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Command", "Target", "cropped", "find_run", "run_stages", "run_status", "working_run"]
+__all__ = ["Command", "Target", "cropped", "find_run", "run_stages", "run_status", "up_to", "working_run"]
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,17 @@ def cropped(target: Target, command: Command) -> tuple[Target, Command]:
     if roi is None:
         return target, command
     return target.changed("input", roi=roi), replace(command, options=replace(command.options, roi=None))
+
+
+def up_to(last: str, stages: Sequence[str]) -> Sequence[str]:
+    """Return the stages up to and with ``last``.
+
+    Raises:
+        ConfigError: the run has no such stage.
+    """
+    if last not in stages:
+        raise ConfigError(f"--until {last}: this run does {', '.join(stages)}")
+    return stages[: stages.index(last) + 1]
 
 
 def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:

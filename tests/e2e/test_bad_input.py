@@ -100,7 +100,7 @@ def test_degenerate_pixels_get_a_word_and_stop_nothing(shell):
     stack[:, 0, 3] = 0
     stack[:, 0, 4] = np.minimum(stack[:, 0, 4], 120)
     np.save(shell.folder / "a.npy", stack)
-    shell.ok("run", "a.npy", "--bit-depth", "14")
+    shell.ok("run", "a.npy", "--bit-depth", "14", "--until", "fit")
     store = RunStore.open(shell.folder / "run.zarr")
     words, gain = store.read("fit/fit_status"), store.read("fit/conversion_gain")
     assert (words[0, :5] != 0).all()
@@ -190,7 +190,7 @@ def test_a_full_disk_stops_with_its_cure_and_the_run_goes_on_elsewhere(shell, fr
     assert result.code == 4
     assert "the disk is full: free some space and run again" in result.last
     subprocess.run(["mount", "-o", "remount,size=200m", small_disk], check=True)
-    shell.ok("run", "run.yaml", "--quiet")
+    shell.ok("run", "run.yaml", "--until", "maps", "--quiet")
 
 
 def test_a_read_only_folder(shell, frames, small_disk):

@@ -69,9 +69,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     """The folder of the run, grown, and what was seen of it before."""
     folder = tmp_path_factory.mktemp("grown")
     path = configured(folder, [])
-    run_stages(
-        find_run(path), ["simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"], QUIET
-    )
+    run_stages(find_run(path), ["simulate", "ingest", "histogram", "fit", "maps", "ensemble"], QUIET)
     store = RunStore.open(folder / "run.zarr")
     assert not any(store.has(f"fit/{name}") for name in FREE_LOBES)
     before = {

@@ -8,6 +8,8 @@ import pytest
 from commands import RUN, assert_same_results
 from filelock import FileLock
 
+UNTIL = ("--until", "ensemble")  # a report is drawn once, in a test of its own
+
 
 @pytest.fixture
 def run(shell, frames):
@@ -19,7 +21,7 @@ def test_killed_again_and_again_it_ends_with_the_same_bits(run, finished):
     rng = random.Random(4)
     killed = 0
     for _ in range(12):
-        process = run.start("run", "run.yaml", "--quiet", "--workers", "2")
+        process = run.start("run", "run.yaml", *UNTIL, "--quiet", "--workers", "2")
         try:
             process.communicate(timeout=rng.uniform(1.5, 5))
         except Exception:
@@ -29,14 +31,14 @@ def test_killed_again_and_again_it_ends_with_the_same_bits(run, finished):
         else:
             assert process.returncode == 0
             break
-    run.ok("run", "run.yaml")
+    run.ok("run", "run.yaml", *UNTIL)
     assert killed >= 1
     assert_same_results(finished, run.folder / "run.zarr")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_stops_with_its_code_and_the_run_goes_on_later(run, finished, number, code):
-    process = run.start("run", "run.yaml")
+    process = run.start("run", "run.yaml", *UNTIL)
     store = run.folder / "run.zarr" / ".pchem" / "stages"
     deadline = time.monotonic() + 120
     while not (store / "histogram.json").exists() and process.poll() is None and time.monotonic() < deadline:
@@ -45,7 +47,7 @@ def test_a_signal_stops_with_its_code_and_the_run_goes_on_later(run, finished, n
     _, stderr = process.communicate(timeout=120)
     assert process.returncode == code
     assert stderr.strip().splitlines()[-1].startswith(f"pchem: stopped by {signal.Signals(number).name}")
-    run.ok("run", "run.yaml")
+    run.ok("run", "run.yaml", *UNTIL)
     assert_same_results(finished, run.folder / "run.zarr")
 
 
@@ -56,5 +58,5 @@ def test_a_second_process_on_the_same_run_is_refused(run, finished):
         result = run("run", "run.yaml")
     assert result.code == 75
     assert "in use by another pchem process" in result.last
-    run.ok("run", "run.yaml")
+    run.ok("run", "run.yaml", *UNTIL)
     assert_same_results(finished, run.folder / "run.zarr")

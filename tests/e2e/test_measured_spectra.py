@@ -83,7 +83,7 @@ def test_the_search_names_what_physics_says_and_describes_the_rest(measured):
 
 
 def test_electron_numbers_need_frames(shell):
-    shell.ok("run", SPECTRA[0], "--store", "sipm.zarr", "--quiet")
+    shell.ok("run", SPECTRA[0], "--store", "sipm.zarr", "--until", "ensemble", "--quiet")
     result = shell("electrons", "sipm.zarr")
     assert result.code in (2, 4)
     assert "histograms" in result.last

@@ -19,7 +19,7 @@ discrepancy: {replicates: 24, grown_replicates: 12, candidates: [row_noise, fram
 
 def search(shell):
     shell.ok("ingest", "run.yaml")
-    shell.ok("discrepancy", "run.yaml")
+    shell.ok("discrepancy", "run.yaml", "--no-refit")
     return json.loads((shell.folder / "run.zarr" / "discrepancy.json").read_text())
 
 

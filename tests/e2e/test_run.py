@@ -106,7 +106,7 @@ def test_a_part_is_done_again_from_the_store_alone(shell, frames, finished):
 def test_neither_tiling_nor_backend_nor_mode_changes_the_answer(shell, frames, finished, tile, backend, mode):
     text = RUN.replace("tile: 8", f"tile: {tile}").replace("bit_depth", f"mode: {mode}, bit_depth")
     (shell.folder / "run.yaml").write_text(text)
-    shell.ok("run", "run.yaml", "--backend", backend, "--workers", "2")
+    shell.ok("run", "run.yaml", "--until", "ensemble", "--backend", backend, "--workers", "2")
     assert_same_results(finished, shell.folder / "run.zarr", rtol=1e-12)
 
 
@@ -115,12 +115,15 @@ def test_formats_of_the_same_frames_give_the_same_maps(shell, frames, finished):
 
     stack = np.concatenate([tifffile.imread(path) for path in sorted(frames.glob("*.tif"))])
     np.save(shell.folder / "stack.npy", stack)
-    shell.ok("run", "stack.npy", "--integration-time", "4.87", "--bit-depth", "14", "--store", "npy.zarr")
+    camera = ("--integration-time", "4.87", "--bit-depth", "14", "--store", "npy.zarr")
+    shell.ok("run", "stack.npy", *camera, "--until", "ensemble")
     assert_same_results(finished, shell.folder / "npy.zarr", rtol=1e-12)
 
 
 def test_a_region_of_interest_is_that_part_of_the_sensor(shell, frames, finished):
-    shell.ok("run", "frames", "--roi", "4:12,8:28", "--bit-depth", "14", "--store", "roi.zarr")
+    shell.ok(
+        "run", "frames", "--roi", "4:12,8:28", "--bit-depth", "14", "--store", "roi.zarr", "--until", "fit"
+    )
     whole, part = (
         arrays_of(finished, ("histogram",)),
         arrays_of(shell.folder / "roi.zarr", ("histogram", "fit")),
@@ -182,3 +185,14 @@ def test_without_home_and_without_integration_time(shell, frames):
     shell.ok("run", "frames", "--roi", "0:8,0:8", "--quiet")
     summary = json.loads((shell.folder / "run.zarr" / "report.json").read_text())
     assert summary["summary"]["read_noise_e"]["median"] > 0
+
+
+def test_a_run_stops_where_it_was_told_to(shell, frames):
+    (shell.folder / "run.yaml").write_text(RUN)
+    result = shell.ok("run", "run.yaml", "--until", "histogram")
+    assert result.stdout == f"{shell.folder / 'run.zarr'}\n"
+    rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
+    assert [stage for stage in STAGES if rows[stage] == "complete"] == ["ingest", "histogram"]
+    wrong = shell("run", "run.yaml", "--until", "simulate")
+    assert wrong.code == 2
+    assert wrong.last == f"pchem: --until simulate: this run does {', '.join(STAGES)}"
