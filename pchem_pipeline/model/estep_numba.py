@@ -31,8 +31,10 @@ from pchem_pipeline.model.workspace_numba import (
     Workspace,
 )
 
-# Sums may be reassociated, so that they run in vector registers: the order is then fixed by the compiler, the
-# same for every pixel and every batch. NaN and infinity keep their meaning.
+# Sums may be reassociated, so that they run in vector registers; NaN and infinity keep their meaning. Only for
+# the reductions here, where it gains most: what numba links into several kernels is optimised again in each,
+# and which copy runs depends on what the process compiled or loaded before. The starting points were once the
+# last bit different in a process that had just compiled them.
 _REORDER = {"reassoc", "nsz", "contract", "arcp"}
 
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13

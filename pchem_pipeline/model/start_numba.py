@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.workspace_numba import Histogram
 
-_REORDER = {"reassoc", "nsz", "contract", "arcp"}
-
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a lobe
 N_FREQUENCIES = 48  # up to 4.8/sd, the lobe of H = 22
 N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the lobe of H = 200
@@ -30,43 +28,49 @@ _MIN_VARIANCE = 1.0 / 12.0
 
 
 def regression_basis() -> NDArray[np.float64]:
-    """Return ``1 - cos(2 pi f a)`` for every trial step a (rows) and every frequency f (columns)."""
+    """Return ``1 - cos(2 pi f a)`` for every frequency f (rows) and every trial step a (columns)."""
     frequency = FREQUENCY_STEP * np.arange(1, N_FREQUENCIES + 1)
     lobe = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
-    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[None, :] / lobe[:, None]))
+    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / lobe[None, :]))
 
 
-@nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
-def ecf(
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def ecf_power(
     histogram: Histogram,
     step: float,
     n_frequencies: int,
     work: NDArray[np.float64],
 ) -> None:
-    """Leave the real and imaginary part of the unnormalised ECF at ``step * (1 ... n)`` in ``work[0:2]``.
+    """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``.
 
-    ``work`` has six rows; successive DN differ by a rotation, so no sine is taken per DN.
+    By Clenshaw's recurrence ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all
+    frequencies side by side; ``|sum c_i exp(i angle)|^2 = b_0^2 + b_1^2 - 2 cos(angle) b_0 b_1``.
     """
-    weights, first = histogram.weights, histogram.first
-    real, imag, cosine, sine = work[0], work[1], work[2], work[3]
-    turn_c, turn_s = work[4], work[5]
+    weights, n_bins = histogram.weights, histogram.n_bins
+    power, even, odd, twice = work[0], work[1], work[2], work[3]
+    base = 2.0 * math.cos(_TWO_PI * step)
+    before, present = 2.0, base
     for m in range(n_frequencies):
-        angle = _TWO_PI * step * (m + 1)
-        turn_c[m] = math.cos(angle)
-        turn_s[m] = math.sin(angle)
-        cosine[m] = math.cos(angle * first)
-        sine[m] = math.sin(angle * first)
-        real[m] = 0.0
-        imag[m] = 0.0
-    for i in range(histogram.n_bins):
-        c = weights[i]
+        twice[m] = present
+        before, present = present, base * present - before
+        even[m] = 0.0
+        odd[m] = 0.0
+    i = n_bins - 1
+    if n_bins % 2 == 1:
         for m in range(n_frequencies):
-            co = cosine[m]
-            si = sine[m]
-            real[m] += c * co
-            imag[m] += c * si
-            cosine[m] = co * turn_c[m] - si * turn_s[m]
-            sine[m] = co * turn_s[m] + si * turn_c[m]
+            even[m] = weights[i]
+        i -= 1
+    while i > 0:
+        right, left = weights[i], weights[i - 1]
+        for m in range(n_frequencies):
+            turn = twice[m]
+            following = right + (turn * even[m] - odd[m])
+            odd[m] = following
+            even[m] = left + (turn * following - even[m])
+        i -= 2
+    share = 1.0 / (histogram.n * histogram.n)
+    for m in range(n_frequencies):
+        power[m] = share * (even[m] * even[m] + odd[m] * odd[m] - twice[m] * even[m] * odd[m])
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -84,38 +88,58 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     return math.hypot(real, imag), math.atan2(imag, real)
 
 
-@nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
+@nb.njit(nogil=True, cache=True, error_model="numpy")
 def _regress(
     basis: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    quadratic: NDArray[np.float64],
-    target: NDArray[np.float64],
+    power: NDArray[np.float64],
+    floor: float,
+    sums: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Return (lobe frequency in 1/sd, H) of the best weighted regression over all trial steps."""
-    n = weight.size
+    """Return (lobe frequency in 1/sd, H) of the best weighted regression over all trial steps.
+
+    The sums of all trial steps grow side by side, frequency by frequency: that needs no other order of the
+    additions to run in vector registers.
+
+    Args:
+        basis: from `regression_basis`.
+        power: squared modulus of the ECF; its frequencies are those of the basis.
+        floor: power below which a frequency does not count.
+        sums: scratch, three rows of at least `N_LOBES`.
+    """
+    bb, bq, by = sums[0, :N_LOBES], sums[1, :N_LOBES], sums[2, :N_LOBES]
+    for p in range(N_LOBES):
+        bb[p] = 0.0
+        bq[p] = 0.0
+        by[p] = 0.0
     qq = qy = 0.0
-    for m in range(n):
-        qq += weight[m] * quadratic[m] * quadratic[m]
-        qy += weight[m] * quadratic[m] * target[m]
+    for m in range(power.size):
+        weight = power[m]
+        if not weight > floor:
+            continue
+        f = FREQUENCY_STEP * (m + 1)
+        quadratic = 0.5 * _TWO_PI * _TWO_PI * f * f
+        target = -0.5 * math.log(min(weight, 1.0))
+        weighted_q, weighted_y = weight * quadratic, weight * target
+        qq += weighted_q * quadratic
+        qy += weighted_q * target
+        row = basis[m]
+        for p in range(N_LOBES):
+            b = row[p]
+            bb[p] += weight * b * b
+            bq[p] += weighted_q * b
+            by[p] += weighted_y * b
     best, place = 0.0, -1
     best_exposure = 1.0
     before = after = last = 0.0
-    for p in range(basis.shape[0]):
-        bb = bq = by = 0.0
-        for m in range(n):
-            b = basis[p, m]
-            wb = weight[m] * b
-            bb += wb * b
-            bq += wb * quadratic[m]
-            by += wb * target[m]
-        determinant = qq * bb - bq * bq
+    for p in range(N_LOBES):
+        determinant = qq * bb[p] - bq[p] * bq[p]
         gain = 0.0
         exposure = 0.0
-        if determinant > 1e-9 * qq * bb:
-            exposure = (qq * by - bq * qy) / determinant
-            noise = (bb * qy - bq * by) / determinant
+        if determinant > 1e-9 * qq * bb[p]:
+            exposure = (qq * by[p] - bq[p] * qy) / determinant
+            noise = (bb[p] * qy - bq[p] * by[p]) / determinant
             if exposure > 0.0 and noise > 0.0:
-                gain = exposure * by + noise * qy
+                gain = exposure * by[p] + noise * qy
         if place == p - 1:
             after = gain
         if gain > best:
@@ -177,7 +201,7 @@ def start_regression(
     work: NDArray[np.float64],
     theta: NDArray[np.float64],
 ) -> tuple[bool, bool]:
-    """Start from the regression on log|phi|; ``work`` has nine rows.
+    """Start from the regression on log|phi|; ``work`` has seven rows.
 
     Returns:
         Whether there is a start, and whether the side lobe at its frequency stands clear of the noise.
@@ -185,20 +209,8 @@ def start_regression(
     n, variance = histogram.n, histogram.variance
     sd = math.sqrt(variance)
     n_used = min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP))
-    ecf(histogram, FREQUENCY_STEP / sd, n_used, work)
-    weight, quadratic, target = work[6, :n_used], work[7, :n_used], work[8, :n_used]
-    floor = 9.0 / n
-    for m in range(n_used):
-        f = FREQUENCY_STEP * (m + 1)
-        power = (work[0, m] * work[0, m] + work[1, m] * work[1, m]) / (n * n)
-        quadratic[m] = 0.5 * _TWO_PI * _TWO_PI * f * f
-        if power > floor:
-            weight[m] = power
-            target[m] = -0.5 * math.log(min(power, 1.0))
-        else:
-            weight[m] = 0.0
-            target[m] = 0.0
-    lobe, exposure = _regress(basis, weight, quadratic, target)
+    ecf_power(histogram, FREQUENCY_STEP / sd, n_used, work)
+    lobe, exposure = _regress(basis, work[0, :n_used], 9.0 / n, work[4:7])
     if lobe <= 0.0:
         return False, False
     answer: tuple[bool, bool] = assemble(histogram, sd / lobe, exposure, theta)
@@ -214,10 +226,10 @@ def start_peak(
     """Start from the highest side lobe of the ECF; False where none stands out of the noise."""
     n, variance = histogram.n, histogram.variance
     sd = math.sqrt(variance)
-    ecf(histogram, FREQUENCY_STEP / sd, N_FREQUENCIES_WIDE, work)
-    modulus = work[6]
+    ecf_power(histogram, FREQUENCY_STEP / sd, N_FREQUENCIES_WIDE, work)
+    modulus = work[0]
     for m in range(N_FREQUENCIES_WIDE):
-        modulus[m] = math.hypot(work[0, m], work[1, m]) / n
+        modulus[m] = math.sqrt(max(modulus[m], 0.0))
     best, place = 3.0 / math.sqrt(n), -1
     highest = min(N_FREQUENCIES_WIDE - 1, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP) - 1)
     for m in range(1, highest):
