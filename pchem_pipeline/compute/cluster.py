@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import functools
 import platform
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pchem_pipeline.compute.environment import prepare_environment
-from pchem_pipeline.compute.executor import OnResult, Outcome, Stop, guarded
+from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, Stop, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.errors import ConfigError, IncompleteRunError, MissingDependencyError
+from pchem_pipeline.errors import ConfigError, IncompleteRunError, MissingDependencyError, PchEmError
 
 __all__ = ["DistributedExecutor", "OtherVersionsError", "library_versions"]
 
@@ -21,6 +22,12 @@ T = TypeVar("T")
 
 #: libraries that decide the bits of a result, or that must understand each other
 _LIBRARIES = ("pchem-pipeline", "numpy", "scipy", "numba", "zarr", "distributed")
+
+#: seconds between looks for results, between looks at the workers while no result comes, and without
+#: workers before it is said
+_POLL, _LOOK, _SAY = 0.01, 1.0, 5.0
+#: share of a worker's memory above which dask gives it no more work
+_USABLE = 0.8
 
 
 class OtherVersionsError(ConfigError):
@@ -32,7 +39,14 @@ class DistributedExecutor:
 
     shares_memory = False
 
-    def __init__(self, settings: ComputeSettings, workers: int) -> None:
+    def __init__(self, settings: ComputeSettings, workers: int, notices: Notices) -> None:
+        """Connect to the cluster, or make it, and wait for its first worker.
+
+        Raises:
+            ConfigError: no scheduler answers, or the class of the cluster cannot be had.
+            IncompleteRunError: no worker came in ``compute.wait_for_workers`` seconds.
+            MissingDependencyError: dask.distributed is not installed.
+        """
         try:
             import distributed
         except ImportError as error:
@@ -58,28 +72,58 @@ class DistributedExecutor:
                 "start one with: dask scheduler"
             ) from error
         self._name = settings.scheduler or "of this run"
-        self.workers = max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        self._patience = _Patience(f"the dask scheduler {self._name}", settings.wait_for_workers, notices)
+        try:
+            self._wait()
+        except BaseException:
+            self.close()
+            raise
+        known = self._workers()
+        self.workers = max(1, len(known))
+        limits = [each["memory_limit"] for each in known if each["memory_limit"]]
+        self.memory_limit = int(_USABLE * min(limits)) if limits else None
+
+    def _workers(self) -> list[dict[str, Any]]:
+        return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
+
+    def _wait(self) -> None:
+        """Wait until there is a worker."""
+        while not self._patience.look(self._workers()):
+            time.sleep(0.1)
+
+    def _completed(self, futures: Sequence[Any]) -> Iterator[Any]:
+        """Give futures as they end, with an eye on the workers while none does."""
+        from distributed import as_completed
+
+        pending = as_completed(futures)
+        looked = time.monotonic()
+        while not pending.is_empty():
+            if batch := pending.next_batch(block=False):
+                yield from batch
+            elif time.monotonic() - looked > _LOOK:
+                self._patience.look(self._workers())
+                looked = time.monotonic()
+            else:
+                time.sleep(_POLL)
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`.
 
         Raises:
-            IncompleteRunError: the scheduler went away.
+            IncompleteRunError: the scheduler went away, or all workers did and none came back.
             OtherVersionsError: a worker has other versions of the libraries.
         """
-        from distributed import as_completed
-
         todo = list(items)
         try:
             task = functools.partial(_alike, library_versions(), function)
             futures = self._client.map(task, todo, pure=False)
             item_of = {future.key: item for future, item in zip(futures, todo, strict=True)}
-            for future in as_completed(futures):
+            for future in self._completed(futures):
                 outcome = _outcome(future)
                 if isinstance(outcome.error, OtherVersionsError):
                     raise outcome.error
                 on_result(item_of[future.key], outcome)
-        except (Stop, OtherVersionsError):
+        except (Stop, PchEmError):
             self._client.cancel(futures)
             raise
         except (OSError, CancelledError) as error:  # a lost connection, and what it makes of results
@@ -96,6 +140,62 @@ class DistributedExecutor:
         self._client.close(timeout=5)
         if self._cluster is not None:
             self._cluster.close(timeout=30)
+
+
+class _Patience:
+    """Says once that no worker can work, and gives up after a while."""
+
+    def __init__(self, name: str, seconds: float, notices: Notices) -> None:
+        self._name, self._seconds, self._notices = name, seconds, notices
+        self._since: float | None = None
+        self._said = False
+
+    def look(self, workers: Sequence[dict[str, Any]]) -> bool:
+        """Tell whether a worker can work now.
+
+        Args:
+            workers: what the scheduler tells of each, with ``status`` and ``memory_limit`` (bytes).
+
+        Raises:
+            IncompleteRunError: none could for too long.
+        """
+        if any(each["status"] == "running" for each in workers):
+            self._since, self._said = None, False
+            return True
+        self._notices.check()
+        now = time.monotonic()
+        self._since = now if self._since is None else self._since
+        if now - self._since >= self._seconds:
+            raise IncompleteRunError(self._last_words(workers))
+        if not self._said and now - self._since >= min(_SAY, self._seconds / 2):
+            self._said = True
+            why = f": all {len(workers)} are paused, their memory is nearly full" if workers else ""
+            self._notices.say(f"waiting for workers of {self._name}{why}")
+        return False
+
+    def _last_words(self, workers: Sequence[dict[str, Any]]) -> str:
+        waited = f"for {self._seconds:g} s (compute.wait_for_workers)"
+        if workers:
+            return (
+                f"{self._name}: all {len(workers)} workers were paused {waited}, {_limit(workers[0])} is "
+                f"nearly full; {_MORE_MEMORY}, and run the same command to go on"
+            )
+        return (
+            f"{self._name} had no worker {waited}; finished tiles are kept: start some with dask worker, or "
+            "raise that time, and run the same command to go on"
+        )
+
+
+_MORE_MEMORY = (
+    "give each more memory (fewer workers on a machine, dask worker --memory-limit, memory_limit in "
+    "compute.cluster.kwargs) or smaller pieces (--max-memory)"
+)
+
+
+def _limit(worker: dict[str, Any]) -> str:
+    """Return the words for the memory that a worker may take."""
+    limit = worker.get("memory_limit")
+    return f"their memory of {limit / 2**20:.0f} MiB" if limit else "their memory"
 
 
 def _address(scheduler: str) -> dict[str, str]:
@@ -156,8 +256,16 @@ def _outcome(future: Any) -> Outcome:
         outcome: Outcome = future.result()
         return outcome
     if type(error).__name__ == "KilledWorker":
-        text = (
-            "all workers that tried it died (killed, or out of memory); give workers more memory, run again"
-        )
-        return Outcome(error=IncompleteRunError(text), trace=str(error))
+        return Outcome(error=IncompleteRunError(_killed(error)), trace=str(error))
+    if isinstance(error, MemoryError):
+        return Outcome(error=IncompleteRunError(out_of_memory(error)), trace=str(error))
     return Outcome(error=error, trace=str(error))
+
+
+def _killed(error: Any) -> str:
+    """Say in one line that workers died at an item; the scheduler does not know of what."""
+    last, times = error.last_worker, error.allowed_failures + 1
+    return (
+        f"{times} worker{'s' * (times > 1)} died at it, the last at {last.address}: killed, or above "
+        f"{_limit({'memory_limit': last.memory_limit})}; {_MORE_MEMORY}, and run the same command to go on"
+    )

@@ -16,7 +16,16 @@ from pchem_pipeline.compute.environment import available_workers, prepare_enviro
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.errors import ConfigError, IncompleteRunError, PchEmError
 
-__all__ = ["Executor", "OnResult", "Outcome", "Stop", "guarded", "make_executor"]
+__all__ = [
+    "Executor",
+    "Notices",
+    "OnResult",
+    "Outcome",
+    "Stop",
+    "guarded",
+    "make_executor",
+    "out_of_memory",
+]
 
 T = TypeVar("T")
 
@@ -34,6 +43,19 @@ class Stop(Exception):
     """Raised by ``on_result`` to end the work: nothing new starts, what runs is finished."""
 
 
+@dataclass(frozen=True)
+class Notices:
+    """What an executor that has to wait calls.
+
+    Attributes:
+        say: with one line for people.
+        check: now and then; raises where the wait shall end.
+    """
+
+    say: Callable[[str], None] = lambda text: None
+    check: Callable[[], None] = lambda: None
+
+
 OnResult = Callable[[Any, Outcome], None]
 
 
@@ -43,6 +65,8 @@ class Executor(Protocol):
     workers: int
     #: workers share the memory of this process
     shares_memory: bool
+    #: bytes that a worker may take, where somebody watches over that
+    memory_limit: int | None
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """Call ``function`` on each item and ``on_result(item, outcome)`` here, in any order."""
@@ -57,8 +81,18 @@ def guarded(function: Callable[[T], Any], item: T) -> Outcome:
     """Call ``function`` and turn what it raises into an outcome: one bad tile stops no run."""
     try:
         return Outcome(value=function(item))
+    except MemoryError as error:
+        return Outcome(error=IncompleteRunError(out_of_memory(error)), trace=traceback.format_exc())
     except Exception as error:
         return Outcome(error=error, trace=traceback.format_exc())
+
+
+def out_of_memory(error: MemoryError) -> str:
+    """Say in one line that memory was not enough."""
+    return (
+        f"out of memory{f' ({error})' if str(error) else ''}; use fewer --workers, a smaller --max-memory "
+        "or a smaller run.tile, or a machine with more, and run the same command to go on"
+    )
 
 
 class SerialExecutor:
@@ -66,6 +100,7 @@ class SerialExecutor:
 
     workers = 1
     shares_memory = True
+    memory_limit: int | None = None
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`."""
@@ -78,6 +113,8 @@ class SerialExecutor:
 
 class DaskPoolExecutor:
     """dask's local scheduler on a pool of threads or of spawned processes."""
+
+    memory_limit: int | None = None
 
     def __init__(self, workers: int, *, processes: bool) -> None:
         self.workers = workers
@@ -125,8 +162,12 @@ class DaskPoolExecutor:
         """The pool lives only during :meth:`map`."""
 
 
-def make_executor(settings: ComputeSettings) -> Executor:
+def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> Executor:
     """Return the executor that the settings ask for.
+
+    Args:
+        settings: the section ``compute``.
+        notices: what to call while waiting for workers.
 
     Raises:
         PchEmError: it cannot be had; the message says why.
@@ -144,5 +185,5 @@ def make_executor(settings: ComputeSettings) -> Executor:
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, workers)
+            return DistributedExecutor(settings, workers, notices or Notices())
     raise PchEmError(f"unknown backend {settings.backend}")

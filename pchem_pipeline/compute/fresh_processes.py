@@ -29,6 +29,7 @@ class FreshProcessExecutor:
     """Processes that live during :meth:`map`; see :class:`~pchem_pipeline.compute.executor.Executor`."""
 
     shares_memory = False
+    memory_limit: int | None = None
 
     def __init__(self, workers: int) -> None:
         self.workers = workers

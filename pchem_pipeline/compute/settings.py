@@ -40,4 +40,10 @@ class ComputeSettings(Section):
         default=None,
         description="distributed: tcp://host:8786 or the path of a scheduler file; null: a local cluster",
     )
+    wait_for_workers: float = Field(
+        default=300.0,
+        gt=0,
+        description="distributed: seconds without a worker that can work after which the run gives up; "
+        "more where jobs wait in a queue",
+    )
     cluster: ClusterSettings | None = Field(default=None, description="distributed: {class, kwargs, scale}")

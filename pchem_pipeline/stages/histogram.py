@@ -103,12 +103,16 @@ def histogram_tile(
 # -- the stage ----------------------------------------------------------------------------------
 
 
+def _band_bytes(context: StageContext) -> int:
+    return band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
+
+
 def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
     """Return the bands; say so where even the lowest possible ones need more memory than allowed."""
     settings, tiles = context.config.histogram, context.tiles()
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
-    most = band_bytes(context.config, context.executor.workers) // row
+    most = _band_bytes(context) // row
     pending = {tile.key for tile in context.pending(tiles)}
     bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
     highest = max(band.y1 - band.y0 for band in bands)
@@ -182,7 +186,7 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
     tiles = context.tiles()
-    most = band_bytes(context.config, context.executor.workers) // row
+    most = _band_bytes(context) // row
     everything = {tile.key for tile in tiles}
     bands = plan_bands(tiles, everything, most, context.executor.workers, source.rows_per_read)
     context.stop.check()

@@ -60,9 +60,17 @@ def allowed_bytes(config: RunConfig, workers: int) -> int:
     return max(bands, (available_memory() or 0) // 2)
 
 
-def band_bytes(config: RunConfig, workers: int) -> int:
-    """Return the memory of a worker that counts a band of rows."""
+def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
+    """Return the memory of a worker that counts a band of rows.
+
+    Args:
+        config: of the run.
+        workers: number of workers.
+        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    """
     bytes_each = config.histogram.band_memory << 20
+    if limit is not None:
+        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
     if config.compute.max_memory is None:
         return bytes_each
     return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))

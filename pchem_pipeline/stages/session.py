@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pchem_pipeline.compute.executor import SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.errors import ConfigError, IncompleteRunError, StoreError
@@ -180,7 +180,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(target.config))
         write_json(store.path / ".pchem" / "location.json", _location(target))
-        executor = make_executor(target.config.compute)
+        executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
         stack.callback(executor.close)
         yield StageContext(
             target.config,

@@ -2,18 +2,23 @@
 
 import functools
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from commands import assert_same_results
 
 from pchem_pipeline.compute import cluster
-from pchem_pipeline.compute.executor import make_executor
+from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.errors import ConfigError, IncompleteRunError
+from pchem_pipeline.stages.interrupt import InterruptedRunError
+from pchem_pipeline.store.run_store import RunStore
 
 
 def slow_square(folder, number):
@@ -31,7 +36,8 @@ def processes(tmp_path):
     def start(kind, *options):
         command = [sys.executable, "-m", "dask", kind, "--no-dashboard", "--scheduler-file", str(file)]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        here = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+        folders = [str(each) for each in Path(__file__).parents[:2]]
+        here = os.pathsep.join([*folders, os.environ.get("PYTHONPATH", "")])
         environment = {**os.environ, "PYTHONPATH": here}  # the workers import this module
         started.append(subprocess.Popen([*command, *options], cwd=tmp_path, env=environment, **quiet))
 
@@ -95,3 +101,108 @@ def test_other_versions_are_refused(executor, monkeypatch, tmp_path):
     with pytest.raises(ConfigError, match=r"has numpy .* instead of 1\.2\.3; install the same versions"):
         executor.map(functools.partial(slow_square, tmp_path), range(4), lambda item, outcome: None)
     assert not list(tmp_path.glob("[0-9]*-*"))
+
+
+SMALL = """
+compute:
+  backend: distributed
+  cluster:
+    class: distributed.LocalCluster
+    kwargs: {n_workers: 1, threads_per_worker: 1, memory_limit: 170MiB, dashboard_address: null}
+"""
+
+
+def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bits(shell, finished):
+    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
+    store = shell.folder / "run.zarr"
+    shutil.rmtree(store / ".pchem" / "done" / "fit")  # as if nothing had been fitted
+    RunStore.open(store, writable=True).write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))
+    (shell.folder / "small.yaml").write_text((shell.folder / "run.yaml").read_text() + SMALL)
+    shell.environment["DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES"] = "0"
+    killed = shell("fit", "small.yaml", "--tiles", "0.0")
+    assert killed.code == 3
+    (line,) = [each for each in killed.stderr.splitlines() if each.startswith("pchem: ")]
+    assert "1 worker died at it, the last at tcp://127.0.0.1" in line
+    assert "above their memory of 170 MiB; give each more memory (fewer workers" in line
+    assert "Traceback" not in killed.stderr
+    shell.ok("fit", "run.yaml")
+    assert_same_results(store, finished)
+
+
+class Counted:
+    """What an executor says, and how often it asks whether to go on."""
+
+    def __init__(self):
+        self.lines, self.asked = [], 0
+
+    def check(self):
+        self.asked += 1
+
+
+def test_a_scheduler_without_workers_is_said_and_given_up(processes):
+    file, (_, *workers) = processes
+    for worker in workers:
+        worker.kill()
+        worker.wait()
+    heard = Counted()
+    settings = ComputeSettings(backend="distributed", scheduler=str(file), wait_for_workers=1)
+    with pytest.raises(
+        IncompleteRunError, match=r"had no worker for 1 s \(compute.wait_for_workers\)"
+    ) as caught:
+        make_executor(settings, Notices(heard.lines.append, heard.check))
+    assert heard.lines == [f"waiting for workers of the dask scheduler {file}"]
+    assert heard.asked > 3
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path):
+    file, (_, *workers) = processes
+    settings = ComputeSettings(backend="distributed", scheduler=str(file), wait_for_workers=3)
+    heard = Counted()
+    executor = make_executor(settings, Notices(heard.lines.append, heard.check))
+    executor._client.wait_for_workers(2, timeout=60)
+    found = []
+
+    def on_result(number, outcome):
+        found.append(number)
+        for worker in workers:
+            worker.kill()
+
+    try:
+        with pytest.raises(IncompleteRunError, match="had no worker for 3 s"):
+            executor.map(functools.partial(slow_square, tmp_path), range(400), on_result)
+    finally:
+        executor.close()
+    assert 1 <= len(found) < 10
+    assert len(heard.lines) == 1
+
+
+def test_a_signal_ends_the_wait_for_workers(processes):
+    file, (_, *workers) = processes
+    for worker in workers:
+        worker.kill()
+        worker.wait()
+
+    def check():
+        raise InterruptedRunError(signal.SIGTERM)
+
+    with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
+        make_executor(ComputeSettings(backend="distributed", scheduler=str(file)), Notices(check=check))
+
+
+def test_paused_workers_are_not_waited_for_forever():
+    lines = []
+    patience = cluster._Patience("the dask scheduler x", 0.05, Notices(lines.append))
+    workers = [{"status": "paused", "memory_limit": 300 << 20}] * 2
+    assert not patience.look(workers)
+    time.sleep(0.03)
+    assert not patience.look(workers)
+    time.sleep(0.03)
+    with pytest.raises(IncompleteRunError, match="all 2 workers were paused") as caught:
+        patience.look(workers)
+    assert "300 MiB" in str(caught.value)
+    assert lines == [
+        "waiting for workers of the dask scheduler x: all 2 are paused, their memory is nearly full"
+    ]
+    assert patience.look([*workers, {"status": "running", "memory_limit": 0}])
