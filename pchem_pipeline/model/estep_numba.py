@@ -31,10 +31,10 @@ from pchem_pipeline.model.workspace_numba import (
     Workspace,
 )
 
-# Sums may be reassociated, so that they run in vector registers; NaN and infinity keep their meaning. Only for
-# the reductions here, where it gains most: what numba links into several kernels is optimised again in each,
-# and which copy runs depends on what the process compiled or loaded before. The starting points were once the
-# last bit different in a process that had just compiled them.
+# Sums may be reassociated, so that they run in vector registers; NaN and infinity keep their meaning. Only
+# for the reductions here: what numba links into several kernels is optimised again in each, and which copy
+# runs depends on what the process compiled or loaded before. The starting points, once compiled like this,
+# came out different in the last bit in a process that had just compiled them.
 _REORDER = {"reassoc", "nsz", "contract", "arcp"}
 
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
