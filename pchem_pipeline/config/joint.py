@@ -63,6 +63,13 @@ class JointSettings(Section):
         description="fraction of pixels without a value above which the exit code is 3",
     )
 
+    @field_validator("store")
+    @classmethod
+    def _is_a_folder(cls, value: str) -> str:
+        if "://" in value:
+            raise ValueError("is a URL; a joint fit has its store on a disk, copy it when it is finished")
+        return value
+
 
 class JointConfig(Section):
     """The configuration of a joint fit.

@@ -27,7 +27,7 @@ class RunSettings(Section):
     store: str = Field(
         default="run.zarr",
         min_length=1,
-        description="folder of the run's store (zarr), on a disk of this machine or a shared one: no URL",
+        description="the run's store (zarr): a folder, or a URL of an object storage: s3://bucket/run.zarr",
     )
     title: str = Field(default="", description="title of the report; empty: the name of the store")
     tile: Literal[8, 16, 32, 64, 128, 256] = Field(
@@ -39,13 +39,6 @@ class RunSettings(Section):
         le=1,
         description="fraction of pixels without a value above which the exit code is 3",
     )
-
-    @field_validator("store")
-    @classmethod
-    def _is_a_folder(cls, value: str) -> str:
-        if "://" in value:
-            raise ValueError("is a URL; a run works on a disk, copy the finished folder there")
-        return value
 
 
 class RunConfig(Section):

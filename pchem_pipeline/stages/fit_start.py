@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.stages.pipeline import setting_values
 from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.variables import PARAMETERS
 
 if TYPE_CHECKING:
@@ -48,7 +49,10 @@ def kept_fit(store: Path, region: tuple[slice, slice]) -> NDArray[np.float64] | 
     place = _place(store)
     if not place.exists():
         return None
-    whole = np.load(place, mmap_mode="r", allow_pickle=False)
+    if isinstance(place, RemotePath):
+        whole = np.load(io.BytesIO(place.read_bytes()), allow_pickle=False)
+    else:
+        whole = np.load(place, mmap_mode="r", allow_pickle=False)
     return np.array(whole[region])
 
 

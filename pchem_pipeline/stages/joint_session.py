@@ -14,6 +14,7 @@ from pchem_pipeline.stages.pipeline import JOINT_STAGES
 from pchem_pipeline.stages.reporting import Reporter
 from pchem_pipeline.stages.session import Command, Target, find_run, run_stages
 from pchem_pipeline.store.files import read_json, write_atomic
+from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["JointRun", "find_joint", "run_joint"]
@@ -60,11 +61,12 @@ def find_joint(
             f"{targets[0]} is a single run, and a joint fit needs several; give them all, "
             "or a YAML with samples"
         )
-    place = (store or Path("joint.zarr")).resolve()
+    place = place_of(store or Path("joint.zarr")).resolve()
     path = place.with_suffix(".yaml")
     kinds = [*((each, "exposed") for each in targets), *((each, "bias") for each in bias)]
     samples = [{"run": os.path.relpath(each, path.parent), "kind": kind} for each, kind in kinds]
-    config = make_joint({"samples": samples, "joint": {"store": place.name}}, "the command line")
+    name = str(place) if isinstance(place, RemotePath) else place.name
+    config = make_joint({"samples": samples, "joint": {"store": name}}, "the command line")
     for each, _ in kinds:
         find_run(each)
     text = dump_joint(config)

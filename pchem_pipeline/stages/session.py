@@ -26,6 +26,7 @@ from pchem_pipeline.stages.pipeline import (
 from pchem_pipeline.stages.reporting import ProgressMode, Reporter
 from pchem_pipeline.store.beacon import Beacon
 from pchem_pipeline.store.files import read_json, write_json
+from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["Command", "Target", "cropped", "find_run", "run_stages", "run_status", "up_to", "working_run"]
@@ -82,6 +83,7 @@ def find_run(path: Path) -> Target:
         ConfigError: neither a YAML file nor a store, or its content is wrong.
         StoreError: the store is damaged.
     """
+    path = place_of(path)
     if path.is_dir():
         store = RunStore.open(path)
         text = store.config_text()
@@ -100,7 +102,7 @@ def find_run(path: Path) -> Target:
         raise ConfigError(f"{path} {what}; give a config.yaml or the store of a run")
     config = load_config(path)
     base_dir = path.resolve().parent
-    return Target(config, base_dir, base_dir / config.run.store, path.resolve())
+    return Target(config, base_dir, place_of(config.run.store, base_dir), path.resolve())
 
 
 def with_overrides(target: Target, command: Command) -> Target:

@@ -13,6 +13,7 @@ from pchem_pipeline.errors import ConfigError, quoted
 from pchem_pipeline.stages.pipeline import STAGES
 from pchem_pipeline.stages.session import Target, find_run
 from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["find_or_start", "write_template"]
@@ -51,7 +52,7 @@ def find_or_start(
     Raises:
         ConfigError: options do not fit the target, or the YAML exists with other settings.
     """
-    first = targets[0]
+    first = place_of(targets[0])
     if len(targets) == 1 and (first.suffix.lower() in _YAML or (first / ".pchem").is_dir()):
         if store is not None or given:
             names = [*(["store"] if store is not None else []), *given]
@@ -65,11 +66,12 @@ def find_or_start(
         raise ConfigError(
             f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
         )
-    place = (store or Path("run.zarr")).resolve()
-    path = place.with_suffix(".yaml")
+    place = place_of(store or Path("run.zarr")).resolve()
+    remote = isinstance(place, RemotePath)  # there the YAML would be out of reach: it is written here
+    path = Path(place.with_suffix(".yaml").name).resolve() if remote else place.with_suffix(".yaml")
     config = make_config(
         {
-            "run": {"store": place.name},
+            "run": {"store": str(place) if remote else place.name},
             "input": {"files": _file_list(targets, path.parent), "roi": roi, **given},
         },
         "the command line",

@@ -11,6 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pchem_pipeline.store.remote_path import RemotePath
+
 __all__ = ["Beacon", "read_beacon"]
 
 
@@ -32,10 +34,12 @@ class Beacon:
             "pid": os.getpid(),
             "host": socket.gethostname(),
         }
-        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
+        remote = isinstance(self._path, RemotePath)  # where an object appears whole
+        aside = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
         with contextlib.suppress(OSError):
-            temporary.write_text(json.dumps(content) + "\n", encoding="utf-8")
-            temporary.replace(self._path)
+            (self._path if remote else aside).write_text(json.dumps(content) + "\n", encoding="utf-8")
+            if not remote:
+                aside.replace(self._path)
             self._shown = True
 
     def remove(self) -> None:

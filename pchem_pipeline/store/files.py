@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.errors import StoreError
+from pchem_pipeline.store.remote_path import RemotePath
 
 __all__ = ["canonical_json", "read_json", "storage_error", "write_atomic", "write_json"]
 
@@ -24,7 +25,9 @@ _CURES = {
 
 
 def storage_error(error: OSError, path: object) -> StoreError:
-    """Translate an error of the file system into one line with its cure."""
+    """Translate an error of the file system into one line with its cure; one that is such a line stays."""
+    if isinstance(error, StoreError):
+        return error
     cure = _CURES.get(error.errno or 0, "check the disk and the permissions")
     return StoreError(f"cannot use {path}: {error.strerror or error}; {cure}")
 
@@ -37,9 +40,14 @@ def is_fatal(error: BaseException) -> bool:
 def write_atomic(path: Path, data: bytes) -> None:
     """Write ``data`` beside ``path``, flush it to the disk, and rename it into place.
 
+    An object of an object storage is put at once: it appears whole or not at all.
+
     Raises:
-        StoreError: the file system refused.
+        StoreError: the file system, or the object storage, refused.
     """
+    if isinstance(path, RemotePath):
+        path.write_bytes(data)
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.store.files import canonical_json, read_json, write_json
+from pchem_pipeline.store.remote_path import RemotePath
 
 __all__ = ["Records", "StageRecord", "fingerprint_of"]
 
@@ -73,7 +74,11 @@ class Records:
     def forget(self, stage: str) -> None:
         """Drop the record and all markers of a stage."""
         (self._folder / "stages" / f"{stage}.json").unlink(missing_ok=True)
-        shutil.rmtree(self._folder / "done" / stage, ignore_errors=True)
+        markers = self._folder / "done" / stage
+        if isinstance(markers, RemotePath):
+            markers.remove_folder()
+        else:
+            shutil.rmtree(markers, ignore_errors=True)
 
     def mark(self, stage: str, fingerprint: str, key: str, summary: dict[str, Any]) -> None:
         """Say that a unit of a stage is whole in the store."""

@@ -8,11 +8,16 @@ run.zarr/
   .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock,
                          progress.json while a command works on it
 ```
+
+The same objects make a run on an object storage, whose path is a URL; there the lock holds on one machine
+only.
 """
 
 from __future__ import annotations
 
+import hashlib
 import shutil
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,15 +27,16 @@ import numpy as np
 from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import LockedError, StoreError, quoted
+from pchem_pipeline.errors import LockedError, PchEmError, StoreError, quoted
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.records import Records
+from pchem_pipeline.store.remote_path import RemotePath, place_of, refused
 from pchem_pipeline.variables import VARIABLES
 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["SCHEMA_VERSION", "RunStore"]
+__all__ = ["SCHEMA_VERSION", "RunStore", "lock_folder"]
 
 #: Version of the layout; another version is refused.
 SCHEMA_VERSION = 1
@@ -58,15 +64,15 @@ class RunStore:
         """
         import zarr
 
+        path = place_of(path)
         if (path / "zarr.json").exists():
             return cls.open(path, writable=True)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise StoreError(f"{path} exists and is not a run; choose another --store or remove it")
-        try:
+        with _one_line(path, path):
             path.mkdir(parents=True, exist_ok=True)
-            root = zarr.create_group(str(path), zarr_format=3, attributes={"pchem_schema": SCHEMA_VERSION})
-        except OSError as error:
-            raise storage_error(error, path) from error
+            attributes = {"pchem_schema": SCHEMA_VERSION}
+            root = zarr.create_group(_zarr_place(path, writable=True), zarr_format=3, attributes=attributes)
         return cls(path, root)
 
     @classmethod
@@ -78,12 +84,13 @@ class RunStore:
         """
         import zarr
 
+        path = place_of(path)
         if not (path / "zarr.json").exists():
             raise StoreError(
                 f"there is no run at {path}; make one with: pchem run FILES --store {quoted(path)}"
             )
         try:
-            root = zarr.open_group(str(path), mode="r+" if writable else "r")
+            root = zarr.open_group(_zarr_place(path, writable=writable), mode="r+" if writable else "r")
             schema = root.attrs.get("pchem_schema")
         except (ValueError, KeyError, TypeError, OSError) as error:
             raise StoreError(f"{path} is damaged ({error}); restore it or start the run again") from error
@@ -242,7 +249,7 @@ class RunStore:
             LockedError: another process holds it.
             StoreError: the lock file cannot be written.
         """
-        private = self.path / _PRIVATE
+        private = lock_folder(self.path)
         try:
             private.mkdir(parents=True, exist_ok=True)
             lock = FileLock(private / "lock")
@@ -261,24 +268,66 @@ class RunStore:
 
     def _sweep(self) -> None:
         """Remove what a killed process left: partial files never become part of the run."""
+        if isinstance(self.path, RemotePath):  # which has none
+            return
         for path in self.path.rglob("*.partial"):
             path.unlink(missing_ok=True)
 
     def free_bytes(self) -> int:
-        """Return the free space of the disk that holds the store."""
+        """Return the free space of the disk that holds the store; an object storage is never full."""
+        if isinstance(self.path, RemotePath):
+            return sys.maxsize
         return shutil.disk_usage(self.path).free
 
     @contextmanager
     def _translated(self, name: str, region: _Region | None = None) -> Iterator[None]:
         where = f"{self.path}: {name}" + (f" {_words(region)}" if region else "")
         try:
-            yield
-        except OSError as error:
-            raise storage_error(error, where) from error
+            with _one_line(self.path, where):
+                yield
         except (ValueError, RuntimeError) as error:
             raise StoreError(
                 f"{where} cannot be read ({error}); redo that stage with --force, or those tiles with --tiles"
             ) from error
+
+
+@contextmanager
+def _one_line(path: Path, where: object) -> Iterator[None]:
+    """Make one line of what a file system, or an object storage, refuses."""
+    try:
+        yield
+    except PchEmError:
+        raise
+    except OSError as error:
+        raise (
+            refused(where, error) if isinstance(path, RemotePath) else storage_error(error, where)
+        ) from error
+    except Exception as error:
+        # each kind of storage has errors of its own; wrong values are a matter of the content
+        if isinstance(path, RemotePath) and not isinstance(
+            error, (ValueError, RuntimeError, KeyError, TypeError)
+        ):
+            raise refused(where, error) from error
+        raise
+
+
+def _zarr_place(path: Path, *, writable: bool) -> Any:
+    """Return what zarr opens."""
+    if not isinstance(path, RemotePath):
+        return str(path)
+    from zarr.storage import FsspecStore
+
+    options = {"use_listings_cache": False}
+    return FsspecStore.from_url(str(path), storage_options=options, read_only=not writable)
+
+
+def lock_folder(path: Path) -> Path:
+    """Return where the lock of a run lies: in the run, or in the user's cache folder if that is no disk."""
+    if not isinstance(path, RemotePath):
+        return path / _PRIVATE
+    from platformdirs import user_cache_path
+
+    return user_cache_path("pchem_pipeline") / "locks" / hashlib.sha256(str(path).encode()).hexdigest()[:16]
 
 
 def _words(region: _Region) -> str:

@@ -1,5 +1,6 @@
-"""Camera files on S3: a real server on loopback (moto, installed from PyPI by the extra dev)."""
+"""Camera files and stores on S3: a real server on loopback (moto, installed from PyPI by the extra dev)."""
 
+import re
 import socket
 import subprocess
 import sys
@@ -7,22 +8,32 @@ import time
 import urllib.error
 import urllib.request
 from importlib.util import find_spec
+from urllib.parse import quote
 
 import numpy as np
 import pytest
 from commands import RUN, arrays_of
+from filelock import FileLock
+
+from pchem_pipeline.store.remote_path import place_of
+from pchem_pipeline.store.run_store import lock_folder
 
 pytestmark = pytest.mark.skipif(
     find_spec("moto") is None or find_spec("s3fs") is None, reason='pip install ".[dev]" brings moto and s3fs'
 )
 
 
-def put(url, data=b""):
+def ask(url, data=None, method="GET"):
     who = "Credential=key/20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=unchecked"
     headers = {"Content-Type": "application/octet-stream", "Authorization": f"AWS4-HMAC-SHA256 {who}"}
-    request = urllib.request.Request(url, data or None, headers, method="PUT")
+    request = urllib.request.Request(url, data, headers, method=method)
     with urllib.request.urlopen(request, timeout=20) as answer:
-        assert answer.status == 200
+        assert answer.status in (200, 204)
+        return answer.read()
+
+
+def put(url, data=b""):
+    ask(url, data or None, "PUT")
 
 
 @pytest.fixture
@@ -108,9 +119,100 @@ def test_a_server_that_does_not_answer_is_one_line(cloud):
     assert "check address, keys and network" in result.last
 
 
-def test_a_store_cannot_be_a_url(shell):
-    (shell.folder / "run.yaml").write_text(RUN.replace("run.zarr", "s3://lab/run.zarr"))
-    result = shell("ingest", "run.yaml")
+STORED = (
+    RUN.replace("run.zarr", "s3://lab/night/run.zarr")
+    .replace("tile: 8", "tile: 32")
+    .replace("bit_depth", "mode: reference, bit_depth")
+)
+
+
+def fetched(server, folder):
+    """Return the folder with all that the bucket holds, fetched by plain HTTP."""
+    last, more = "", True
+    while more:
+        page = ask(f"{server}/lab?list-type=2&start-after={quote(last)}").decode()
+        keys = re.findall("<Key>(.*?)</Key>", page)
+        for key in keys:
+            (folder / key).parent.mkdir(parents=True, exist_ok=True)
+            (folder / key).write_bytes(ask(f"{server}/lab/{key}"))
+        last, more = (keys or [""])[-1], "<IsTruncated>true" in page
+    return folder / "night" / "run.zarr"
+
+
+def assert_same(store, finished, groups):
+    expected, found = arrays_of(finished, groups), arrays_of(store, groups)
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_a_run_whose_store_is_on_s3(cloud, server, frames, finished, tmp_path):
+    (cloud.folder / "run.yaml").write_text(STORED)
+    cloud.ok("run", "run.yaml", "--until", "maps")
+    store = fetched(server, tmp_path / "first")
+    assert_same(store, finished, ("histogram", "summary", "fit", "maps"))
+    cloud.ok("export", "s3://lab/night/run.zarr", "--format", "npz", "--output", "out")
+    (written,) = (cloud.folder / "out").glob("*.npz")
+    with np.load(written) as maps:
+        np.testing.assert_array_equal(maps["bias"], arrays_of(finished, ("maps",))["maps/bias"])
+    # a tile without its marker is done again, by a process of its own; what is finished is left alone
+    (marker,) = (store / ".pchem" / "done" / "fit").rglob("0.0.json")
+    for lost in (marker, store / "fit" / "bias" / "c" / "0" / "0"):
+        ask(f"{server}/lab/{lost.relative_to(tmp_path / 'first')}", method="DELETE")
+    cloud.ok("fit", "run.yaml", "--backend", "processes", "--workers", "1")
+    assert_same(fetched(server, tmp_path / "second"), finished, ("histogram", "fit"))
+    states = [line.split()[1] for line in cloud.ok("status", "s3://lab/night/run.zarr").stdout.splitlines()]
+    assert states[:4] == ["complete"] * 4
+    assert not list(cloud.folder.glob("s3*"))
+
+
+@pytest.mark.long
+def test_a_report_in_a_store_on_s3_begun_from_files(cloud, server, frames, finished, tmp_path):
+    url = "s3://lab/night/run.zarr"
+    options = ("--integration-time", "4.87", "--bit-depth", "14")
+    result = cloud.ok("run", "frames", "--store", url, *options)
+    assert result.stdout.strip() == f"{url}/report.html"
+    assert (cloud.folder / "run.yaml").exists()
+    store = fetched(server, tmp_path / "fetched")
+    assert_same(store, finished, ("frames", "histogram"))
+    assert "<html" in (store / "report.html").read_text()
+    assert len(list((store / "figures").glob("*.png"))) > 5
+
+
+def test_a_store_on_s3_is_locked_on_this_machine(cloud, frames, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", cloud.environment["XDG_CACHE_HOME"])
+    folder = lock_folder(place_of("s3://lab/night/run.zarr"))
+    folder.mkdir(parents=True)
+    (cloud.folder / "run.yaml").write_text(STORED)
+    with FileLock(folder / "lock"):
+        result = cloud("ingest", "run.yaml")
+    assert result.code == 75
+    assert "s3://lab/night/run.zarr is in use" in result.last
+
+
+def test_a_store_on_a_server_that_does_not_answer_is_one_line(cloud, frames):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        cloud.environment["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{free.getsockname()[1]}"
+    cloud.environment["AWS_MAX_ATTEMPTS"] = "1"
+    (cloud.folder / "run.yaml").write_text(STORED)
+    result = cloud("ingest", "run.yaml")
+    assert result.code == 4
+    assert result.last.startswith("pchem: s3://lab/night/run.zarr")
+    assert "check address, keys and network" in result.last
+
+
+def test_a_bucket_that_does_not_exist_is_one_line(cloud, frames):
+    (cloud.folder / "run.yaml").write_text(STORED.replace("//lab/", "//elsewhere/"))
+    result = cloud("ingest", "run.yaml")
+    assert result.code == 4
+    assert result.last.startswith("pchem: s3://elsewhere/night/run.zarr")
+
+
+def test_the_store_of_a_joint_fit_cannot_be_a_url(shell):
+    (shell.folder / "joint.yaml").write_text(
+        "samples: [{run: a.yaml}, {run: b.yaml}]\njoint: {store: 's3://lab/j.zarr'}"
+    )
+    result = shell("joint", "joint.yaml")
     assert result.code == 2
-    assert "run.store" in result.last
-    assert not (shell.folder / "s3:").exists()
+    assert "joint.store" in result.last

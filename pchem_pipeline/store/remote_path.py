@@ -1,0 +1,167 @@
+"""Paths of an object storage (``s3://bucket/run.zarr``, what else fsspec knows), used like those of a disk.
+
+What a run does to its small files beside the arrays is a handful of operations; here each is one request. An
+object appears whole or not at all, so a put takes the place of writing aside and renaming.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Generator
+from fnmatch import fnmatchcase
+from pathlib import Path, PosixPath
+from typing import Any, Self, TypeVar, cast
+
+from pchem_pipeline.errors import MissingDependencyError, StoreError
+
+__all__ = ["RemoteError", "RemotePath", "place_of", "refused"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# Path makes one slash of two
+_URL = re.compile(r"^([a-z][a-z0-9+.-]+):/+(.*)$", re.DOTALL)
+
+
+class RemoteError(StoreError, OSError):
+    """The object storage refused, or did not answer."""
+
+    __str__ = Exception.__str__
+
+
+def refused(where: object, error: BaseException) -> RemoteError:
+    """Translate an error of an object storage into one line with its cure."""
+    words = " ".join(str(error).split()) or type(error).__name__
+    return RemoteError(f"{where}: the object storage refused ({words}); check address, keys and network")
+
+
+def place_of(path: Path | str, base_dir: Path | None = None) -> Path:
+    """Return a path below a folder, or a `RemotePath` for a URL, also one that went through ``Path``."""
+    if isinstance(path, RemotePath):
+        return path
+    if _URL.match(str(path)):
+        return RemotePath(path)
+    return Path(path) if base_dir is None else base_dir / path
+
+
+def _asked(method: F) -> F:
+    """Let files that are not there be an error of their own, and make one line of all others."""
+
+    @functools.wraps(method)
+    def ask(self: RemotePath, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(self, *args, **kwargs)
+        except (FileNotFoundError, StoreError, MissingDependencyError):
+            raise
+        except Exception as error:  # each kind of storage has errors of its own
+            raise refused(self, error) from error
+
+    return cast("F", ask)
+
+
+class RemotePath(PosixPath):
+    """A place in an object storage. Folders are but names with something below them.
+
+    Keys and the address of the server come from where the storage's library looks for them.
+    """
+
+    def __str__(self) -> str:
+        """Return the URL."""
+        return _URL.sub(r"\1://\2", super().__str__())
+
+    def __fspath__(self) -> str:
+        """Return the URL, which no system call understands."""
+        return str(self)
+
+    @property
+    def storage(self) -> Any:
+        """The file system of fsspec; nothing that it lists is kept, since others write, too.
+
+        Raises:
+            MissingDependencyError: the library of that kind of storage is not installed.
+        """
+        return _storage(str(self).partition("://")[0])
+
+    def resolve(self, strict: bool = False) -> Self:
+        """Return the path itself: it is absolute."""
+        return self
+
+    absolute = resolve
+
+    @_asked
+    def exists(self, **unused: Any) -> bool:
+        """Tell whether there is an object or a folder of that name."""
+        return bool(self.storage.exists(str(self)))
+
+    @_asked
+    def is_dir(self, **unused: Any) -> bool:
+        """Tell whether something lies below that name."""
+        return bool(self.storage.isdir(str(self)))
+
+    @_asked
+    def is_file(self, **unused: Any) -> bool:
+        """Tell whether there is an object of that name."""
+        return bool(self.storage.isfile(str(self)))
+
+    def mkdir(self, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
+        """Do nothing: folders come with what is in them."""
+
+    @_asked
+    def iterdir(self) -> Generator[Self, None, None]:
+        """Return what lies directly below."""
+        try:
+            names = self.storage.ls(str(self), detail=False)
+        except FileNotFoundError:
+            names = []
+        return (self / name.rstrip("/").rpartition("/")[2] for name in names)
+
+    def glob(self, pattern: str, **unused: Any) -> Generator[Self, None, None]:
+        """Return what lies directly below and has a name like the pattern."""
+        return (path for path in self.iterdir() if fnmatchcase(path.name, pattern))
+
+    @_asked
+    def read_bytes(self) -> bytes:
+        """Return the content of the object."""
+        return bytes(self.storage.cat_file(str(self)))
+
+    def read_text(self, encoding: str | None = None, errors: str | None = None, *unused: Any) -> str:
+        """Return the content of the object as text."""
+        return self.read_bytes().decode(encoding or "utf-8", errors or "strict")
+
+    @_asked
+    def write_bytes(self, data: Any) -> int:
+        """Put an object in the place of an older one."""
+        content = bytes(data)
+        self.storage.pipe_file(str(self), content)
+        return len(content)
+
+    def write_text(self, data: str, encoding: str | None = None, *unused: Any, **more: Any) -> int:
+        """Put a text in the place of an older one."""
+        return self.write_bytes(data.encode(encoding or "utf-8"))
+
+    @_asked
+    def unlink(self, missing_ok: bool = False) -> None:
+        """Remove the object."""
+        try:
+            self.storage.rm_file(str(self))
+        except FileNotFoundError:
+            if not missing_ok:
+                raise
+
+    @_asked
+    def remove_folder(self) -> None:
+        """Remove all that lies below."""
+        if self.storage.exists(str(self)):
+            self.storage.rm(str(self), recursive=True)
+
+
+@functools.cache
+def _storage(protocol: str) -> Any:
+    import fsspec
+
+    try:
+        return fsspec.filesystem(protocol, use_listings_cache=False)
+    except (ImportError, ValueError) as error:
+        raise MissingDependencyError(
+            f'{protocol}://: a store there needs another library ({error}); pip install "pchem-pipeline[s3]"'
+        ) from error

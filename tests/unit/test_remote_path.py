@@ -1,0 +1,98 @@
+import copy
+import pickle
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+
+from pchem_pipeline.errors import MissingDependencyError, StoreError
+from pchem_pipeline.store.remote_path import RemoteError, RemotePath, place_of, refused
+from pchem_pipeline.store.run_store import RunStore
+
+
+@pytest.fixture
+def folder():
+    """A folder in a storage that lives in this process."""
+    path = place_of("memory://lab/night")
+    yield path
+    path.remove_folder()
+    fsspec.filesystem("memory").store.clear()
+
+
+@pytest.mark.parametrize("text", ["s3://lab/run.zarr", "s3:/lab/run.zarr", Path("s3://lab/run.zarr")])
+def test_a_url_survives_what_paths_do_to_it(text):
+    path = place_of(text, Path("/home"))
+    assert isinstance(path, RemotePath)
+    assert str(path) == "s3://lab/run.zarr"
+    assert str(path / "fit" / "bias") == "s3://lab/run.zarr/fit/bias"
+    assert str(path.parent) == "s3://lab"
+    assert path.with_suffix(".yaml").name == "run.yaml"
+    for same in (pickle.loads(pickle.dumps(path)), copy.copy(path), path.resolve(), place_of(path)):
+        assert isinstance(same, RemotePath)
+        assert same == path
+        assert hash(same) == hash(path)
+
+
+def test_other_paths_stay_what_they_are():
+    assert place_of("run.zarr") == Path("run.zarr")
+    assert place_of("run.zarr", Path("/data")) == Path("/data/run.zarr")
+    assert not isinstance(place_of("/data/s3:/x"), RemotePath)
+
+
+def test_the_files_of_a_run(folder):
+    path = folder / "a" / "x.json"
+    assert not path.exists()
+    assert not folder.is_dir()
+    assert list(folder.iterdir()) == []
+    with pytest.raises(FileNotFoundError):
+        path.read_bytes()
+    with pytest.raises(FileNotFoundError):
+        path.unlink()
+    path.unlink(missing_ok=True)
+    path.write_text("µ")
+    assert path.exists()
+    assert path.is_file()
+    assert folder.is_dir()
+    assert path.read_text() == "µ"
+    assert path.read_bytes() == "µ".encode()
+    (folder / "a" / ".hidden.json").write_bytes(b"")
+    assert [each.name for each in (folder / "a").glob("[!.]*.json")] == ["x.json"]
+    assert {str(each) for each in (folder / "a").iterdir()} == {
+        "memory://lab/night/a/x.json",
+        "memory://lab/night/a/.hidden.json",
+    }
+    (folder / "a").remove_folder()
+    assert not path.exists()
+
+
+def test_arrays_markers_and_records_in_an_object_storage(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    store = RunStore.create(folder)
+    store.create_array("fit/bias", (16, 16), chunks=(8, 8))
+    values = np.arange(64.0).reshape(8, 8)
+    with store.locked():
+        store.write("fit/bias", (slice(0, 8), slice(8, 16)), values)
+        store.records.mark("fit", "f" * 64, "0.1", {"pixels": 64})
+    other = RunStore.open(folder)
+    np.testing.assert_array_equal(other.read("fit/bias", (slice(0, 8), slice(8, 16))), values)
+    assert np.isnan(other.read("fit/bias", (slice(8, 16), slice(0, 8)))).all()
+    assert other.records.summaries("fit", "f" * 64) == {"0.1": {"pixels": 64}}
+    store.records.forget("fit")
+    assert other.records.done("fit", "f" * 64) == set()
+    store.delete("fit/bias")
+    assert not RunStore.open(folder).has("fit/bias")
+    (folder / "zarr.json").unlink()
+    with pytest.raises(StoreError, match="there is no run at memory://lab/night"):
+        RunStore.open(folder)
+
+
+def test_what_the_storage_refuses_is_one_line():
+    error = refused("s3://lab/x", ValueError("first\n second"))
+    assert str(error) == (
+        "s3://lab/x: the object storage refused (first second); check address, keys and network"
+    )
+    assert isinstance(pickle.loads(pickle.dumps(error)), RemoteError)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    with pytest.raises(MissingDependencyError, match="needs another library"):
+        place_of("nowhere://lab/x").exists()
