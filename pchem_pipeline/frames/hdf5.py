@@ -1,7 +1,8 @@
 """HDF5 and NeXus: one dataset (frames, rows, columns), with any filter that h5py and hdf5plugin know.
 
-The file is opened for each call: handles of HDF5 must not cross processes, and h5py itself lets one thread in
-at a time.
+Frames that lie plainly in the file (contiguous, or in chunks of whole frames without filters) are read from
+their offsets. For others the file is opened for each call: handles of HDF5 must not cross processes, and h5py
+itself lets one thread in at a time.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.errors import InputError
 from pchem_pipeline.frames.atomic import temporary
-from pchem_pipeline.frames.base import FrameReader, changed, check_window
+from pchem_pipeline.frames.base import changed, check_window
 from pchem_pipeline.frames.choice import choose_dataset
-from pchem_pipeline.frames.contiguous import unsigned_type
+from pchem_pipeline.frames.contiguous import ContiguousReader, Layout, unsigned_type
 from pchem_pipeline.frames.kinds import check_samples, full_window, stack_shape
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
@@ -31,7 +32,7 @@ _TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _LOCK = threading.Lock()
 
 
-class Hdf5Reader(FrameReader):
+class Hdf5Reader(ContiguousReader):
     """One dataset of an HDF5 file."""
 
     format_name = "hdf5"
@@ -73,7 +74,11 @@ class Hdf5Reader(FrameReader):
         self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
         self.dtype = unsigned_type(dataset.dtype)
         self._full = tuple(dataset.shape)
-        if dataset.chunks is not None:
+        offsets = _plain_offsets(file, dataset, self.shape)
+        if offsets is not None:
+            layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
+            self._set_layout(path, layout, path.stat().st_size)
+        elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         self._read_facts(dataset)
 
@@ -97,6 +102,9 @@ class Hdf5Reader(FrameReader):
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
+        if self.layout is not None:
+            super().read_into(buffer, t0, t1, y0, y1)
+            return
         import h5py
 
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
@@ -109,6 +117,9 @@ class Hdf5Reader(FrameReader):
                 dataset = file[self._name]
                 if tuple(dataset.shape) != self._full:
                     raise changed(path, "the dataset changed its shape")
+                if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
+                    dataset.read_direct(buffer, window)
+                    return
                 values = dataset[window]
         except FileNotFoundError as error:
             raise changed(path, "the file vanished") from error
@@ -121,6 +132,34 @@ class Hdf5Reader(FrameReader):
                 f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
             )
         buffer[...] = values.reshape(buffer.shape)
+
+
+def _plain_offsets(file: Any, dataset: Any, shape: tuple[int, int, int]) -> NDArray[np.int64] | None:
+    """Return the byte offset of each frame that lies plainly in the file, or None where they do not all."""
+    from h5py import h5t
+
+    n_frames, rows, columns = shape
+    frame_bytes = rows * columns * dataset.dtype.itemsize
+    plain_type = dataset.id.get_type().equal(h5t.py_create(dataset.dtype))
+    if file.userblock_size or not plain_type or not dataset.size:
+        return None
+    if dataset.chunks is None:  # None where it lies elsewhere, is virtual, or was never written
+        start = dataset.id.get_offset()
+        return None if start is None else start + frame_bytes * np.arange(n_frames, dtype=np.int64)
+    filters = dataset.id.get_create_plist().get_nfilters()
+    whole = dataset.ndim == 3 and dataset.chunks[1:] == dataset.shape[1:]
+    if filters or not whole or not hasattr(dataset.id, "chunk_iter"):
+        return None
+    starts = np.full(-(-n_frames // dataset.chunks[0]), -1, np.int64)
+
+    def take(chunk: Any) -> None:
+        starts[chunk.chunk_offset[0] // dataset.chunks[0]] = chunk.byte_offset
+
+    dataset.id.chunk_iter(take)
+    frame = np.arange(n_frames, dtype=np.int64)
+    number, inside = np.divmod(frame, dataset.chunks[0])
+    offsets: NDArray[np.int64] = starts[number] + frame_bytes * inside
+    return None if (starts < 0).any() else offsets
 
 
 def _require() -> None:

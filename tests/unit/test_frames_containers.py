@@ -64,6 +64,48 @@ def test_hdf5_types(tmp_path: Path, dtype: str) -> None:
     check_windows(path, stack)
 
 
+@pytest.mark.parametrize(
+    ("options", "plain"),
+    [
+        ({}, True),
+        ({"chunks": (1, 19, 22)}, True),
+        ({"chunks": (3, 19, 22)}, True),  # the last chunk is not full
+        ({"chunks": (3, 5, 22)}, False),
+        ({"chunks": (3, 19, 22), "fletcher32": True}, False),
+        ({"chunks": (3, 19, 22), "compression": "gzip"}, False),
+    ],
+)
+@pytest.mark.parametrize("dtype", ["<u2", ">u2", "<i2"])
+def test_hdf5_is_read_from_offsets_where_frames_lie_plainly(tmp_path, options, plain, dtype):
+    path, values = tmp_path / "a.h5", (STACK // 2).astype(dtype)
+    with h5py.File(path, "w") as file:
+        dataset = file.create_dataset("frames", values.shape, dtype, **options)
+        for t in reversed(range(len(values))):  # so that chunks do not lie in order
+            dataset[t] = values[t]
+    reader = Hdf5Reader.open(path, InputSettings(dtype="uint16"))
+    assert (reader.layout is not None) == plain
+    np.testing.assert_array_equal(reader.read(0, len(values)), values)
+    np.testing.assert_array_equal(reader.read(2, 5, 3, 7), values[2:5, 3:7])
+
+
+def test_hdf5_that_only_looks_plain(tmp_path):
+    twelve = h5py.h5t.NATIVE_UINT16.copy()
+    twelve.set_precision(12)
+    with h5py.File(tmp_path / "block.h5", "w", userblock_size=512) as file:
+        file["frames"] = STACK
+    with h5py.File(tmp_path / "holes.h5", "w") as file:
+        file.create_dataset("frames", STACK.shape, "u2", chunks=(1, *STACK.shape[1:]))[1] = STACK[1]
+    with h5py.File(tmp_path / "bits.h5", "w") as file:
+        space = h5py.h5s.create_simple(STACK.shape)
+        h5py.h5d.create(file.id, b"frames", twelve, space).write(h5py.h5s.ALL, h5py.h5s.ALL, STACK % 4096)
+    holes = np.zeros_like(STACK)
+    holes[1] = STACK[1]
+    for name, expected in (("block", STACK), ("holes", holes), ("bits", STACK % 4096)):
+        reader = Hdf5Reader.open(tmp_path / f"{name}.h5", InputSettings())
+        assert reader.layout is None
+        np.testing.assert_array_equal(reader.read(0, len(STACK)), expected)
+
+
 def test_nexus(tmp_path: Path) -> None:
     path = tmp_path / "scan.nxs"
     with h5py.File(path, "w") as file:

@@ -50,7 +50,9 @@ def test_the_largest_of_several_files_counts(tmp_path: Path) -> None:
         assert reader.rows_per_read == 16
 
 
-@pytest.mark.parametrize(("chunks", "rows"), [(None, 1), ((2, 8, 48), 8), ((1, 32, 48), 32)])
+@pytest.mark.parametrize(
+    ("chunks", "rows"), [(None, 1), ((1, 32, 48), 1), ((2, 8, 48), 8), ((1, 32, 24), 32)]
+)
 def test_chunks_of_hdf5(tmp_path: Path, chunks: tuple[int, ...] | None, rows: int) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", data=STACK, chunks=chunks)
