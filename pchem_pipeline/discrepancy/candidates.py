@@ -130,7 +130,8 @@ class Laboratory:
     def fingerprints(self, effects: Sequence[Effect]) -> list[Hypothesis]:
         """Simulate effects on the random numbers of the model without them; failures are left out."""
         base = [] if self._base is not None else [self._replicate(())]
-        tasks = [self._replicate((effect,)) for effect in effects]
+        shown = [effect.representative(self.acquisition.numbers) for effect in effects]
+        tasks = [self._replicate((effect,)) for effect, _ in shown]
         if not tasks:
             return []
         results = self.mapper([*base, *tasks])
@@ -141,11 +142,11 @@ class Laboratory:
             self._base = self._row(first)
         assert self._base is not None
         found = []
-        for effect, result in zip(effects, results, strict=True):
+        for effect, (_, share), result in zip(effects, shown, results, strict=True):
             if isinstance(result, Exception):
                 self._leave_out(effect.tag, result)
             else:
-                found.append(Hypothesis(effect, self._shift(effect, result)))
+                found.append(Hypothesis(effect, share * _without_chance(self._row(result) - self._base)))
         return found
 
     def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
@@ -195,16 +196,6 @@ class Laboratory:
         return Replicate(
             f"{self.prefix}-{label}-{digest}", self.maps, (*self.model, *effects), self.seed, self.acquisition
         )
-
-    def _shift(self, effect: Effect, vector: Vector) -> FloatArray:
-        """Return what an effect does; for counts of rare events the mean instead of what happened to come."""
-        assert self._base is not None
-        shift = _without_chance(self._row(vector) - self._base)
-        pairs = int(np.sum(np.diff(self.acquisition.numbers) == 1))
-        for name, mean in effect.counted(pairs).items():
-            if name in self.names:
-                shift[self.names.index(name)] = mean
-        return shift
 
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
@@ -259,4 +250,5 @@ class _Tuning:
 
 def _as_simulated(hypotheses: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise) -> float:
     """Return the log score of a set at the very strengths that were simulated."""
-    return SetFit(hypotheses, np.ones(len(hypotheses)), np.zeros(len(hypotheses))).log_score(shift, noise)
+    n = len(hypotheses)
+    return SetFit(hypotheses, np.ones(n), np.zeros(n), np.zeros(n, np.bool_)).log_score(shift, noise)

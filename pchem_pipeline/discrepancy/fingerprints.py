@@ -59,14 +59,19 @@ class Noise:
     Attributes:
         covariance: of the statistics under the null, its estimation included, shape (m, m).
         model_error: relative error of a fingerprint, no unit.
+        events: of exact counts, by how much an event raises the statistic, over the number of splits in the
+            mean; 0 for all others, shape (m,). Their number scatters as Poisson counts do; without an effect
+            that predicts some there is none.
     """
 
     covariance: FloatArray
     model_error: float
+    events: FloatArray | float = 0.0
 
     def of(self, prediction: FloatArray) -> FloatArray:
         """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
-        return self.covariance + np.diag(tolerance(prediction, self.model_error) ** 2)
+        counts = self.events * np.abs(prediction.sum(axis=0))
+        return self.covariance + np.diag(tolerance(prediction, self.model_error) ** 2 + counts)
 
 
 @dataclass(frozen=True)
@@ -77,11 +82,13 @@ class SetFit:
         hypotheses: the set.
         factors: c_e of each, at least 0, shape (e,).
         stderr: their standard errors, shape (e,).
+        certain: whether an exact count asks for it, however few events it has, shape (e,).
     """
 
     hypotheses: tuple[Hypothesis, ...]
     factors: FloatArray
     stderr: FloatArray
+    certain: NDArray[np.bool_]
 
     @property
     def parts(self) -> FloatArray:
@@ -90,10 +97,11 @@ class SetFit:
 
     def substantial(self) -> list[tuple[Hypothesis, float]]:
         """Return the hypotheses of which there is more than their errors, with factors; at least one."""
+        there = (self.factors > _SMALLEST_FACTOR * self.stderr) | self.certain
         kept = [
             (h, float(c))
-            for h, c, error in zip(self.hypotheses, self.factors, self.stderr, strict=True)
-            if c > _SMALLEST_FACTOR * error
+            for h, c, is_there in zip(self.hypotheses, self.factors, there, strict=True)
+            if is_there
         ]
         largest = int(np.argmax(self.factors / self.stderr))
         return kept or [(self.hypotheses[largest], max(float(self.factors[largest]), _NEXT_TO_NOTHING))]
@@ -170,4 +178,5 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
         target = linalg.solve_triangular(factor, shift, lower=True)
         factors, _ = optimize.nnls(design, target)
         stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
-    return SetFit(tuple(hypotheses), factors, stderr)
+    counted = (columns.T * factors[:, None] * noise.events > 0.0) & (shift > 0.0)
+    return SetFit(tuple(hypotheses), factors, stderr, np.asarray(counted.any(axis=1)))

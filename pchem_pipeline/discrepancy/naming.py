@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,8 +112,17 @@ class Choice:
 def score_set(
     hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
 ) -> ScoredSet:
-    """Fit a set on each split and score it on the other."""
+    """Fit a set on each split and score it on the other.
+
+    Of effects that an exact count asks for, both splits have the strength of their mean: an event proves
+    itself, and need not come again.
+    """
     first, second = (fit_set(hypotheses, shift, noise) for shift in shifts)
+    if (first.certain | second.certain).any():
+        mean = fit_set(hypotheses, (shifts[0] + shifts[1]) / 2.0, noise)
+        first, second = (
+            replace(fit, factors=np.where(mean.certain, mean.factors, fit.factors)) for fit in (first, second)
+        )
     return ScoredSet((first, second), first.log_score(shifts[1], noise) + second.log_score(shifts[0], noise))
 
 
@@ -224,7 +233,8 @@ def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise:
     first, second = scored.fits
     factor = (first.factors + second.factors) / 2.0
     error = np.hypot(first.stderr, second.stderr) / 2.0
-    if not np.all(factor > _SMALLEST_FACTOR * error):
+    there = factor > _SMALLEST_FACTOR * error
+    if not np.all(there | first.certain | second.certain):
         return False
     parts = (first.parts + second.parts) / 2.0
     shift = (shifts[0] + shifts[1]) / 2.0

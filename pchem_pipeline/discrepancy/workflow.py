@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,12 +134,12 @@ class _Search:
             number = len(rounds)
             laboratory = self._laboratory(maps, names, number)
             shifts = (z.train - null.mean, z.test - null.mean)
-            hypotheses = self._hypotheses(laboratory, classes, (train, test), shifts, self._noise(null, 2, z))
-            choice = choose(hypotheses, shifts, self._noise(null, 1, z)) if hypotheses else None
+            hypotheses = self._hypotheses(laboratory, classes, (train, test), shifts, self._noise(null, 2))
+            choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
             self.left_out |= laboratory.left_out
             if choice is None or not (still or choice.advantage > _CONVINCING):
                 break
-            added = self._added(laboratory, choice, shifts, self._noise(null, 2, z))
+            added = self._added(laboratory, choice, shifts, self._noise(null, 2))
             before, self.model = self.model, (*self.model, *(h.effect for h in added.hypotheses))
             maps = refit_maps(self.stack[self._seen()], plain, self.model).maps
             grown, _ = self._null(
@@ -228,14 +228,11 @@ class _Search:
         parts = np.concatenate([this.added.parts for this in rounds])
         return tolerance(parts, self.settings.model_error)
 
-    def _noise(self, null: NullModel, splits: int, z: Measured) -> Noise:
-        """Return the noise of a shift; exact counts, which no null has, scatter by their own number."""
+    def _noise(self, null: NullModel, splits: int) -> Noise:
+        """Return the noise of a shift of the mean of so many splits."""
         covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
-        for name, step in EXACT.items():
-            if name in null.names:
-                index = null.names.index(name)
-                covariance[index, index] += step * abs(float(z.both[index])) / splits
-        return Noise(covariance, self.settings.model_error)
+        events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
+        return Noise(covariance, self.settings.model_error, events)
 
     def _laboratory(self, maps: PixelMaps, names: tuple[str, ...], number: int) -> Laboratory:
         return Laboratory(
@@ -275,7 +272,7 @@ class _Search:
         noise: Noise,
     ) -> SetFit:
         """Refine the strengths of the chosen set together; drop what comes to nothing."""
-        noise = Noise(noise.covariance, _FINE_ERROR)
+        noise = replace(noise, model_error=_FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
         chosen = choice.present(self.settings.certainty)
         for _ in range(len(chosen)):
@@ -289,7 +286,7 @@ class _Search:
         last = [
             Hypothesis(h.rescaled(float(c)), h.fingerprint * c) for h, c in zip(chosen, near, strict=True)
         ]
-        return SetFit(tuple(last), np.ones(len(last)), fit.stderr / near)
+        return SetFit(tuple(last), np.ones(len(last)), fit.stderr / near, fit.certain)
 
     def _corrected(
         self, added: SetFit, null: NullModel, grown: NullModel, z: Measured
@@ -299,14 +296,14 @@ class _Search:
         moved = np.abs(total) > _TELLING
         ratio = np.where(moved, (grown.mean - null.mean) / np.where(moved, total, 1.0), 1.0)
         parts = added.parts * np.clip(ratio, 0.5, 2.0)
-        noise = Noise(grown.covariance * (0.5 + 1.0 / grown.n_replicates), _FINE_ERROR)
+        noise = replace(self._noise(grown, 2), model_error=_FINE_ERROR)
         change, stderr = correction(parts, z.both - grown.mean, noise)
         change *= np.array([bool(h.effect.strength) for h in added.hypotheses])
         new = tuple(
             Hypothesis(h.rescaled(1.0 + float(c)), part * (1.0 + c))
             for h, part, c in zip(added.hypotheses, parts, change, strict=True)
         )
-        fit = SetFit(new, np.ones(len(new)), stderr / (1.0 + change))
+        fit = SetFit(new, np.ones(len(new)), stderr / (1.0 + change), added.certain)
         return fit, grown.shifted(np.sum(parts * change[:, None], axis=0))
 
     def _result(

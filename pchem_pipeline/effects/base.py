@@ -33,6 +33,7 @@ from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.settings import Section
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
@@ -105,15 +106,15 @@ class Effect(Section):
         """
         return cls.typical() if evidence.strongest(*cls.signature[:2]) > 3.0 else ()
 
-    def counted(self, n_pairs: int) -> Mapping[str, float]:
-        """Return statistics that count rare events exactly, by name: their mean under the effect.
+    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+        """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
 
-        A simulated stack holds few such events or none, so its own count says little about the mean.
+        For effects of rare events: by chance a simulated stack holds none of them, or too many.
 
         Args:
-            n_pairs: pairs of successive frames.
+            frames: numbers of the frames to be simulated, increasing, shape (n,).
         """
-        return {}
+        return self, 1.0
 
     def scaled(self, factor: float) -> Self:
         """Return a copy of ``factor`` times the strength, kept within the limits of its field.

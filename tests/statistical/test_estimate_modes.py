@@ -206,3 +206,16 @@ def test_a_change_across_a_gap_is_put_into_the_gap():
     gaps = np.ones(200)
     gaps[100] = 200.0
     assert find_steps(series, gaps)[0].starts.tolist() == [0, 100]
+
+
+def test_rare_repeats_are_simulated_in_their_mean_number():
+    numbers = np.concatenate([np.arange(0, 500), np.arange(900, 1401)])
+    shown, share = RepeatedFrames(probability=1e-3, rows=(0, 4)).representative(numbers)
+    assert shown.rows == (0, 4)
+    assert len(shown.frames) == 4
+    assert set(shown.frames) <= set(numbers) - {0, 900}  # the frames before these are not there
+    assert share == pytest.approx(1e-3 * 999 / 4)
+    many, share = RepeatedFrames(probability=0.02).representative(numbers)
+    assert (len(many.frames), share) == (20, pytest.approx(0.02 * 999 / 20))
+    listed = RepeatedFrames(frames=(3, 9))
+    assert listed.representative(numbers) == (listed, 1.0)

@@ -29,8 +29,8 @@ __all__ = ["RepeatedFrames"]
 _RARE = 1e-12
 
 
-# by how much a repeated frame raises the statistic that counts them
-_PER_REPEAT = 10.0
+# repeats in a simulation that shows what they do, where fewer are to be expected
+_FEWEST_SHOWN = 4
 
 
 @register_effect
@@ -140,11 +140,16 @@ class RepeatedFrames(Effect):
             found.append(cls(probability=min(time.repeated_rows / part / pairs, 0.5), rows=(0, part)))
         return found
 
-    def counted(self, n_pairs: int) -> Mapping[str, float]:
-        """Return the mean of the exact count of repeated frames."""
-        if self.rows is not None or self.frames:
-            return {}
-        return {"frame.repeated": _PER_REPEAT * self.probability * n_pairs}
+    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+        """Return repeats spread evenly over the frames, and how many more or fewer there are in the mean."""
+        second = frames[1:][np.diff(frames) == 1]
+        if self.frames or not self.probability * second.size > 0:
+            return self, 1.0
+        mean = self.probability * second.size
+        shown = min(max(round(mean), _FEWEST_SHOWN), second.size)
+        places = (np.arange(shown) * second.size) // shown
+        listed = tuple(int(frame) for frame in second[places])
+        return type(self)(frames=listed, rows=self.rows), mean / shown
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the same law: a repeat is one more sample of it, though not a new one."""
