@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from running import Outcome, machine, run_pchem, save_figure
+from running import Outcome, machine, plain_numbers, run_pchem, save_figure
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -111,10 +111,12 @@ def draw(folder: Path, by_frames: list[Row], by_side: list[Row], powers: dict[st
         )
     axes[1].set(xlabel=f"pixels, {by_side[0].frames} frames", ylabel="seconds")
     for rows, marker, what in ((by_frames, "o", "more frames"), (by_side, "s", "more pixels")):
-        axes[2].loglog([r.said for r in rows], [r.took.peak["histogram"] for r in rows], marker, label=what)
-    limits = np.array(axes[2].get_xlim())
-    axes[2].loglog(limits, limits, "-", color="0.5", lw=1, label="as said")
-    axes[2].loglog(limits, 1.2 * limits, "--", color="0.5", lw=1, label="1.2 times")
+        axes[2].plot([r.said for r in rows], [r.took.peak["histogram"] for r in rows], marker, label=what)
+    limits = np.array([0.0, axes[2].get_xlim()[1]])
+    axes[2].plot(limits, limits, "-", color="0.5", lw=1, label="as said")
+    axes[2].plot(limits, 1.2 * limits, "--", color="0.5", lw=1, label="1.2 times")
+    plain_numbers(axes[0], n)
+    plain_numbers(axes[1], pixels, 2)
     axes[2].set(xlabel="memory said, MiB", ylabel="peak memory, MiB")
     for each in axes:
         each.legend(frameon=False, fontsize=8)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -74,8 +73,13 @@ def paper_em(x: NDArray[np.float64], most: int = 500, tolerance: float = 1e-6) -
     return steps
 
 
-def _paper_pixel(samples: NDArray[np.uint16]) -> int:
-    return paper_em(samples.astype(np.float64))
+def _paper_pixel(samples: NDArray[np.uint16]) -> float:
+    """Return the CPU seconds of a pixel, without those of imports."""
+    import scipy.special  # noqa: F401
+
+    start = time.process_time()
+    paper_em(samples.astype(np.float64))
+    return time.process_time() - start
 
 
 def _bincounts(part: NDArray[np.uint16], bins: int = 1024) -> NDArray[np.int64]:
@@ -104,6 +108,7 @@ def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[st
     from pchem_pipeline.model.start import starting_points
 
     pixels = Pixels(counts, origin.astype(np.int64), np.ones((len(counts), 4)))
+    scipy_fit(Pixels(counts[:1], pixels.origin[:1], np.ones((1, 4))))  # imports its libraries
     found = {"scipy L-BFGS-B on histograms": cpu(lambda: scipy_fit(pixels)) / len(counts)}
     try:
         from iminuit import Minuit
@@ -179,11 +184,8 @@ def compare(raw: Path, folder: Path, given: argparse.Namespace) -> list[Row]:
     )
     chosen = np.random.default_rng(1).choice(pixels, given.pixels, replace=False)
     samples = [np.array(frames[:, i // nx, i % nx]) for i in chosen]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with ProcessPoolExecutor(given.workers) as pool:
-        list(pool.map(_paper_pixel, samples, chunksize=4))
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    spent = (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / given.workers
+        spent = sum(pool.map(_paper_pixel, samples, chunksize=4)) / given.workers
     part = f"{given.pixels} pixels, scaled to {given.workers} cores"
     rows.append(Row("the paper's EM on samples, numpy", spent * pixels / given.pixels, part, fit))
     counts = store.read("histogram/counts").reshape(pixels, -1)[chosen]
@@ -199,7 +201,8 @@ def show(rows: list[Row]) -> None:
     print(f"|{'-' * 42}|{'-' * 10}:|-----------:|-------------|")
     for row in rows:
         ratio = row.seconds / row.ours
-        print(f"| {row.what:<40} | {row.seconds:>9.1f} | {ratio:>10.3g} | {row.measured} |")
+        spent = f"{row.seconds:,.0f}" if row.seconds >= 100 else f"{row.seconds:.3g}"
+        print(f"| {row.what:<40} | {spent:>9} | {ratio:>10.3g} | {row.measured} |")
 
 
 def draw(rows: list[Row], folder: Path, title: str) -> None:

@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-__all__ = ["Outcome", "evict", "machine", "read_once", "run_pchem", "save_figure"]
+__all__ = ["Outcome", "evict", "machine", "plain_numbers", "read_once", "run_pchem", "save_figure"]
 
 STAGES = ("ingest", "histogram", "fit", "maps", "ensemble", "report")
 
@@ -44,7 +45,9 @@ def machine() -> str:
         found = re.search(r"model name\s*:\s*(.*)", facts.read_text())
         name = found[1] if found else name
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    libraries = ", ".join(f"{each} {version(each)}" for each in ("numpy", "numba", "zarr", "pchem-pipeline"))
+    libraries = ", ".join(
+        f"{each} {version(each)}" for each in ("numpy", "numba", "scipy", "zarr", "dask", "pchem-pipeline")
+    )
     load = os.getloadavg()[0]
     return (
         f"{name}, {os.cpu_count()} processors, {memory:.0f} GiB, load {load:.1f}; "
@@ -72,6 +75,7 @@ def read_once(path: Path) -> float:
 _SOME_STAGES = """
 import sys
 from pathlib import Path
+from typing import Any
 from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 from pchem_pipeline.stages.session import Command, find_run, run_stages
@@ -100,8 +104,27 @@ def run_pchem(config: Path, stages: Sequence[str] = ()) -> Outcome:
     )
 
 
+def plain_numbers(axes: Any, places: Sequence[float], power: int = 1) -> None:
+    """Write plain numbers at logarithmic axes, at the horizontal one those that were measured.
+
+    Args:
+        axes: of matplotlib.
+        places: that were measured.
+        power: 2 for areas, which are written as squares.
+    """
+    from matplotlib.ticker import LogFormatter
+
+    ticks = sorted(set(places))
+    sign = f"$^{power}$" if power > 1 else ""
+    axes.set_xticks(ticks, [f"{place ** (1 / power):,.6g}{sign}" for place in ticks])
+    axes.xaxis.minorticks_off()
+    axes.yaxis.set_major_formatter(LogFormatter())
+    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
+
+
 def save_figure(figure: object, folder: Path, name: str) -> None:
-    """Save a figure as PNG and SVG, and say where."""
+    """Save a figure as PNG and SVG, with the machine below it, and say where."""
+    figure.text(0.0, -0.02, machine(), fontsize=6, color="0.4", va="top")  # type: ignore[attr-defined]
     folder.mkdir(parents=True, exist_ok=True)
     for suffix in ("png", "svg"):
         figure.savefig(folder / f"{name}.{suffix}", dpi=150, bbox_inches="tight")  # type: ignore[attr-defined]
