@@ -25,6 +25,7 @@ class FitStatus(IntFlag):
     OUTSIDE_WINDOW = 256
     POOR_FIT = 512
     COARSE_STEPS = 1024
+    WEAKLY_IDENTIFIED = 2048
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -49,6 +50,8 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window were left out",
     FitStatus.POOR_FIT: "poor goodness of fit: the model does not describe the pixel",
     FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
+    FitStatus.WEAKLY_IDENTIFIED: "too few frames at this sensor's read noise: the bias is clear by chance "
+    "only, or the standard errors are rough",
 }
 
 

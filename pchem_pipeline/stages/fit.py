@@ -26,6 +26,7 @@ from pchem_pipeline.model.settings import FitSettings
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.fit_start import drop_fit, kept_fit
+from pchem_pipeline.stages.fit_together import judge_sensor
 from pchem_pipeline.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
 
 if TYPE_CHECKING:
@@ -163,6 +164,7 @@ def run(context: StageContext) -> None:
         set_aside=context.config.model.set_aside_e,
     )
     done = context.run_units(context.tiles(), task, needs="histogram")
+    judge_sensor(context)
     if len(done) == context.n_keys:
         drop_fit(context.store.path)
     biased, pixels = (sum(tile.get(key, 0) for tile in done.values()) for key in ("rounded", "pixels"))

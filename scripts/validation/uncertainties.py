@@ -4,14 +4,18 @@ Pixels are drawn from the exact quantised mass on a grid of quanta exposure, rea
 10,000 in all, and fitted. Printed are
 
 * the share of normal (estimate -+ z stderr) and profile-likelihood intervals that hold the truth, where
-  ``fit_status`` is 0, and its distance from nominal in standard errors of that share;
+  ``fit_status`` is 0 once the pixels of a point were judged together, as the stage ``fit`` does, and its
+  distance from nominal in standard errors (of the binomial law, by its exact tail); every point counts,
+  however few of its pixels are good;
+* the same where the read noise makes a sensor lose its good pixels, and for a sensor of unlike pixels: the
+  share of good pixels one by one and together, and the largest distance in each case;
 * the standard errors against the scatter of the estimates, with information and with sandwich errors;
 * p-values of the goodness of fit: shares below 1 %, 5 %, 50 %, and pixels called misfits at a rate of false
   discoveries of 5 %;
 * the tail guard: its share of clean samples, its cost in efficiency, and how far outliers move the estimates
   with and without it.
 
-    python scripts/validation/uncertainties.py            # about a minute
+    python scripts/validation/uncertainties.py            # a CPU minute, kernels compiled
     python scripts/validation/uncertainties.py --quick    # a tenth of the pixels
 """
 
@@ -22,7 +26,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import bdtr, bdtrc, ndtri
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -33,6 +38,7 @@ from pchem_pipeline.model.fisher import sandwich_covariance  # noqa: E402
 from pchem_pipeline.model.intervals import profile_intervals, quantile_of  # noqa: E402
 from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
 from pchem_pipeline.model.pchem import FitResult, fit_histograms  # noqa: E402
+from pchem_pipeline.model.pooled import judge_together  # noqa: E402
 from pchem_pipeline.model.settings import FitSettings  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -55,25 +61,28 @@ class Pixels:
 def draw(
     rng: np.random.Generator,
     n: int,
-    exposure: float,
-    noise: float,
+    exposure: ArrayLike,
+    noise: ArrayLike,
     n_frames: int,
     spread: tuple[float, ...] = (1.0,),
 ) -> Pixels:
     """Draw pixels of one kind whose bias lies anywhere between two DN.
 
-    ``noise`` is in e-, quantisation included; ``spread`` holds factors of the exposure, equally likely in
-    each frame.
+    ``exposure`` and ``noise`` are in e-, one or (n,), quantisation included; ``spread`` holds factors of the
+    exposure, equally likely in each frame.
     """
     bias = rng.uniform(100.0, 101.0, n)
-    analog = np.sqrt(noise**2 - 1.0 / (12.0 * STEP**2))
-    first = int(np.floor(100.0 - 9.0 * noise * STEP))
-    width = int((exposure + 11.0 * np.sqrt(exposure) + 12.0 + 18.0 * noise) * STEP)
+    light, noises = (np.broadcast_to(np.asarray(values, np.float64), n) for values in (exposure, noise))
+    analog = np.sqrt(noises**2 - 1.0 / (12.0 * STEP**2))
+    loudest, most = float(noises.max()), float(light.max())
+    first = int(np.floor(100.0 - 9.0 * loudest * STEP))
+    width = int((most + 11.0 * np.sqrt(most) + 12.0 + 18.0 * loudest) * STEP)
     codes = first + np.arange(width)
-    parts = [pcd_mass(codes, exposure * each, 1.0 / STEP, bias[:, None], analog) for each in spread]
+    columns = [values[:, None] for values in (light, bias, analog)]
+    parts = [pcd_mass(codes, columns[0] * each, 1.0 / STEP, *columns[1:]) for each in spread]
     mass = np.mean(parts, axis=0)
     counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True)).astype(np.uint32)
-    truth = np.column_stack([np.full(n, exposure), np.full(n, 1.0 / STEP), bias, np.full(n, noise * STEP)])
+    truth = np.column_stack([light, np.full(n, 1.0 / STEP), bias, noises * STEP])
     return Pixels(counts, np.full(n, first, np.int64), truth)
 
 
@@ -116,15 +125,13 @@ def print_coverage(rng: np.random.Generator, n: int) -> None:
     print(f"\nCoverage of nominal 68 % and 95 % intervals in %, {n} pixels a point, fit_status 0 only")
     head = "".join(f"{name:>7s}" for name in NAMES)
     print(f"{'H':>5s}{'s_e':>6s}{'N':>7s}{'good':>6s} {'':8s}|{head} |{head}")
-    total, worst = 0, 0.0
+    total, worst = 0, np.zeros(2)
     sums = np.zeros((2, len(LEVELS), len(NAMES)))
     for exposure, noise, n_frames in GRID:
         pixels = draw(rng, n, exposure, noise, n_frames)
-        good, found = coverage(pixels, fit_histograms(pixels.counts, pixels.origin))
-        if good < n / 2:
-            print(
-                f"{exposure:5g}{noise:6.2f}{n_frames:7d}{good:6d} few good pixels, chosen by chance: left out"
-            )
+        good, found = coverage(pixels, judge_together(fit_histograms(pixels.counts, pixels.origin)))
+        if good == 0:
+            print(f"{exposure:5g}{noise:6.2f}{n_frames:7d}{good:6d}")
             continue
         for kind, rows in zip(("normal", "profile"), found, strict=True):
             cells = " |".join("".join(f"{100 * v:7.1f}" for v in row) for row in rows)
@@ -139,10 +146,43 @@ def print_coverage(rng: np.random.Generator, n: int) -> None:
         print(f"{'standard errors from nominal':33s}|{off}; at most {far:.1f} at a point")
 
 
+def print_edges(rng: np.random.Generator, n: int) -> None:
+    """Print the share of good pixels and how far coverage is from nominal where good ones grow few."""
+    print(
+        f"\nWhere good pixels grow few, {n} pixels a row: share of good ones in %, and the largest distance"
+    )
+    print("of normal and profile coverage from nominal in standard errors, judged one by one and together")
+    far = f"{'normal':>8s}{'profile':>8s}"
+    print(f"{'H':>12s}{'s_e':>14s}{'N':>7s} | one by one{far} | together {far}")
+    points = itertools.product((2.0, 8.0), np.arange(0.36, 0.525, 0.02), (2_000, 17_750))
+    rows: list[tuple[str, str, ArrayLike, ArrayLike, int]] = [
+        (f"{exposure:g}", f"{noise:.2f}", exposure, noise, n_frames) for exposure, noise, n_frames in points
+    ]
+    for spread in (0.05, 0.15):
+        light, noises = np.exp(rng.normal(np.log(2.0), 0.4, n)), np.exp(rng.normal(np.log(0.4), spread, n))
+        rows += [("2 -+ 40 %", f"0.4 -+ {100 * spread:.0f} %", light, noises, m) for m in (2_000, 17_750)]
+    for light_words, noise_words, light, noises, n_frames in rows:
+        pixels = draw(rng, n, light, noises, n_frames)
+        fit = fit_histograms(pixels.counts, pixels.origin)
+        cells = []
+        for each in (fit, judge_together(fit)):
+            good, found = coverage(pixels, each)
+            distance = np.abs(deviations(found, good)).max(axis=(1, 2)) if good else (np.nan, np.nan)
+            cells.append(f"{100 * good / n:9.1f} {distance[0]:8.1f}{distance[1]:8.1f}")
+        print(f"{light_words:>12s}{noise_words:>14s}{n_frames:7d} | {' | '.join(cells)}")
+
+
 def deviations(shares: Array, n: int) -> Array:
-    """Return the distance of covered shares from nominal in their standard errors, levels before the last."""
-    level = np.array(LEVELS)[:, None]
-    return (shares - level) / np.sqrt(level * (1.0 - level) / n)
+    """Return how far covered shares of n are from nominal, levels before the last axis.
+
+    The probability of a share as small or smaller (large or larger) under the nominal level, told as that
+    many standard deviations of a normal law; 0 where it is above a half.
+    """
+    level = np.broadcast_to(np.array(LEVELS)[:, None], shares.shape)
+    held = np.rint(shares * n)
+    below, above = bdtr(held, n, level), np.where(held > 0, bdtrc(np.maximum(held - 1, 0), n, level), 1.0)
+    tail = np.clip(np.minimum(below, above), 1e-300, 0.5)
+    return np.where(below < above, 1.0, -1.0) * ndtri(tail)
 
 
 def print_errors(rng: np.random.Generator, n: int) -> None:
@@ -236,6 +276,7 @@ def main() -> None:
     share = 10 if options.quick else 1
     rng = np.random.default_rng(options.seed)
     print_coverage(rng, max(30, options.pixels // share // len(GRID)))
+    print_edges(rng, max(100, options.pixels // share // 20))
     print_errors(rng, 2000 // share)
     print_goodness(rng, 4000 // share)
     print_guard(rng, 2000 // share)

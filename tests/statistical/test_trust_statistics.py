@@ -7,7 +7,7 @@ import pytest
 from drawn_pixels import Drawn, draw
 from numpy.typing import NDArray
 from scipy.special import chdtrc
-from scipy.stats import kstest
+from scipy.stats import binom, kstest
 
 from pchem_pipeline.model.discovery import false_discovery
 from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, curve_errors, epcd_exact
@@ -17,6 +17,7 @@ from pchem_pipeline.model.maps import summarise
 from pchem_pipeline.model.pcd import pcd_mass
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.pooled import judge_together
 from pchem_pipeline.model.settings import FitSettings
 
 Array = NDArray[np.float64]
@@ -61,6 +62,43 @@ def test_intervals_cover_the_truth_as_often_as_they_say(case: tuple[float, float
         np.testing.assert_allclose(normal, level, atol=limit)
         # errors that were a quarter too small would be seen
         assert (np.abs((np.abs(values - truth) <= 0.75 * z * stderr).mean(axis=0) - level) > limit).all()
+
+
+@pytest.mark.parametrize("case", [(2.0, 0.48, 2000), (8.0, 0.48, 17_750), (2.0, 0.42, 2000)])
+def test_pixels_that_pass_together_are_no_selection(case: tuple[float, float, int]) -> None:
+    """Judged one by one, those that pass on a poor sensor are the lucky ones, and their intervals miss."""
+    h, noise, n_frames = case
+    n = 600
+    pixels = draw(np.random.default_rng(70), np.full(n, h), 11.0, noise, n_frames=n_frames)
+    alone = fit_histograms(pixels.counts, pixels.origin)
+    together = judge_together(alone)
+    np.testing.assert_array_equal(alone.fit_status, together.fit_status & ~np.uint16(2048))
+
+    def tail(fit: FitResult) -> float:
+        """Return the smallest probability of so few intervals, or fewer, that hold the truth."""
+        good = fit.fit_status == 0
+        held = np.abs(estimates(fit) - pixels.truth)[good] <= 1.96 * errors(fit)[good]
+        return float(binom.cdf(held.sum(axis=0), good.sum(), 0.95).min())
+
+    five = 2.9e-7  # probability beyond five standard deviations, one side
+    assert tail(together) > five
+    if noise > 0.45:
+        assert tail(alone) < five  # what is guarded against
+        assert np.mean(alone.fit_status == 0) > 0.02
+        assert np.mean(together.fit_status == 0) < 0.01
+    else:
+        assert np.mean(together.fit_status == 0) > 0.4
+
+
+def test_pixels_that_were_clear_stay_so_up_to_0_4_electrons() -> None:
+    lost = 0
+    for h, noise in ((0.1, 0.4), (2.0, 0.4), (8.0, 0.4), (2.0, 0.2)):
+        pixels = draw(np.random.default_rng(71), np.full(400, h), 11.0, noise)
+        alone = fit_histograms(pixels.counts, pixels.origin)
+        assert np.mean(alone.fit_status == 0) > 0.98
+        lost += np.count_nonzero((alone.fit_status == 0) & (judge_together(alone).fit_status != 0))
+    # fewer than 0.1 % of 1600: a Poisson law of mean 1.6 is above 9 with 4e-6
+    assert lost <= 9
 
 
 def test_goodness_of_fit_is_uniform_with_few_frames_too() -> None:

@@ -1,0 +1,93 @@
+"""The judgement of all pixels of a sensor together: what it flags, and what it leaves alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.model.fit_status import FAILED, FitStatus
+from pchem_pipeline.model.pooled import LOOSEST, Judged, NoisePool, noise_of
+from pchem_pipeline.model.settings import FitSettings
+
+SETTINGS = FitSettings()
+
+
+def pixels(noise: float, spread: float, error: float, gap: float, n: int = 4000, seed: int = 1) -> Judged:
+    """Pixels whose read noises differ by ``spread``, estimated to ``error``; a quiet one has a larger gap."""
+    rng = np.random.default_rng(seed)
+    true = noise + spread * rng.standard_normal(n)
+    found = true + error * rng.standard_normal(n)
+    return Judged(found, np.full(n, error), gap * np.exp(-25.0 * (found - noise)))
+
+
+def weak(sensor: Judged) -> np.ndarray:
+    pool = NoisePool.of(sensor)
+    assert pool is not None
+    return pool.weak(sensor, SETTINGS)
+
+
+def test_lucky_pixels_of_a_poor_sensor_are_flagged() -> None:
+    sensor = pixels(0.46, 0.0, 0.02, gap=3.0)
+    assert (sensor.gap > 5.0).mean() > 0.1  # clear by themselves
+    assert weak(sensor).mean() > 0.99
+
+
+def test_unlucky_pixels_of_a_good_sensor_are_not() -> None:
+    sensor = pixels(0.42, 0.0, 0.015, gap=9.0)
+    assert (sensor.gap < 5.0).mean() > 0.05  # which their own word says
+    assert not weak(sensor).any()
+
+
+def test_pixels_that_really_differ_are_judged_by_themselves() -> None:
+    sensor = pixels(0.42, 0.08, 0.01, gap=10.0)
+    clear = sensor.gap > 5.0
+    disagree = weak(sensor) != (~clear | (sensor.noise > 0.5))
+    assert 0.2 < clear.mean() < 0.9
+    assert disagree.mean() < 0.03
+
+
+def test_read_noise_and_rough_errors_are_judged_in_common_too() -> None:
+    assert weak(pixels(0.52, 0.0, 0.02, gap=100.0)).all()
+    assert not weak(pixels(0.49, 0.0, 0.01, gap=100.0)).any()
+    rough = LOOSEST / (8 * np.pi**2 * 0.4)
+    assert weak(pixels(0.4, 0.0, 1.15 * rough, gap=1000.0)).mean() > 0.99
+    assert weak(pixels(0.4, 0.0, 0.85 * rough, gap=1000.0)).mean() < 0.02
+
+
+def test_one_pixel_far_rougher_than_its_like_is_flagged() -> None:
+    sensor = pixels(0.3, 0.0, 0.005, gap=500.0)
+    sensor.stderr[7], sensor.noise[7] = 0.1, 0.3
+    assert np.flatnonzero(weak(sensor)).tolist() == [7]
+
+
+def test_pixels_without_a_value_have_no_part_in_it() -> None:
+    sensor = pixels(0.46, 0.0, 0.02, gap=3.0)
+    expected = weak(sensor)
+    hole = np.array([np.nan])
+    more = Judged.join([Judged(hole, hole, hole), sensor, Judged(np.array([0.3]), hole, np.array([50.0]))])
+    found = weak(more)
+    np.testing.assert_array_equal(found[1:-1], expected)
+    assert not found[0]
+    assert not found[-1]
+
+
+def test_few_pixels_make_no_pool() -> None:
+    assert NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=29)) is None
+    assert NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=30)) is not None
+
+
+def test_pixels_all_alike_do_no_harm() -> None:
+    same = Judged(np.full(40, 0.3), np.full(40, 0.005), np.full(40, 50.0))
+    assert not weak(same).any()
+
+
+def test_noise_in_electrons_by_the_delta_method() -> None:
+    covariance = np.diag([1.0, 4e-6, 1.0, 0.01])[None]
+    covariance[0, 1, 3] = covariance[0, 3, 1] = -1e-4
+    noise, error = noise_of(np.array([0.1]), np.array([3.0]), covariance)
+    assert noise[0] == pytest.approx(0.3)
+    assert error[0] == pytest.approx(np.sqrt(9 * 4e-6 + 0.01 * 0.01 - 2 * 0.3 * 1e-4))
+
+
+def test_the_word_is_a_caution_and_no_failure() -> None:
+    assert not int(FitStatus.WEAKLY_IDENTIFIED) & int(FAILED)
