@@ -24,10 +24,11 @@ _YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class JointRun:
-    """A joint fit: its settings and the YAML file that they come from."""
+    """A joint fit: its settings, the YAML file that they come from, and whether that was written just now."""
 
     config: JointConfig
     path: Path
+    is_new: bool = False
 
     @property
     def folder(self) -> Path:
@@ -69,7 +70,7 @@ def find_joint(
     config = make_joint({"samples": samples, "joint": {"store": name}}, "the command line")
     for each, _ in kinds:
         find_run(each)
-    text = dump_joint(config)
+    text, is_new = dump_joint(config), write and not path.exists()
     if path.exists() and path.read_text(encoding="utf-8") != text:
         raise ConfigError(
             f"{path} exists with other settings; use them with: pchem joint {quoted(path)}, "
@@ -77,7 +78,7 @@ def find_joint(
         )
     if write:
         write_atomic(path, text.encode())
-    return JointRun(config, path)
+    return JointRun(config, path, is_new)
 
 
 def _existing(target: Path) -> Path | None:
@@ -97,11 +98,24 @@ def _existing(target: Path) -> Path | None:
 def run_joint(joint: JointRun, command: Command) -> None:
     """Histogram every run that needs it, fit all together, write maps and report.
 
+    A new YAML whose samples do not belong together is taken away again, so that its name is free.
+
     Raises:
         ConfigError: the samples do not belong together.
         IncompleteRunError: tiles failed, or more pixels failed than the configuration allows.
         PchEmError: a stage cannot be done; the message says why.
     """
+    try:
+        target = _histogrammed(joint, command)
+    except ConfigError:
+        if joint.is_new and not joint.store.exists():
+            joint.path.unlink(missing_ok=True)
+        raise
+    run_stages(target, JOINT_STAGES, command)
+
+
+def _histogrammed(joint: JointRun, command: Command) -> Target:
+    """Bring every sample up to its histograms and note them in the store of the joint fit."""
     config = joint.config
     targets = [find_run(joint.folder / sample.run) for sample in config.samples]
     check_runs(config, targets)
@@ -117,4 +131,4 @@ def run_joint(joint: JointRun, command: Command) -> None:
         store = RunStore.create(joint.store)
         with store.locked():
             write_samples(store, samples, sensor, config.joint.against)
-    run_stages(target, JOINT_STAGES, command)
+    return target

@@ -216,6 +216,18 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, joint_
     assert not (joint / "bad.zarr").exists()
 
 
+def test_a_refused_list_leaves_its_name_free(joint):
+    store = joint / "refused.zarr"
+    for runs in (["dark_2s.yaml", "dark_1s.yaml"], ["dark_1s.yaml", "dark_1s.zarr"]):
+        with pytest.raises(ConfigError, match=r"is not above|is the run of"):
+            run_joint(find_joint([joint / run for run in runs], store=store), QUIET)
+        assert not store.with_suffix(".yaml").exists()
+    kept = write(joint, "kept", [("dark_2s.zarr", ""), ("dark_1s.zarr", "")])
+    with pytest.raises(ConfigError):
+        run_joint(find_joint([kept]), QUIET)
+    assert kept.exists()
+
+
 def test_what_is_no_joint_fit_says_so(joint):
     with pytest.raises(ConfigError, match=r"dark_1s\.yaml is a single run, and a joint fit needs several"):
         find_joint([joint / "dark_1s.yaml"])

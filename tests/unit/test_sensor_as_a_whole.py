@@ -1,0 +1,68 @@
+"""What the stage fit does with the sensor as a whole: words given in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.model.fit_status import FitStatus
+from pchem_pipeline.stages import fit_together
+from pchem_pipeline.stages.base import Options, StageContext
+from pchem_pipeline.stages.interrupt import StopRequest
+from pchem_pipeline.stages.pipeline import execute
+from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.store.run_store import RunStore
+
+WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
+
+
+def sensor(folder: Path, noise: float, steps: float, n_frames: int, tile: int) -> StageContext:
+    """A run up to its fit: H = 2, equal pixels."""
+    values = {"quanta_exposure": 2.0, "dn_per_electron": steps, "analog_read_noise_e": noise}
+    constant = {name: {"kind": "constant", "value": value} for name, value in values.items()}
+    config = RunConfig.model_validate(
+        {
+            "run": {"tile": tile, "store": f"run{tile}.zarr"},
+            "simulate": {
+                "shape": [12, 14],
+                "n_frames": n_frames,
+                "format": "npy",
+                "parameters": {**constant, "correlations": [], "hot_pixels": {"fraction": 0}},
+            },
+        }
+    )
+    store = RunStore.create(folder / f"run{tile}.zarr")
+    context = StageContext(
+        config, folder, store, SerialExecutor(), Reporter("off", quiet=True), StopRequest(), options=Options()
+    )
+    for stage in ("simulate", "ingest", "histogram", "fit"):
+        assert execute(stage, context).state == "complete"
+    return context
+
+
+def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contexts = [sensor(tmp_path, 0.48, 7.0, 2000, tile) for tile in (8, 64)]
+    words = [context.store.read("fit/fit_status") for context in contexts]
+    np.testing.assert_array_equal(*words)
+    assert (words[0] & WEAK != 0).all()
+    assert np.count_nonzero((words[0] & ~WEAK) == 0) > 5  # clear one by one
+    # given again it is the same, and a pool of some pixels says the same of all
+    context = contexts[0]
+    assert fit_together.judge_sensor(context) == words[0].size
+    monkeypatch.setattr(fit_together, "_LARGEST_POOL", 60)
+    assert fit_together.judge_sensor(context) == words[0].size
+    np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0])
+    # fewer pixels than make a pool take the words back
+    monkeypatch.setattr(fit_together, "_LARGEST_POOL", 10)
+    assert fit_together.judge_sensor(context) == 0
+    np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0] & ~WEAK)
+
+
+def test_a_good_sensor_keeps_its_words(tmp_path: Path) -> None:
+    words = sensor(tmp_path, 0.3, 7.0, 4000, 64).store.read("fit/fit_status")
+    assert not (words & WEAK).any()
+    assert (words == 0).mean() > 0.95
