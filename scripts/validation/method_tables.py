@@ -1,7 +1,7 @@
 """The methods of the literature beside PCH-EM on simulated pixels, and plans checked by the real fit.
 
 Prints, for each exposure, the root mean square error of the gain by every method over the read noise with the
-bounds, and then how well the frames that ``pchem plan`` asks for do. Half a minute to some minutes, after the
+bounds, and then how well the frames that ``pchem plan`` asks for do. A CPU minute or two, after the
 kernels are compiled.
 
     python scripts/validation/method_tables.py                   # H = 0.5, 2 and 6 e-, 4000 frames
@@ -32,7 +32,7 @@ def method_table(exposure: float, options: argparse.Namespace) -> None:
         for noise in READ_NOISES
     ]
     print(f"\nH = {exposure:g} e-, {options.frames:,} frames for every method, {options.pixels} pixels")
-    head = f"{'read noise, e-':<34}" + "".join(f"{noise:>8g}" for noise in READ_NOISES)
+    head = f"{'read noise, e-':<34}" + "".join(f"{noise:>10g}" for noise in READ_NOISES)
     gain = {
         name: [p["methods"][name]["errors"]["conversion_gain"] for p in points]
         for name in points[0]["methods"]
@@ -40,19 +40,19 @@ def method_table(exposure: float, options: argparse.Namespace) -> None:
     for quantity in ("rmse", "bias"):
         print(f"\n{quantity} of g, %\n{head}")
         for name, rows in gain.items():
-            print(f"{name:<34}" + "".join(f"{percent(row[quantity]):>8}" for row in rows))
+            print(f"{name:<34}" + "".join(f"{percent(row[quantity]):>10}" for row in rows))
         if quantity == "rmse":
             for bound in points[0]["bounds"]:
                 values = [p["bounds"][bound] for p in points]
-                print(f"{'limit, ' + bound:<34}" + "".join(f"{percent(value):>8}" for value in values))
+                print(f"{'limit, ' + bound:<34}" + "".join(f"{percent(value):>10}" for value in values))
     print(f"\npixels without an answer, %\n{head}")
     for name in gain:
         counts = [p["methods"][name] for p in points]
-        print(f"{name:<34}" + "".join(f"{100 * (1 - m['n_answered'] / m['n_pixels']):>8.3g}" for m in counts))
+        print(f"{name:<34}" + "".join(f"{100 * (1 - m['n_answered'] / m['n_pixels']):>10.3g}" for m in counts))
     print(f"\nus per pixel\n{head}")
     for name in gain:
         times = [p["methods"][name]["seconds_per_pixel"] for p in points]
-        print(f"{name:<34}" + "".join(f"{1e6 * t:>8.0f}" for t in times))
+        print(f"{name:<34}" + "".join(f"{1e6 * t:>10.0f}" for t in times))
     print(f"\n{verdict_words(points)}")
 
 
