@@ -48,7 +48,8 @@ def method_table(exposure: float, options: argparse.Namespace) -> None:
     print(f"\npixels without an answer, %\n{head}")
     for name in gain:
         counts = [p["methods"][name] for p in points]
-        print(f"{name:<34}" + "".join(f"{100 * (1 - m['n_answered'] / m['n_pixels']):>10.3g}" for m in counts))
+        missing = [100 * (1 - m["n_answered"] / m["n_pixels"]) for m in counts]
+        print(f"{name:<34}" + "".join(f"{share:>10.3g}" for share in missing))
     print(f"\nus per pixel\n{head}")
     for name in gain:
         times = [p["methods"][name]["seconds_per_pixel"] for p in points]
