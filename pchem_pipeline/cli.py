@@ -6,6 +6,7 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -13,25 +14,12 @@ import typer
 
 from pchem_pipeline import __version__
 from pchem_pipeline.cli_methods import methods
-from pchem_pipeline.cli_options import (
-    Backend,
-    DryRun,
-    Force,
-    LogJson,
-    MaxMemory,
-    Progress,
-    Quiet,
-    Roi,
-    Target,
-    Tiles,
-    Workers,
-    make_command,
-)
+from pchem_pipeline.cli_options import Progress, Quiet, Target, Workers, region_of, takes_command
 from pchem_pipeline.cli_plan import plan
 from pchem_pipeline.errors import ExitCode, PchEmError
 
 if TYPE_CHECKING:
-    pass
+    from pchem_pipeline.stages.session import Command
 
 __all__ = ["app", "main"]
 
@@ -48,25 +36,10 @@ app = typer.Typer(
 def _stage_command(name: str, summary: str) -> None:
     """Add the command of one stage; all stages take the same options."""
 
-    def stage(
-        target: Target,
-        force: Force = False,
-        dry_run: DryRun = False,
-        tiles: Tiles = None,
-        roi: Roi = None,
-        workers: Workers = None,
-        backend: Backend = None,
-        max_memory: MaxMemory = None,
-        log_json: LogJson = None,
-        progress: Progress = "auto",
-        quiet: Quiet = False,
-    ) -> None:
+    @takes_command()
+    def stage(target: Target, *, command: Command) -> None:
         from pchem_pipeline.stages.session import find_run, run_stages
 
-        command = make_command(
-            force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
-            log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
-        )  # fmt: skip
         run_stages(find_run(target), [name], command)
 
     stage.__doc__ = summary
@@ -88,6 +61,7 @@ def init(
 
 
 @app.command()
+@takes_command()
 def ingest(
     target: Target,
     append: Annotated[
@@ -96,24 +70,12 @@ def ingest(
             "--append", help="take the files that came behind those of a finished run; reads only them"
         ),
     ] = False,
-    force: Force = False,
-    dry_run: DryRun = False,
-    tiles: Tiles = None,
-    roi: Roi = None,
-    workers: Workers = None,
-    backend: Backend = None,
-    max_memory: MaxMemory = None,
-    log_json: LogJson = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Check the camera files; copy or reference their frames."""
     from pchem_pipeline.stages.session import cropped, find_run, run_stages
 
-    command = make_command(
-        force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
-    )  # fmt: skip
     run = find_run(target)
     if append:
         from pchem_pipeline.stages.append import append_frames
@@ -137,6 +99,7 @@ for _name, _summary in {
 
 
 @app.command()
+@takes_command()
 def run(
     targets: Annotated[
         list[Path], typer.Argument(help="a config.yaml, a store, or camera files and folders")
@@ -156,16 +119,8 @@ def run(
         Literal["simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"],
         typer.Option(help="last stage to be done"),
     ] = "report",
-    force: Force = False,
-    dry_run: DryRun = False,
-    tiles: Tiles = None,
-    roi: Roi = None,
-    workers: Workers = None,
-    backend: Backend = None,
-    max_memory: MaxMemory = None,
-    log_json: LogJson = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Do every stage, from camera files to the report.
 
@@ -174,22 +129,21 @@ def run(
     from pchem_pipeline.stages.session import cropped, run_stages, up_to
     from pchem_pipeline.stages.start import find_or_start
 
-    command = make_command(
-        force=force, dry_run=dry_run, tiles=tiles, roi=roi, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet, max_memory=max_memory,
-    )  # fmt: skip
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}
-    target, is_new = find_or_start(targets, store, known, command.options.roi, write=not dry_run)
+    target, is_new = find_or_start(
+        targets, store, known, command.options.roi, write=not command.options.dry_run
+    )
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, target.stages)
     run_stages(target, stages, command)
-    if not dry_run:
+    if not wanted.dry_run:
         typer.echo(target.store / "report.html" if "report" in stages else target.store)
 
 
 @app.command()
+@takes_command(without=("tiles", "roi", "max_memory"))
 def discrepancy(
     target: Target,
     refit: Annotated[
@@ -198,16 +152,11 @@ def discrepancy(
             "--refit/--no-refit", help="fit, maps, ensemble and report with the grown model at once"
         ),
     ] = True,
-    force: Force = False,
-    dry_run: DryRun = False,
     roi: Annotated[
         str | None, typer.Option(help="look at the pixels y0:y1,x0:x1 only [default: all, or a window]")
     ] = None,
-    workers: Workers = None,
-    backend: Backend = None,
-    log_json: LogJson = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Find what the model is missing, name it, and add it to the model.
 
@@ -216,16 +165,14 @@ def discrepancy(
     from pchem_pipeline.stages.growing import find_and_grow
     from pchem_pipeline.stages.session import find_run
 
-    command = make_command(
-        force=force, dry_run=dry_run, tiles=None, roi=roi, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet,
-    )  # fmt: skip
+    command = replace(command, options=replace(command.options, roi=region_of(roi)))
     text = find_and_grow(find_run(target), command, refit=refit)
     if text:
         typer.echo(text)
 
 
 @app.command()
+@takes_command(without=("roi", "max_memory"))
 def joint(
     targets: Annotated[
         list[Path], typer.Argument(help="a joint.yaml, or the runs (YAML or store) in order of exposure")
@@ -234,14 +181,8 @@ def joint(
         list[Path] | None, typer.Option(help="runs: one whose frames hold no electrons (repeatable)")
     ] = None,
     store: Annotated[Path | None, typer.Option(help="runs: store of the fit [default: joint.zarr]")] = None,
-    force: Force = False,
-    dry_run: DryRun = False,
-    tiles: Tiles = None,
-    workers: Workers = None,
-    backend: Backend = None,
-    log_json: LogJson = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Fit several exposures of a sensor together.
 
@@ -249,13 +190,9 @@ def joint(
     """
     from pchem_pipeline.stages.joint_session import find_joint, run_joint
 
-    command = make_command(
-        force=force, dry_run=dry_run, tiles=tiles, roi=None, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet,
-    )  # fmt: skip
-    fit = find_joint(targets, bias or [], store, write=not dry_run)
+    fit = find_joint(targets, bias or [], store, write=not command.options.dry_run)
     run_joint(fit, command)
-    if not dry_run:
+    if not command.options.dry_run:
         typer.echo(fit.store / "report.html")
 
 

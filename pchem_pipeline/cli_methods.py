@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pchem_pipeline.cli_options import (
-    Backend,
-    DryRun,
-    Force,
-    LogJson,
-    Progress,
-    Quiet,
-    Target,
-    Workers,
-    make_command,
-)
+from pchem_pipeline.cli_options import Target, takes_command
+
+if TYPE_CHECKING:
+    from pchem_pipeline.stages.session import Command
 
 __all__ = ["methods"]
 
 
+@takes_command(without=("tiles", "roi", "max_memory"))
 def methods(
     target: Target,
     with_runs: Annotated[
@@ -37,13 +31,8 @@ def methods(
         int | None,
         typer.Option(min=0, help="simulated pixels at each read noise [default: methods.study_pixels]"),
     ] = None,
-    force: Force = False,
-    dry_run: DryRun = False,
-    workers: Workers = None,
-    backend: Backend = None,
-    log_json: LogJson = None,
-    progress: Progress = "auto",
-    quiet: Quiet = False,
+    *,
+    command: Command,
 ) -> None:
     """Compare other characterisation methods with PCH-EM.
 
@@ -52,10 +41,6 @@ def methods(
     from pchem_pipeline.stages.methods_result import compare_methods
     from pchem_pipeline.stages.session import find_run
 
-    command = make_command(
-        force=force, dry_run=dry_run, tiles=None, roi=None, workers=workers, backend=backend,
-        log_json=log_json, progress=progress, quiet=quiet,
-    )  # fmt: skip
     given = {"with_runs": with_runs, "pixels": pixels, "study_pixels": study_pixels}
     known = {name: value for name, value in given.items() if value is not None}
     text = compare_methods(find_run(target), command, known)
