@@ -131,9 +131,8 @@ def run(
 
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}
-    target, is_new = find_or_start(
-        targets, store, known, command.options.roi, write=not command.options.dry_run
-    )
+    wanted = command.options
+    target, is_new = find_or_start(targets, store, known, wanted.roi, write=not wanted.dry_run)
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, target.stages)
