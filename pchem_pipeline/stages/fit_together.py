@@ -15,6 +15,7 @@ from pchem_pipeline.store.run_store import RunStore
 __all__ = ["judge_sensor"]
 
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
+_LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 _GAIN, _SIGMA = 1, 3  # places in ``variables.PARAMETERS``
 _PAIR = CORRELATION_PAIRS.index((_GAIN, _SIGMA))
 
@@ -32,14 +33,22 @@ def judge_sensor(context: StageContext) -> int:
     store, shape = context.store, context.sensor.shape
     bands = list(_bands(shape, context.config.run.tile))
     every = -(-shape[0] * shape[1] // _LARGEST_POOL)
-    places = [slice(-band[0].start * shape[1] % every, None, every) for band in bands]
-    pool = NoisePool.of(Judged.join([_judged(store, b).of(s) for b, s in zip(bands, places, strict=True)]))
+    kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
+    chosen = []
+    for band in bands:
+        pixels = _judged(store, band)
+        some = pixels.of(slice(-band[0].start * shape[1] % every, None, every))
+        chosen.append(Judged.join([some]))  # a copy: a view would keep the whole band
+        if shape[0] * shape[1] <= _LARGEST_KEPT:
+            kept[band[0].start] = pixels
+    pool = NoisePool.of(Judged.join(chosen))
     weakly, found = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED)), 0
     for band in bands:
         words = store.read("fit/fit_status", band)
         new = words & ~weakly
         if pool is not None:
-            weak = pool.weak(_judged(store, band), context.config.fit).reshape(words.shape)
+            pixels = kept[band[0].start] if kept else _judged(store, band)
+            weak = pool.weak(pixels, context.config.fit).reshape(words.shape)
             new[weak] |= weakly
             found += int(np.count_nonzero(weak))
         if not np.array_equal(new, words):
