@@ -7,6 +7,7 @@ object appears whole or not at all, so a put takes the place of writing aside an
 from __future__ import annotations
 
 import functools
+import hashlib
 import re
 from collections.abc import Callable, Generator
 from fnmatch import fnmatchcase
@@ -15,7 +16,7 @@ from typing import Any, Self, TypeVar, cast
 
 from pchem_pipeline.errors import MissingDependencyError, StoreError
 
-__all__ = ["RemoteError", "RemotePath", "place_of", "refused"]
+__all__ = ["RemoteError", "RemotePath", "lock_folder", "place_of", "refused", "zarr_place"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -165,3 +166,22 @@ def _storage(protocol: str) -> Any:
         raise MissingDependencyError(
             f'{protocol}://: a store there needs another library ({error}); pip install "pchem-pipeline[s3]"'
         ) from error
+
+
+def zarr_place(path: Path, *, writable: bool) -> Any:
+    """Return what zarr opens."""
+    if not isinstance(path, RemotePath):
+        return str(path)
+    from zarr.storage import FsspecStore
+
+    options = {"use_listings_cache": False}
+    return FsspecStore.from_url(str(path), storage_options=options, read_only=not writable)
+
+
+def lock_folder(path: Path, private: str) -> Path:
+    """Return where the lock of a run lies: in its private folder; in the user's cache if that is no disk."""
+    if not isinstance(path, RemotePath):
+        return path / private
+    from platformdirs import user_cache_path
+
+    return user_cache_path("pchem_pipeline") / "locks" / hashlib.sha256(str(path).encode()).hexdigest()[:16]

@@ -15,7 +15,6 @@ only.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -30,13 +29,13 @@ from numpy.typing import NDArray
 from pchem_pipeline.errors import LockedError, PchEmError, StoreError, quoted
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.records import Records
-from pchem_pipeline.store.remote_path import RemotePath, place_of, refused
+from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused, zarr_place
 from pchem_pipeline.variables import VARIABLES
 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["SCHEMA_VERSION", "RunStore", "lock_folder"]
+__all__ = ["SCHEMA_VERSION", "RunStore"]
 
 #: Version of the layout; another version is refused.
 SCHEMA_VERSION = 1
@@ -72,7 +71,7 @@ class RunStore:
         with _one_line(path, path):
             path.mkdir(parents=True, exist_ok=True)
             attributes = {"pchem_schema": SCHEMA_VERSION}
-            root = zarr.create_group(_zarr_place(path, writable=True), zarr_format=3, attributes=attributes)
+            root = zarr.create_group(zarr_place(path, writable=True), zarr_format=3, attributes=attributes)
         return cls(path, root)
 
     @classmethod
@@ -90,9 +89,10 @@ class RunStore:
                 f"there is no run at {path}; make one with: pchem run FILES --store {quoted(path)}"
             )
         try:
-            root = zarr.open_group(_zarr_place(path, writable=writable), mode="r+" if writable else "r")
-            schema = root.attrs.get("pchem_schema")
-        except (ValueError, KeyError, TypeError, OSError) as error:
+            with _one_line(path, path):
+                root = zarr.open_group(zarr_place(path, writable=writable), mode="r+" if writable else "r")
+                schema = root.attrs.get("pchem_schema")
+        except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{path} is damaged ({error}); restore it or start the run again") from error
         if schema is None:
             raise StoreError(
@@ -110,7 +110,8 @@ class RunStore:
 
     def has(self, name: str) -> bool:
         """Tell whether the array or group ``name`` exists."""
-        return name in self._root
+        with _one_line(self.path, self.path):
+            return name in self._root
 
     def create_array(
         self,
@@ -167,7 +168,8 @@ class RunStore:
         import zarr
 
         try:
-            found = self._root[name]
+            with _one_line(self.path, f"{self.path}: {name}"):
+                found = self._root[name]
         except KeyError as error:
             raise StoreError(f"{self.path} has no {name}; run the stage that writes it") from error
         if not isinstance(found, zarr.Array):
@@ -205,15 +207,16 @@ class RunStore:
 
     def delete(self, name: str) -> None:
         """Remove an array or a group, if it exists."""
-        if name in self._root:
+        if self.has(name):
             with self._translated(name):
                 del self._root[name]
 
     def attributes(self, name: str = "") -> dict[str, Any]:
         """Return the attributes of a group or array (of the root by default); empty where there is none."""
-        if name and name not in self._root:
+        if name and not self.has(name):
             return {}
-        return dict((self._root[name] if name else self._root).attrs)
+        with _one_line(self.path, self.path):
+            return dict((self._root[name] if name else self._root).attrs)
 
     def set_attributes(self, name: str, values: Mapping[str, Any]) -> None:
         """Add attributes (JSON) to a group, making the group where needed."""
@@ -249,7 +252,7 @@ class RunStore:
             LockedError: another process holds it.
             StoreError: the lock file cannot be written.
         """
-        private = lock_folder(self.path)
+        private = lock_folder(self.path, _PRIVATE)
         try:
             private.mkdir(parents=True, exist_ok=True)
             lock = FileLock(private / "lock")
@@ -309,25 +312,6 @@ def _one_line(path: Path, where: object) -> Iterator[None]:
         ):
             raise refused(where, error) from error
         raise
-
-
-def _zarr_place(path: Path, *, writable: bool) -> Any:
-    """Return what zarr opens."""
-    if not isinstance(path, RemotePath):
-        return str(path)
-    from zarr.storage import FsspecStore
-
-    options = {"use_listings_cache": False}
-    return FsspecStore.from_url(str(path), storage_options=options, read_only=not writable)
-
-
-def lock_folder(path: Path) -> Path:
-    """Return where the lock of a run lies: in the run, or in the user's cache folder if that is no disk."""
-    if not isinstance(path, RemotePath):
-        return path / _PRIVATE
-    from platformdirs import user_cache_path
-
-    return user_cache_path("pchem_pipeline") / "locks" / hashlib.sha256(str(path).encode()).hexdigest()[:16]
 
 
 def _words(region: _Region) -> str:

@@ -15,8 +15,7 @@ import pytest
 from commands import RUN, arrays_of
 from filelock import FileLock
 
-from pchem_pipeline.store.remote_path import place_of
-from pchem_pipeline.store.run_store import lock_folder
+from pchem_pipeline.store.remote_path import lock_folder, place_of
 
 pytestmark = pytest.mark.skipif(
     find_spec("moto") is None or find_spec("s3fs") is None, reason='pip install ".[dev]" brings moto and s3fs'
@@ -181,7 +180,7 @@ def test_a_report_in_a_store_on_s3_begun_from_files(cloud, server, frames, finis
 
 def test_a_store_on_s3_is_locked_on_this_machine(cloud, frames, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", cloud.environment["XDG_CACHE_HOME"])
-    folder = lock_folder(place_of("s3://lab/night/run.zarr"))
+    folder = lock_folder(place_of("s3://lab/night/run.zarr"), ".pchem")
     folder.mkdir(parents=True)
     (cloud.folder / "run.yaml").write_text(STORED)
     with FileLock(folder / "lock"):

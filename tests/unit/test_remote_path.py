@@ -87,6 +87,34 @@ def test_arrays_markers_and_records_in_an_object_storage(folder, tmp_path, monke
         RunStore.open(folder)
 
 
+class StrangeError(Exception):
+    """An error of a library of its own."""
+
+
+def test_a_storage_that_fails_later_is_one_line(folder, monkeypatch):
+    from zarr.storage import FsspecStore
+
+    store = RunStore.create(folder)
+    store.create_array("fit/bias", (8, 8), chunks=(8, 8))
+
+    async def fail(self, *args, **kwargs):
+        raise StrangeError("no route\nto host")
+
+    monkeypatch.setattr(FsspecStore, "get", fail)
+    asked = [
+        lambda: store.has("fit/bias"),
+        lambda: store.read("fit/bias"),
+        lambda: store.attributes("fit"),
+        lambda: store.delete("fit/bias"),
+        lambda: RunStore.open(folder),
+    ]
+    for ask in asked:
+        with pytest.raises(
+            StoreError, match="refused \\(no route to host\\); check address, keys and network"
+        ):
+            ask()
+
+
 def test_what_the_storage_refuses_is_one_line():
     error = refused("s3://lab/x", ValueError("first\n second"))
     assert str(error) == (
