@@ -9,7 +9,7 @@ For the values nearest to component ``j``, with ``d = y - m - j a``, the compone
 score and ``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
 
 First `_fill` lays the values out in a table, a column for each DN, with the polynomial's coefficients; then
-one loop without branches or calls runs over the columns, which the compiler turns into vector instructions.
+one loop without branches or calls runs over the columns, eight side by side (:mod:`.lanes_numba`).
 """
 
 from __future__ import annotations
@@ -22,109 +22,109 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.lanes_math_numba import LN2, ROOT2, artanh_series, lanes_exp, lanes_log
+from pchem_pipeline.model.lanes_numba import (
+    LANES,
+    counting,
+    exponent_of,
+    fused,
+    least,
+    load_lanes,
+    most,
+    scaled,
+    store_lanes,
+    sum_lanes,
+)
 from pchem_pipeline.model.workspace_numba import (
     CAPACITY,
-    LANES,
     LOGLIK,
     MAX_COMPONENTS,
     Histogram,
     Workspace,
 )
 
-# Sums may be reassociated, so that they run in vector registers; NaN and infinity keep their meaning. Only
-# for the reductions here: what numba links into several kernels is optimised again in each, and which copy
-# runs depends on what the process compiled or loaded before. The starting points, once compiled like this,
-# came out different in the last bit in a process that had just compiled them.
-_REORDER = {"reassoc", "nsz", "contract", "arcp"}
-
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
-_LARGEST_RATIO = 1e145  # keeps r^2 finite when the peaks are needles
+_LARGEST_RATIO = 333.0  # logarithm; keeps r^2 finite when the peaks are needles
+_SMALLEST = -700.0  # logarithm of what counts as 0 beside 1
+_NOTHING = -60.0  # logarithm of a density that no number of frames makes visible
 
 # rows of the table; the coefficients follow
-_WEIGHT, _RATIO, _OFFSET, _LOWEST, _LEVEL, _COEFFICIENT = range(6)
-# places in `totals`: LOGLIK, the five sums of `Workspace.total`, then sums of c times var(i), cov(i, i^2)
-# and var(i^2),
-# i counted from the lowest component, times powers of the offset d from it and of w = d - a lowest
-_V11, _V11W, _V11D, _V11WW, _V11DW, _V11DD, _V12, _V12W, _V12D, _V22 = range(6, 16)
-_N_TOTALS = 16
+_WEIGHT, _OFFSET, _NEAREST, _LEVEL, _COEFFICIENT = range(5)
+# places in `totals`: the log-likelihood; the sums over c of low and low^2 (low: the lowest component); with i
+# counted from it, the offset d from it and w = d - a low, sums of c times E[i], E[i^2], low E[i], d E[i] and
+# low d; then of c times var(i), cov(i, i^2) and var(i^2) times powers of d and w
+_LOW, _LOW2, _M1, _M2, _LOW_M1, _D_M1, _LOW_D = range(1, 8)
+_V11, _V11W, _V11D, _V11WW, _V11DW, _V11DD, _V12, _V12W, _V12D, _V22 = range(8, 18)
+_N_TOTALS = 18
+
+# rows of `Workspace.rows`
+_EXPECTED, _TOTALS, _POWERS, _RISE, _FALL, _LOG_RISE = range(6)
 
 LOG_2PI = math.log(2.0 * math.pi)
-_LN2 = math.log(2.0)
-_ROOT2 = math.sqrt(2.0)
-_MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
-_ONE = np.int64(0x3FF0000000000000)
-
-
-@nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
-def vector_log(x: float) -> float:
-    """Return log(x) of a positive normal number, in a form that compiles to vector instructions.
-
-    From the exponent and ``2 artanh((f - 1)/(f + 1))`` of the fraction f in [sqrt(1/2), sqrt(2)).
-    """
-    bits = np.float64(x).view(np.int64)
-    fraction = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
-    large = 1.0 if fraction > _ROOT2 else 0.0
-    exponent = float((bits >> 52) - 1023) + large
-    fraction = fraction * (1.0 - 0.5 * large)
-    q = (fraction - 1.0) / (fraction + 1.0)
-    z = q * q
-    series = 1 / 15 + z * (1 / 17 + z * (1 / 19 + z / 21))
-    series = 1 / 7 + z * (1 / 9 + z * (1 / 11 + z * (1 / 13 + z * series)))
-    series = 1.0 + z * (1 / 3 + z * (1 / 5 + z * series))
-    answer: float = exponent * _LN2 + 2.0 * q * series
-    return answer
 
 
 def _table_kernel(width: int) -> Callable[..., Any]:
     """Make the loop over the columns for a fixed number of components (0: given at run time)."""
 
-    @nb.njit(nogil=True, cache=True, fastmath=_REORDER, error_model="numpy")
+    @nb.njit(nogil=True, cache=True, error_model="numpy")
     def table_sums(
-        table: NDArray[np.float64], columns: int, components: int, a: float, totals: NDArray[np.float64]
+        table: NDArray[np.float64],
+        columns: int,
+        components: int,
+        a: float,
+        inverse: float,
+        totals: NDArray[np.float64],
     ) -> None:
         terms = width if width > 0 else components
-        loglik = sum_k = sum_kk = sum_ke = sum_e = sum_ee = 0.0
-        v11 = v11w = v11d = v11ww = v11dw = v11dd = v12 = v12w = v12d = v22 = 0.0
-        for i in range(columns):
-            c, ratio, d = table[_WEIGHT, i], table[_RATIO, i], table[_OFFSET, i]
-            low = table[_LOWEST, i]
-            power = 1.0
-            s0 = table[_COEFFICIENT, i]
-            s1 = s2 = s3 = s4 = 0.0
-            for k in range(1, terms):
+        half = float(terms // 2)
+        loglik = sum_m1 = sum_m2 = sum_low_m1 = sum_d_m1 = sum_low_d = counting() * 0.0
+        v11 = v11w = v11d = v11ww = v11dw = v11dd = v12 = v12w = v12d = v22 = loglik
+        for i in range(0, columns, LANES):
+            c, offset = load_lanes(table, _WEIGHT, i), load_lanes(table, _OFFSET, i)
+            place = load_lanes(table, _NEAREST, i)
+            low = most(place - half, 0.0)
+            d = fused(place - low, a, offset)
+            ratio = lanes_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+            power = ratio
+            term = load_lanes(table, _COEFFICIENT + 1, i) * power
+            s0 = load_lanes(table, _COEFFICIENT, i) + term
+            s1 = s2 = s3 = s4 = term
+            for k in range(2, terms):
                 power = power * ratio
-                term = table[_COEFFICIENT + k, i] * power
-                s0 += term
-                s1 += k * term
-                s2 += k * k * term
-                s3 += k * k * k * term
-                s4 += k * k * k * k * term
-            loglik += c * (table[_LEVEL, i] + vector_log(s0))
-            inverse = 1.0 / s0
-            m1, m2, m3, m4 = s1 * inverse, s2 * inverse, s3 * inverse, s4 * inverse
-            w = d - a * low
-            sum_k += c * (low + m1)
-            sum_kk += c * (low * (low + 2.0 * m1) + m2)
-            sum_ke += c * (low * d + m1 * w - a * m2)
-            sum_e += c * (d - a * m1)
-            sum_ee += c * (d * d - a * (2.0 * d * m1 - a * m2))
-            c11, c12, c22 = c * (m2 - m1 * m1), c * (m3 - m1 * m2), c * (m4 - m2 * m2)
-            v11 += c11
-            v11w += c11 * w
-            v11d += c11 * d
-            v11ww += c11 * w * w
-            v11dw += c11 * d * w
-            v11dd += c11 * d * d
-            v12 += c12
-            v12w += c12 * w
-            v12d += c12 * d
-            v22 += c22
-        first = (loglik, sum_k, sum_kk, sum_ke, sum_e, sum_ee)
+                term = load_lanes(table, _COEFFICIENT + k, i) * power
+                number = float(k)
+                s0 = s0 + term
+                s1 = fused(term, number, s1)
+                s2 = fused(term, number * number, s2)
+                s3 = fused(term, number * number * number, s3)
+                s4 = fused(term, number * number * number * number, s4)
+            # log(s0) as in `lanes_log`, its division shared with 1 / s0
+            exponent = exponent_of(s0 * ROOT2)
+            fraction = scaled(s0, 0.0 - exponent)
+            above = fraction + 1.0
+            shared = 1.0 / (s0 * above)
+            each, q = shared * above, (fraction - 1.0) * (shared * s0)
+            logged = fused(q + q, artanh_series(q * q), load_lanes(table, _LEVEL, i))
+            logged = fused(offset * (0.0 - inverse), fused(offset, -0.5, d), fused(exponent, LN2, logged))
+            loglik = fused(c, logged, loglik)
+            m1, m2, share = s1 * each, s2 * each, c * each
+            c1, c2, minus = c * m1, c * m2, 0.0 - m1
+            sum_m1, sum_m2, sum_low_d = sum_m1 + c1, sum_m2 + c2, fused(c * low, d, sum_low_d)
+            sum_low_m1, sum_d_m1 = fused(c1, low, sum_low_m1), fused(c1, d, sum_d_m1)
+            c11, c12, c22 = fused(c1, minus, c2), fused(c2, minus, share * s3), share * s4 - c2 * m2
+            w = fused(low, 0.0 - a, d)
+            c11w, c11d = c11 * w, c11 * d
+            v11, v12, v22 = v11 + c11, v12 + c12, v22 + c22
+            v11w, v11d = v11w + c11w, v11d + c11d
+            v11ww, v11dw, v11dd = fused(c11w, w, v11ww), fused(c11d, w, v11dw), fused(c11d, d, v11dd)
+            v12w, v12d = fused(c12, w, v12w), fused(c12, d, v12d)
+        totals[LOGLIK] += sum_lanes(loglik)
+        first = (sum_m1, sum_m2, sum_low_m1, sum_d_m1, sum_low_d)
         second = (v11, v11w, v11d, v11ww, v11dw, v11dd, v12, v12w, v12d, v22)
-        for place, value in enumerate(first):
-            totals[place] += value
-        for place, value in enumerate(second):
-            totals[_V11 + place] += value
+        for number_of, value in enumerate(first):
+            totals[_M1 + number_of] += sum_lanes(value)
+        for number_of, value in enumerate(second):
+            totals[_V11 + number_of] += sum_lanes(value)
 
     kernel: Callable[..., Any] = table_sums
     return kernel
@@ -149,74 +149,140 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int) -
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _fill_prior(
-    prior: NDArray[np.float64], nearest: int, low: int, width: int, exposure: float, overlap: float
-) -> None:
-    """Fill the polynomial's coefficients relative to the nearest; ``overlap = exp(-a^2/2 sigma^2)``."""
-    place = nearest - low
-    square = overlap * overlap
-    prior[place] = 1.0
-    factor = overlap
-    for step in range(1, width - place):
-        prior[place + step] = prior[place + step - 1] * factor * exposure / (nearest + step)
-        factor *= square
-    factor = overlap
+def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure: float) -> None:
+    """Fill ``H / k`` of k from ``first`` on, its inverse and its logarithm, by the eight; 1 / k of k = 0."""
+    exposure = math.exp(log_exposure)
     inverse = 1.0 / exposure
+    for i in range(0, count, LANES):
+        k = most(counting() + float(first + i), 1.0)
+        store_lanes(rows, _RISE, i, exposure / k)
+        store_lanes(rows, _FALL, i, k * inverse)
+        store_lanes(rows, _LOG_RISE, i, log_exposure - lanes_log(k))
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _fill_coefficients(
+    table: NDArray[np.float64],
+    filled: int,
+    n: int,
+    rows: NDArray[np.float64],
+    nearest_one: int,
+    first: int,
+    low: int,
+    width: int,
+) -> None:
+    """Fill the polynomial's coefficients, relative to the nearest component, of ``n`` columns of one cell.
+
+    Neighbours differ by ``H / k`` and by an odd power of ``exp(-a^2/2 sigma^2)``.
+
+    Args:
+        table: out.
+        filled: first of the columns.
+        n: number of columns; they are written by the eight.
+        rows: the powers, and H / k and its inverse.
+        nearest_one: nearest component.
+        first: component with which those rows begin.
+        low: lowest component.
+        width: number of components.
+    """
+    powers, rise, fall = rows[_POWERS], rows[_RISE], rows[_FALL]
+    place, place_of = nearest_one - low, nearest_one - first
+    coefficient = 1.0
+    for step in range(width - place):
+        if step > 0:
+            coefficient *= powers[step] * rise[place_of + step]
+        for i in range(0, n, LANES):
+            store_lanes(table, _COEFFICIENT + place + step, filled + i, coefficient)
+    coefficient = 1.0
     for step in range(1, place + 1):
-        prior[place - step] = prior[place - step + 1] * factor * (nearest - step + 1) * inverse
-        factor *= square
+        coefficient *= powers[step] * fall[place_of - step + 1]
+        for i in range(0, n, LANES):
+            store_lanes(table, _COEFFICIENT + place - step, filled + i, coefficient)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def _sum_table(
-    table: NDArray[np.float64], filled: int, width: int, a: float, totals: NDArray[np.float64]
+    table: NDArray[np.float64],
+    filled: int,
+    width: int,
+    a: float,
+    inverse: float,
+    totals: NDArray[np.float64],
+    frames: float,
+    expected: NDArray[np.float64],
+    end: int,
 ) -> None:
-    """Fill up the last vector with columns of no weight, and sum with the loop for this many components."""
-    columns = (filled + LANES - 1) // LANES * LANES
-    for i in range(filled, columns):
-        for row in range(_COEFFICIENT + width):
-            table[row, i] = 0.0
-        table[_COEFFICIENT, i] = 1.0
+    """Fill up the last lanes with columns of no weight, and sum with the loop for this many components.
+
+    With ``frames``, also leave the counts expected of the columns, which end before DN ``end``.
+    """
+    for row in range(_COEFFICIENT + width):
+        store_lanes(table, row, filled, 1.0 if row == _COEFFICIENT else 0.0)
     if width == 3:
-        table_sums_3(table, columns, 3, a, totals)
+        table_sums_3(table, filled, 3, a, inverse, totals)
     elif width == 5:
-        table_sums_5(table, columns, 5, a, totals)
+        table_sums_5(table, filled, 5, a, inverse, totals)
     elif width == 7:
-        table_sums_7(table, columns, 7, a, totals)
+        table_sums_7(table, filled, 7, a, inverse, totals)
     elif width == 9:
-        table_sums_9(table, columns, 9, a, totals)
+        table_sums_9(table, filled, 9, a, inverse, totals)
     else:
-        table_sums_any(table, columns, width, a, totals)
+        table_sums_any(table, filled, width, a, inverse, totals)
+    if frames > 0.0:
+        _expect(table, filled, width, a, inverse, frames, expected, end - filled)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def _expect(
-    table: NDArray[np.float64], filled: int, width: int, frames: float, start: int, out: NDArray[np.float64]
+    table: NDArray[np.float64],
+    filled: int,
+    width: int,
+    a: float,
+    inverse: float,
+    frames: float,
+    out: NDArray[np.float64],
+    start: int,
 ) -> None:
-    """Leave the counts expected of the DN in the table, from ``start`` on, in ``out``."""
-    for i in range(filled):
-        power = 1.0
-        density = table[_COEFFICIENT, i]
+    """Leave the counts expected of the DN in the table in ``out`` from ``start`` on."""
+    half = float(width // 2)
+    for first in range(0, filled, LANES):
+        offset = load_lanes(table, _OFFSET, first)
+        ratio = lanes_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+        power = ratio
+        density = load_lanes(table, _COEFFICIENT, first)
         for k in range(1, width):
-            power *= table[_RATIO, i]
-            density += table[_COEFFICIENT + k, i] * power
-        out[start + i] = frames * density * math.exp(table[_LEVEL, i])
+            density = fused(load_lanes(table, _COEFFICIENT + k, first), power, density)
+            power = power * ratio
+        shift = least(load_lanes(table, _NEAREST, first), half) * a
+        level = fused(offset * (0.0 - inverse), fused(offset, 0.5, shift), load_lanes(table, _LEVEL, first))
+        level = lanes_exp(most(least(level, -_SMALLEST), _SMALLEST))
+        store_lanes(table, _WEIGHT, first, density * frames * level)
+    for i in range(filled):
+        out[start + i] = table[_WEIGHT, i]
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def _finish(n: float, theta: NDArray[np.float64], totals: NDArray[np.float64], space: Workspace) -> None:
-    """Turn the totals into score and observed information.
+def _finish(
+    histogram: Histogram, theta: NDArray[np.float64], totals: NDArray[np.float64], space: Workspace
+) -> None:
+    """Turn the totals into the E-step's sums, score and observed information.
 
     With ``S = const + alpha i + beta i^2``, ``alpha = (1, w/s2, -a/s2, -a d/s2)`` and ``beta = (0, -a/s2, 0,
     a^2/2 s2)``, the conditional covariance of the complete-data score is made of the sums of var(i),
     cov(i, i^2) and var(i^2) times powers of d and w.
     """
-    total, score, information = space.total, space.score, space.information
+    n, total, score, information = histogram.n, space.total, space.score, space.information
     exposure, a, inverse = math.exp(theta[0]), theta[1], math.exp(-theta[3])
     t = a * inverse
-    for i in range(6):
-        total[i] = totals[i]
-    sum_k, sum_kk, sum_ke, sum_e, sum_ee = totals[1], totals[2], totals[3], totals[4], totals[5]
+    mean = histogram.mean - theta[2]
+    low2, low_d, m2, d_m1 = totals[_LOW2], totals[_LOW_D], totals[_M2], totals[_D_M1]
+    sum_k = totals[_LOW] + totals[_M1]
+    sum_kk = low2 + 2.0 * totals[_LOW_M1] + m2
+    sum_ke = low_d + d_m1 - a * (totals[_LOW_M1] + m2)
+    sum_e = n * mean - a * sum_k
+    sum_ee = n * (histogram.variance + mean * mean) - a * (2.0 * (low_d + d_m1) + a * (low2 - m2))
+    for place, value in enumerate((totals[LOGLIK], sum_k, sum_kk, sum_ke, sum_e, sum_ee)):
+        total[place] = value
     v11, v12, v22 = totals[_V11], totals[_V12], totals[_V22]
     cov01 = inverse * totals[_V11W] - t * v12
     cov03 = 0.5 * a * t * v12 - t * totals[_V11D]
@@ -250,32 +316,21 @@ def _fill(
     weights: NDArray[np.float64],
     start: int,
     stop: int,
-    nearest: float,
-    shift: float,
-    low: float,
+    offset: float,
+    place: int,
     level: float,
-    a: float,
-    inverse: float,
-    prior: NDArray[np.float64],
-    width: int,
-    powers: NDArray[np.float64],
 ) -> None:
-    """Lay out the DN from ``start`` to ``stop``; the first is ``nearest`` DN off their nearest component."""
+    """Lay out the DN from ``start`` to ``stop``; the first is ``offset`` DN off component ``place``.
+
+    Columns are written by the eight: what that writes too much, the next ones overwrite.
+    """
     n = stop - start
-    top = math.exp((nearest + n - 1) * a * inverse)
     for i in range(n):
-        d = nearest + i
-        column = filled + i
-        table[_WEIGHT, column] = weights[start + i]
-        table[_RATIO, column] = min(top * powers[n - 1 - i], _LARGEST_RATIO)
-        table[_OFFSET, column] = d + shift
-        table[_LOWEST, column] = low
-        table[_LEVEL, column] = level - (0.5 * d + shift) * d * inverse
-    for k in range(width):
-        coefficient = prior[k]
-        row = table[_COEFFICIENT + k]
-        for column in range(filled, filled + n):
-            row[column] = coefficient
+        table[_WEIGHT, filled + i] = weights[start + i]
+    for i in range(0, n, LANES):
+        store_lanes(table, _OFFSET, filled + i, counting() + (offset + i))
+        store_lanes(table, _NEAREST, filled + i, float(place))
+        store_lanes(table, _LEVEL, filled + i, level)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -292,17 +347,20 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
         The log-likelihood, nats.
     """
     weights, cumulative, n_bins, first, _, _, _ = histogram
-    table, expected, powers, totals = space.table, space.rows[0], space.rows[1], space.rows[2]
-    prior = space.rows[3]
+    rows, table = space.rows, space.table
+    expected, totals = rows[_EXPECTED], rows[_TOTALS]
     exposure, a, origin, inverse = math.exp(theta[0]), theta[1], theta[2], math.exp(-theta[3])
     j = max(0, math.floor((first - origin) / a + 0.5))
     last = max(j, math.floor((first + n_bins - 1 - origin) / a + 0.5))
     half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last)
     width = 2 * half + 1
-    overlap = math.exp(-0.5 * a * a * inverse)
-    decay = math.exp(-a * inverse)
-    powers[0] = 1.0
-    known = 1
+    lowest = max(0, j - half)
+    _fill_steps(rows, lowest, max(last, half) + half + 2 - lowest, theta[0])
+    power = math.exp(-0.5 * a * a * inverse)
+    square = power * power
+    for step in range(1, width):
+        rows[_POWERS, step] = power
+        power *= square
     for i in range(_N_TOTALS):
         totals[i] = 0.0
     level = j * theta[0] - exposure - math.lgamma(j + 1.0) - 0.5 * (theta[3] + LOG_2PI)
@@ -312,36 +370,30 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
         end = min(n_bins, math.ceil(origin + (j + 0.5) * a - first))
         if j == last:
             end = n_bins
-        empty = end <= start or cumulative[end] == cumulative[start]
-        if not empty:
+        held = cumulative[end] - cumulative[start] if end > start else 0.0
+        if end > start and (held > 0.0 or (frames > 0.0 and level > _NOTHING)):
             low = max(0, j - half)
-            _fill_prior(prior, j, low, width, exposure, overlap)
-        while start < end:
-            stop = min(end, start + CAPACITY)
-            if filled + stop - start > CAPACITY:
-                _sum_table(table, filled, width, a, totals)
-                filled = 0
-            if empty:
-                if frames > 0.0:
-                    for i in range(start, end):
-                        expected[i] = 0.0
-                stop = end
-            else:
-                while known < stop - start:
-                    powers[known] = powers[known - 1] * decay
-                    known += 1
-                nearest = first + start - origin - j * a
-                shift = (j - low) * a
-                _fill(
-                    table, filled, weights, start, stop, nearest, shift, float(low), level, a, inverse,
-                    prior, width, powers,
-                )  # fmt: skip
-                if frames > 0.0:
-                    _expect(table[:, filled:], stop - start, width, frames, start, expected)
+            totals[_LOW] += held * low
+            totals[_LOW2] += held * low * low
+            while start < end:
+                stop = min(end, start + CAPACITY)
+                if filled + stop - start > CAPACITY:
+                    _sum_table(table, filled, width, a, inverse, totals, frames, expected, start)
+                    filled = 0
+                offset = first + start - origin - j * a
+                _fill(table, filled, weights, start, stop, offset, j, level)
+                _fill_coefficients(table, filled, stop - start, rows, j, lowest, low, width)
                 filled += stop - start
-            start = stop
+                start = stop
+        elif end > start:
+            if frames > 0.0:
+                _sum_table(table, filled, width, a, inverse, totals, frames, expected, start)
+                filled = 0
+                for i in range(start, end):
+                    expected[i] = 0.0
+            start = end
         j += 1
-        level += theta[0] - math.log(j)
-    _sum_table(table, filled, width, a, totals)
-    _finish(cumulative[n_bins], theta, totals, space)
+        level += rows[_LOG_RISE, j - lowest]
+    _sum_table(table, filled, width, a, inverse, totals, frames, expected, n_bins)
+    _finish(histogram, theta, totals, space)
     return float(totals[LOGLIK])

@@ -118,11 +118,10 @@ def newton_step(
         with a share of 0 does the former say how far the maximum is.
     """
     total, score, information = space.total, space.score, space.information
-    held = np.zeros(4, np.bool_)
+    held, lower, matrix = space.held, space.small[:4], space.small[4:8]
+    held[1] = held[2] = False
     held[0] = theta[0] <= bound + 1e-12 and score[0] <= 0.0
     held[3] = theta[3] <= min_log_variance(theta[1]) + 1e-12 and score[3] <= 0.0
-    lower = np.empty((4, 4))
-    matrix = np.empty((4, 4))
     for i in range(4):
         copy(information[i], matrix[i])
     if share > 0.0:
@@ -197,7 +196,7 @@ def polish(
     """
     bound, tolerance = limits[MIN_LOG_EXPOSURE], limits[TOLERANCE]
     n = histogram.n
-    trial, step = np.empty(4), np.empty(4)
+    trial, step = space.small[8], space.small[9]
     ahead = share_workspace(space)
     theta[0] = max(bound, theta[0])
     theta[3] = max(min_log_variance(theta[1]), theta[3])

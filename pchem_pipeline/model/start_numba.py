@@ -13,6 +13,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.lanes_numba import LANES, counting, fused, load_lanes, store_lanes
 from pchem_pipeline.model.workspace_numba import Histogram
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a lobe
@@ -21,6 +22,7 @@ N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the lobe of H = 200
 LOBE_STEP = 0.05
 LOBE_FIRST = 0.25  # lowest lobe frequency tried, 1/sd: the step a is at most 4 sd
 N_LOBES = 90
+_SIDE_BY_SIDE = 3  # vectors of frequencies at a time
 _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 
 _TWO_PI = 2.0 * math.pi
@@ -47,30 +49,28 @@ def ecf_power(
     frequencies side by side; ``|sum c_i exp(i angle)|^2 = b_0^2 + b_1^2 - 2 cos(angle) b_0 b_1``.
     """
     weights, n_bins = histogram.weights, histogram.n_bins
-    power, even, odd, twice = work[0], work[1], work[2], work[3]
     base = 2.0 * math.cos(_TWO_PI * step)
     before, present = 2.0, base
-    for m in range(n_frequencies):
-        twice[m] = present
+    for m in range(n_frequencies + _SIDE_BY_SIDE * LANES):
+        work[1, m] = present
         before, present = present, base * present - before
-        even[m] = 0.0
-        odd[m] = 0.0
-    i = n_bins - 1
-    if n_bins % 2 == 1:
-        for m in range(n_frequencies):
-            even[m] = weights[i]
-        i -= 1
-    while i > 0:
-        right, left = weights[i], weights[i - 1]
-        for m in range(n_frequencies):
-            turn = twice[m]
-            following = right + (turn * even[m] - odd[m])
-            odd[m] = following
-            even[m] = left + (turn * following - even[m])
-        i -= 2
     share = 1.0 / (histogram.n * histogram.n)
-    for m in range(n_frequencies):
-        power[m] = share * (even[m] * even[m] + odd[m] * odd[m] - twice[m] * even[m] * odd[m])
+    for m in range(0, n_frequencies, _SIDE_BY_SIDE * LANES):
+        turn1, turn2 = load_lanes(work, 1, m), load_lanes(work, 1, m + LANES)
+        turn3 = load_lanes(work, 1, m + 2 * LANES)
+        odd1 = odd2 = odd3 = counting() * 0.0
+        even1 = even2 = even3 = odd1 + (weights[n_bins - 1] if n_bins % 2 == 1 else 0.0)
+        for i in range(n_bins // 2 * 2 - 1, 0, -2):
+            right, left = weights[i], weights[i - 1]
+            odd1 = fused(turn1, even1, right - odd1)
+            odd2 = fused(turn2, even2, right - odd2)
+            odd3 = fused(turn3, even3, right - odd3)
+            even1 = fused(turn1, odd1, left - even1)
+            even2 = fused(turn2, odd2, left - even2)
+            even3 = fused(turn3, odd3, left - even3)
+        store_lanes(work, 0, m, share * (even1 * even1 + odd1 * odd1 - turn1 * even1 * odd1))
+        store_lanes(work, 0, m + LANES, share * (even2 * even2 + odd2 * odd2 - turn2 * even2 * odd2))
+        store_lanes(work, 0, m + 2 * LANES, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")

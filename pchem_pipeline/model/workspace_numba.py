@@ -9,11 +9,13 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.lanes_numba import LANES
+
 # places in `Workspace.total`, the sums that an evaluation leaves besides score and information
 LOGLIK, SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(6)
 N_TOTAL = 6
 N_ROWS = 9
-LANES = 8  # doubles in the widest vector register
+N_SMALL = 10
 CAPACITY = 256  # columns of the table of an evaluation; a longer histogram goes through in pieces
 MAX_COMPONENTS = 201  # of which a value may be a mixture
 _MIN_COLUMNS = 256  # the frequencies of the starting points, a value's components, a table's columns
@@ -51,6 +53,8 @@ class Workspace(NamedTuple):
             ``e = x - mu - k/g``; the names above are their places.
         score: gradient of the log-likelihood in theta, shape (4,).
         information: observed information in theta, shape (4, 4).
+        small: scratch of a step, shape (N_SMALL, 4).
+        held: scratch of a step, the parameters that a bound holds, shape (4,).
     """
 
     rows: NDArray[np.float64]
@@ -58,25 +62,29 @@ class Workspace(NamedTuple):
     total: NDArray[np.float64]
     score: NDArray[np.float64]
     information: NDArray[np.float64]
+    small: NDArray[np.float64]
+    held: NDArray[np.bool_]
 
 
 @nb.njit(nogil=True, cache=True)
 def make_rows(n_bins: int) -> NDArray[np.float64]:
     """Return scratch rows for histograms of at most so many bins."""
-    return np.empty((N_ROWS, max(n_bins + 2, _MIN_COLUMNS)))
+    return np.empty((N_ROWS, n_bins + _MIN_COLUMNS))
 
 
 @nb.njit(nogil=True, cache=True)
 def make_workspace(rows: NDArray[np.float64]) -> Workspace:
     """Return a workspace with these rows."""
-    table = np.empty((MAX_COMPONENTS + 5, CAPACITY))
-    return Workspace(rows, table, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)))
+    table = np.empty((MAX_COMPONENTS + 5, CAPACITY + LANES))
+    small, held = np.empty((N_SMALL, 4)), np.empty(4, np.bool_)
+    return Workspace(rows, table, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)), small, held)
 
 
 @nb.njit(nogil=True, cache=True)
 def share_workspace(space: Workspace) -> Workspace:
     """Return a workspace of the same scratch, which keeps nothing between calls, with its own answers."""
-    return Workspace(space.rows, space.table, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)))
+    total, score, information = np.empty(N_TOTAL), np.empty(4), np.empty((4, 4))
+    return Workspace(space.rows, space.table, total, score, information, space.small, space.held)
 
 
 @nb.njit(nogil=True, cache=True)

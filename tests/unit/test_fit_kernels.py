@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numba as nb
 import numpy as np
 import pytest
 from drawn_pixels import draw, samples
@@ -12,10 +15,12 @@ from pchem_pipeline.model import (
     estep_numba,
     fisher_numba,
     goodness_numba,
+    lanes_math_numba,
     polish_numba,
     start_numba,
     workspace_numba,
 )
+from pchem_pipeline.model.lanes_numba import counting, least, load_lanes, most, store_lanes
 from pchem_pipeline.model.pchem import em_trace
 from pchem_pipeline.model.workspace_numba import SUM_E, SUM_EE, SUM_K, SUM_KE, SUM_KK, Histogram, Workspace
 
@@ -119,11 +124,19 @@ def test_compiled_evaluation_equals_plain() -> None:
     rows = workspace_numba.make_rows.py_func(histogram.n_bins)
     plain = workspace_numba.make_workspace.py_func(rows)
     assert estep_numba.evaluate.py_func(histogram, point, plain, 0.0) == pytest.approx(loglik, rel=1e-13)
-    for compiled_array, plain_array in zip(space[2:], plain[2:], strict=True):
+    for compiled_array, plain_array in zip(space[2:5], plain[2:5], strict=True):
         np.testing.assert_allclose(compiled_array, plain_array, rtol=1e-9, atol=1e-7)
 
 
-def test_compiled_table_equals_plain_at_every_width() -> None:
+def take_plain_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From here on loops in plain Python take their lanes from numpy; nothing can be compiled."""
+    for name in ("artanh_series", "lanes_exp", "lanes_log"):
+        plain = getattr(lanes_math_numba, name).py_func
+        for module in (lanes_math_numba, estep_numba):
+            monkeypatch.setattr(module, name, plain)
+
+
+def test_compiled_table_equals_plain_at_every_width(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(8)
     kernels = {
         3: estep_numba.table_sums_3,
@@ -132,26 +145,59 @@ def test_compiled_table_equals_plain_at_every_width() -> None:
         9: estep_numba.table_sums_9,
         12: estep_numba.table_sums_any,
     }
+    a, inverse, columns = 1.3, 0.9, 24
     for width, kernel in kernels.items():
-        table = rng.uniform(0.01, 2, (5 + width, 24))
-        table[5:] *= 10.0 ** rng.integers(-30, 30, 24)  # the logarithm over many powers of two
+        half = width // 2
+        table = rng.uniform(0.01, 2, (4 + width, columns))
+        table[1] = rng.uniform(-a / 2, a / 2, columns)
+        table[2] = rng.integers(0, 9, columns)
+        table[4:] *= 10.0 ** rng.integers(-30, 30, columns)  # the logarithm over many powers of two
         answers = []
-        for function in (kernel, kernel.py_func, estep_numba.table_sums_any):
-            totals = np.zeros(16)
-            function(table, 24, width, 1.3, totals)
+        for function in (kernel, estep_numba.table_sums_any, kernel.py_func):
+            totals = np.zeros(18)
+            if function is kernel.py_func:
+                take_plain_lanes(monkeypatch)
+            function(table, columns, width, a, inverse, totals)
             answers.append(totals)
+        monkeypatch.undo()
         np.testing.assert_allclose(answers[0], answers[1], rtol=1e-11)
         np.testing.assert_allclose(answers[0], answers[2], rtol=1e-11)
-        density = (table[5:] * table[1] ** np.arange(width)[:, None]).sum(axis=0)
-        assert answers[0][0] == pytest.approx(table[0] @ (table[4] + np.log(density)), rel=1e-13)
+        c, offset, place, level = table[:4]
+        low = np.maximum(place - half, 0)
+        d = offset + (place - low) * a
+        i = np.arange(width)[:, None]
+        terms = table[4:] * np.exp(i * offset * a * inverse)
+        density = terms.sum(axis=0)
+        loglik = level - (d - offset / 2) * offset * inverse + np.log(density)
+        first, second = ((terms * i**power).sum(axis=0) / density for power in (1, 2))
+        fourth = (terms * (i**2 - second) ** 2).sum(axis=0) / density
+        assert answers[0][0] == pytest.approx(c @ loglik, rel=1e-13)
+        expected = [c @ first, c @ second, c @ (low * first), c @ (d * first), c @ (low * d)]
+        np.testing.assert_allclose(answers[0][3:8], expected, rtol=1e-11)
+        assert answers[0][10] == pytest.approx(c @ ((second - first**2) * d), rel=1e-9)
+        assert answers[0][17] == pytest.approx(c @ fourth, rel=1e-9)
 
 
-def test_vector_log_is_the_logarithm() -> None:
-    x = np.exp(np.random.default_rng(1).uniform(-690, 690, 2000))
-    for function in (estep_numba.vector_log, estep_numba.vector_log.py_func):
-        np.testing.assert_allclose(
-            [function(v) for v in [*x, 1.0, 2.0, 0.5]], np.log([*x, 1.0, 2.0, 0.5]), rtol=1e-15, atol=1e-15
-        )
+def test_lanes_are_the_functions_that_they_are_named_after(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    table, plain = np.zeros((4, 2000)), np.zeros((4, 2000))
+
+    def fill(table: NDArray[np.float64]) -> None:
+        for i in range(0, table.shape[1], 8):
+            x = load_lanes(table, 0, i)
+            store_lanes(table, 1, i, lanes_math_numba.lanes_exp(x))
+            store_lanes(table, 2, i, lanes_math_numba.lanes_log(load_lanes(table, 1, i)))
+            store_lanes(table, 3, i, most(least(x, 1.0), -2.0) - counting())
+
+    table[0] = rng.uniform(-690, 690, 2000)
+    plain[0] = table[0]
+    nb.njit(fill)(table)
+    take_plain_lanes(monkeypatch)
+    fill(plain)
+    np.testing.assert_allclose(table[1], np.exp(table[0]), rtol=3e-15)
+    np.testing.assert_allclose(table[2], np.log(table[1]), rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(table[3], np.clip(table[0], -2, 1) - np.arange(2000) % 8)
+    np.testing.assert_allclose(plain, table, rtol=1e-14)
 
 
 def test_compiled_steps_equal_plain() -> None:
@@ -211,3 +257,11 @@ def test_chi_square_merges_to_five_and_keeps_the_total() -> None:
     assert goodness_numba.pearson(wide_seen, wide_expected, 20, 200.0) == (pytest.approx(3.6), 15)
     assert goodness_numba.normal_score(15.0, 15) == pytest.approx(0.0, abs=0.2)
     assert goodness_numba.normal_score(60.0, 15) > 4
+
+
+def test_no_kernel_lets_the_compiler_choose_the_bits() -> None:
+    # numba optimises a kernel again in every kernel that calls it, and which copy runs depends on what the
+    # process compiled or loaded before: with sums in any order, so would the last bits
+    kernels = sorted(Path(workspace_numba.__file__).parents[1].rglob("*_numba.py"))
+    assert len(kernels) > 20
+    assert [path.name for path in kernels if "fastmath" in path.read_text()] == []
