@@ -24,7 +24,7 @@ from pchem_pipeline.model.start_numba import regression_basis
 
 __all__ = ["EmTrace", "FitResult", "em_trace", "fit_histograms"]
 
-WARM_UP = 1  # EM steps before the first Newton step
+WARM_UP = 0  # EM steps before the first Newton step: the start is good enough without
 
 # Frames and degrees of freedom below which it matters that merging bins for the chi-square test hides part of
 # what the parameters know: it is half a degree of freedom or so.
@@ -100,12 +100,12 @@ def fit_histograms(
     """Estimate (H, g, mu, sigma) of every pixel from its histogram by maximum likelihood.
 
     The likelihood is that of the PCD at whole DN (Hendrickson et al. 2023, eq. X_density). A start from the
-    empirical characteristic function is improved by an EM step, eqs. (update_eqns) to (gamma_nk), and by
-    damped Newton steps with Louis' observed information (``algorithm: em``: by EM steps alone), until the
-    expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried and the likeliest is
-    kept; a pixel whose goodness of fit or read noise raises suspicion gets other starts. No pixel raises:
-    what cannot be fitted holds NaN and a reason. The answer for a pixel does not depend on the others in the
-    batch.
+    empirical characteristic function is improved by damped Newton steps with Louis' observed information, by
+    EM steps, eqs. (update_eqns) to (gamma_nk), where that does not help (``algorithm: em``: by EM steps
+    alone), until the expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried and
+    the likeliest is kept; a pixel whose goodness of fit or read noise raises suspicion gets other starts. No
+    pixel raises: what cannot be fitted holds NaN and a reason. The answer for a pixel does not depend on the
+    others in the batch.
 
     Samples that the model does not expect at all are left out (setting ``tail_guard``): a few outliers move
     nothing, and a pixel without any has the very estimates that it would have without the guard.

@@ -16,7 +16,7 @@ class FitSettings(Section):
 
     algorithm: Literal["newton", "em"] = Field(
         default="newton",
-        description="newton: a few EM steps, then a safeguarded Newton finish on the exact likelihood. "
+        description="newton: safeguarded Newton steps on the exact likelihood, EM steps where those do not help. "
         "em: the plain EM of the paper (slow when the read noise exceeds 0.4 e-)",
     )
     likelihood: Literal["density", "exact", "auto"] = Field(
