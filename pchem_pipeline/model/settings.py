@@ -16,8 +16,8 @@ class FitSettings(Section):
 
     algorithm: Literal["newton", "em"] = Field(
         default="newton",
-        description="newton: safeguarded Newton steps on the exact likelihood, EM steps where those do not help. "
-        "em: the plain EM of the paper (slow when the read noise exceeds 0.4 e-)",
+        description="newton: safeguarded Newton steps on the exact likelihood, EM steps where those do not "
+        "help. em: the plain EM of the paper (slow when the read noise exceeds 0.4 e-)",
     )
     likelihood: Literal["density", "exact", "auto"] = Field(
         default="density",
