@@ -91,3 +91,17 @@ def test_zero_workers_are_refused():
 def test_environment_is_measured():
     assert 1 <= available_workers() <= (os.cpu_count() or 1)
     assert peak_rss_bytes() > 10_000_000
+
+
+def take_too_much(number):
+    return bytearray(1 << 60)
+
+
+@pytest.mark.parametrize("backend", BACKENDS[:2])
+def test_a_lack_of_memory_is_one_line_with_its_cure(backend):
+    executor = make_executor(ComputeSettings(backend=backend, workers=1))
+    found = []
+    executor.map(take_too_much, [1], lambda item, outcome: found.append(outcome))
+    assert isinstance(found[0].error, IncompleteRunError)
+    assert str(found[0].error).startswith("out of memory; use fewer --workers, a smaller --max-memory")
+    assert "take_too_much" in found[0].trace

@@ -104,3 +104,20 @@ def test_the_limit_is_shared_by_the_workers():
     assert bytes_per_row(512, 5000, 2, 64, free.histogram) == bytes_per_row(
         512, 60_000, 2, 64, free.histogram
     )
+
+
+@pytest.mark.parametrize(
+    ("limit", "allowed", "mebibytes"),
+    [
+        (None, None, 640),
+        (8192, None, 640),
+        (400, None, 160),
+        (200, None, 16),
+        (400, 440, 100),
+        (300, 640, 60),
+    ],
+)
+def test_a_band_fits_into_the_memory_of_a_worker_and_of_the_run(limit, allowed, mebibytes):
+    content = {"input": {"files": ["a.raw"]}, "compute": {"max_memory": allowed}}
+    config = RunConfig.model_validate(content)
+    assert band_bytes(config, 2, None if limit is None else limit << 20) == mebibytes << 20
