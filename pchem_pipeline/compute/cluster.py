@@ -23,9 +23,9 @@ T = TypeVar("T")
 #: libraries that decide the bits of a result, or that must understand each other
 _LIBRARIES = ("pchem-pipeline", "numpy", "scipy", "numba", "zarr", "distributed")
 
-#: seconds between looks for results, between looks at the workers while no result comes, and without
-#: workers before it is said
-_POLL, _LOOK, _SAY = 0.01, 1.0, 5.0
+#: seconds between looks for results, between looks at the workers while no result comes (at first, and at
+#: most where one is on its way), and without workers before it is said
+_POLL, _LOOK, _LONGEST, _SAY = 0.01, 1.0, 16.0, 5.0
 #: share of a worker's memory above which dask gives it no more work
 _USABLE = 0.8
 
@@ -106,6 +106,16 @@ class DistributedExecutor:
             else:
                 time.sleep(_POLL)
 
+    def _outcome(self, future: Any) -> Outcome:
+        """Return what became of an item; a result dies with the worker that has it, so look at the workers."""
+        patience = _LOOK
+        while True:
+            try:
+                return _outcome(future, patience)
+            except TimeoutError:
+                self._patience.look(self._workers())
+                patience = min(2 * patience, _LONGEST)
+
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`.
 
@@ -119,7 +129,7 @@ class DistributedExecutor:
             futures = self._client.map(task, todo, pure=False)
             item_of = {future.key: item for future, item in zip(futures, todo, strict=True)}
             for future in self._completed(futures):
-                outcome = _outcome(future)
+                outcome = self._outcome(future)
                 if isinstance(outcome.error, OtherVersionsError):
                     raise outcome.error
                 on_result(item_of[future.key], outcome)
@@ -247,13 +257,13 @@ def _differences(expected: tuple[tuple[str, str], ...]) -> str:
     return f"a worker on {platform.node()} has {', '.join(other)}; install the same versions on all machines"
 
 
-def _outcome(future: Any) -> Outcome:
-    """Return what became of an item, also where its workers died."""
+def _outcome(future: Any, seconds: float) -> Outcome:
+    """Return what became of an item, also where its workers died; wait some seconds for it."""
     if future.cancelled():
         raise CancelledError
-    error = future.exception()
+    error = future.exception(timeout=seconds)
     if error is None:
-        outcome: Outcome = future.result()
+        outcome: Outcome = future.result(timeout=seconds)
         return outcome
     if type(error).__name__ == "KilledWorker":
         return Outcome(error=IncompleteRunError(_killed(error)), trace=str(error))
