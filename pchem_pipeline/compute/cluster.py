@@ -107,7 +107,7 @@ class DistributedExecutor:
                 time.sleep(_POLL)
 
     def _outcome(self, future: Any) -> Outcome:
-        """Return what became of an item; a result dies with the worker that has it, so look at the workers."""
+        """Return what became of an item; it may die with the worker that has it, so look at the workers."""
         patience = _LOOK
         while True:
             try:
