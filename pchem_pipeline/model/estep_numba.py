@@ -338,7 +338,7 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
     """Evaluate log-likelihood, E-step sums, score and observed information of one pixel.
 
     Args:
-        histogram: of the pixel.
+        histogram: of the pixel; its moments take part, too.
         theta: (log H, a, m, log sigma^2).
         space: scratch; out: sums, score and information.
         frames: leave the counts of each DN expected in so many frames in ``space.rows[0]``; nothing if 0.

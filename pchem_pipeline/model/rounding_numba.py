@@ -53,7 +53,13 @@ def rounding_bias(
     for i in range(n_bins):
         weights[i] *= n
         cumulative[i + 1] = cumulative[i] + weights[i]
-    histogram = Histogram(weights, cumulative, n_bins, float(first), n, 0.0, sigma * sigma)
+    total = cumulative[n_bins]
+    mean = variance = 0.0
+    for i in range(n_bins):
+        mean += weights[i] * places[i] / total
+    for i in range(n_bins):
+        variance += weights[i] * (places[i] - mean) ** 2 / total
+    histogram = Histogram(weights, cumulative, n_bins, float(first), total, mean, variance)
     space = make_workspace(make_rows(n_bins))
     theta = np.array([math.log(exposure), a, offset, 2.0 * math.log(sigma)])
     evaluate(histogram, theta, space, 0.0)
