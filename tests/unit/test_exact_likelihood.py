@@ -114,8 +114,11 @@ def test_few_dn_per_electron_have_their_own_starts():
     assert good.sum() >= 5
     pulls = (mine.conversion_gain - 1 / 1.2) / np.sqrt(mine.covariance[:, 1, 1])
     assert (np.abs(pulls[good]) < 5).all()
-    before = np.abs(plain.conversion_gain - 1 / 1.2) / np.sqrt(plain.covariance[:, 1, 1])
-    assert (~(before < 5)).sum() >= 3
+    assert abs(pulls[good].mean()) * np.sqrt(good.sum()) < 5
+    before = (plain.conversion_gain - 1 / 1.2) / np.sqrt(plain.covariance[:, 1, 1])
+    known = np.isfinite(before)
+    assert known.sum() >= 4
+    assert abs(before[known].mean()) * np.sqrt(known.sum()) > 5  # rounding biases the density
 
 
 def test_nothing_to_fit_stays_nothing():
