@@ -31,10 +31,10 @@ from pchem_pipeline.effects.evidence import SCORES, CodeResiduals, Evidence, Pix
 from pchem_pipeline.errors import InputError, PchEmError
 from pchem_pipeline.model.fit_status import FAILED, FitStatus
 from pchem_pipeline.model.histogram import histogram_frames
-from pchem_pipeline.model.pchem import fit_histograms
+from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
 
-__all__ = ["MINIMUM_BLOCKS", "UNTRUSTWORTHY", "observe", "observe_histograms"]
+__all__ = ["MINIMUM_BLOCKS", "UNTRUSTWORTHY", "fitted_maps", "observe", "observe_histograms"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -150,19 +150,8 @@ def _marginal(
     near: PixelMaps | None = None,
 ) -> tuple[Evidence, PixelLaws]:
     """Fit the histograms and compare them with their laws."""
-    start = None
-    if near is not None:
-        known = (near.quanta_exposure, near.conversion_gain, near.bias, near.read_noise_dn)
-        start = np.stack([values.ravel() for values in known], axis=1)
-    # every sample counts here: what the tail guard would leave out is what is looked for
-    settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
-    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
-    parameters = np.stack(
-        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
-    )
+    result, parameters, usable = _fitted(counts, origin, outside, wanted, fit, near)
     inside = counts.sum(axis=1)
-    usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
-    usable &= outside.sum(axis=1) <= _MOST_OUTSIDE * inside
     laws = pixel_laws(counts, origin, outside, parameters, usable)
     good = laws.good
     if not good.any():
@@ -197,8 +186,49 @@ def _marginal(
         code=residuals,
         time=None,
         z=in_order(marginal_statistics(laws, parameters[:, 0], residuals)),
+        covariance=result.covariance.reshape(*shape, 4, 4),
+        ambiguous=float(np.mean((result.fit_status[good] & FitStatus.BIAS_AMBIGUOUS) != 0)),
     )
     return evidence, laws
+
+
+def _fitted(
+    counts: NDArray[Any],
+    origin: IntArray,
+    outside: FloatArray,
+    wanted: NDArray[np.bool_],
+    fit: FitSettings | None,
+    near: PixelMaps | None,
+) -> tuple[FitResult, FloatArray, NDArray[np.bool_]]:
+    """Return the fit, its parameters (n, 4), and which pixels can be used."""
+    start = None
+    if near is not None:
+        known = (near.quanta_exposure, near.conversion_gain, near.bias, near.read_noise_dn)
+        start = np.stack([values.ravel() for values in known], axis=1)
+    # every sample counts here: what the tail guard would leave out is what is looked for
+    settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
+    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
+    parameters = np.stack(
+        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
+    )
+    usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
+    usable &= outside.sum(axis=1) <= _MOST_OUTSIDE * counts.sum(axis=1)
+    return result, parameters, usable
+
+
+def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:
+    """Return the plain fit of some frames, from nothing, as :func:`observe` makes it.
+
+    Args:
+        frames: codes (n, y, x), DN.
+        exclude: pixels not to look at, (y, x).
+    """
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
+    outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
+    origin = histograms.origin.ravel().astype(np.int64)
+    _, parameters, usable = _fitted(counts, origin, outside, ~exclude.ravel(), None, None)
+    return _maps(np.where(usable[:, None], parameters, np.nan), usable.reshape(exclude.shape))
 
 
 def _maps(parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelMaps:

@@ -29,19 +29,27 @@ class Refit:
         maps: H, g, mu, sigma of the pixels themselves.
         moved: by parameter: median change against the maps before, the same in standard errors of a pixel,
             and the unit.
+        covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
     """
 
     maps: PixelMaps
     moved: Mapping[str, Mapping[str, Any]]
+    covariance: NDArray[np.float64]
 
 
-def refit_maps(frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]) -> Refit:
+def refit_maps(
+    frames: NDArray[np.unsignedinteger],
+    maps: PixelMaps,
+    effects: Sequence[Effect],
+    covariance: NDArray[np.float64],
+) -> Refit:
     """Fit the pixels of some frames with effects in their law.
 
     Args:
         frames: (frame, y, x), DN.
         maps: plain fit of the same frames; pixels that are not usable stay so.
         effects: of the grown model.
+        covariance: of the plain fit, shape (y, x, 4, 4).
 
     Returns:
         New maps; the old ones where the effects cannot be fitted with.
@@ -52,7 +60,7 @@ def refit_maps(frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Se
     try:
         law = marginal_model(effects, pixel_maps(flat, maps.usable))
     except ConfigError:
-        return Refit(maps, {})
+        return Refit(maps, {}, covariance)
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
     fit = fit_grown(counts, histograms.origin.ravel(), flat, law, warm=True)
@@ -64,7 +72,8 @@ def refit_maps(frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Se
         name: _change(after[good] - before[good], error[good], unit)
         for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
     }
-    return Refit(PixelMaps(exposure, gain, bias, noise, good.reshape(shape)), moved)
+    new_maps = PixelMaps(exposure, gain, bias, noise, good.reshape(shape))
+    return Refit(new_maps, moved, fit.covariance[:, :4, :4].reshape(*shape, 4, 4))
 
 
 def expected_codes(

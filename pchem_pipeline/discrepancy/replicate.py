@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe import observe
+from pchem_pipeline.discrepancy.observe import fitted_maps, observe
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 from pchem_pipeline.simulate.chain import dn_dtype, simulate_block
@@ -29,6 +29,8 @@ class Acquisition:
         block_frames: frames in a block.
         bit_depth: bits of the ADC.
         integration_time: s.
+        beside: numbers of further frames from which, together with these, the pixels' fits are begun; None:
+            they are begun at the truth, which is faster, and the same where no pixel's bias can be mistaken.
     """
 
     numbers: NDArray[np.int64]
@@ -36,6 +38,7 @@ class Acquisition:
     block_frames: int
     bit_depth: int
     integration_time: float = 1.0
+    beside: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -58,15 +61,21 @@ class Replicate:
 
     def evidence(self) -> Evidence:
         """Simulate and observe."""
-        frames = simulate_frames(self.maps, self.effects, self.seed, self.acquisition)
-        taken = self.acquisition
+        taken, start = self.acquisition, self.maps
+        if taken.beside is None:
+            frames = simulate_frames(self.maps, self.effects, self.seed, taken)
+        else:
+            seen = np.union1d(taken.numbers, taken.beside)
+            frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
+            start = fitted_maps(frames, ~self.maps.usable)
+            frames = frames[np.isin(seen, taken.numbers)]
         return observe(
             frames,
             taken.numbers,
             n_run=taken.n_run,
             block_frames=taken.block_frames,
-            exclude=~self.maps.usable,
-            start=self.maps,
+            exclude=~start.usable,
+            start=start,
         )
 
     def __call__(self) -> dict[str, float]:

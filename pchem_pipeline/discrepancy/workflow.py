@@ -18,10 +18,11 @@ from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_
 from pchem_pipeline.discrepancy.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees, suspicious
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, correction, fit_set, tolerance
+from pchem_pipeline.discrepancy.likely_truth import likely_truth
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
-from pchem_pipeline.discrepancy.refit import expected_codes, refit_maps
+from pchem_pipeline.discrepancy.refit import Refit, expected_codes, refit_maps
 from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.result import Discrepancy
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -44,6 +45,7 @@ _TELLING = (
     4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
 )
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
+_MISTAKEN = 0.003  # share of pixels with an ambiguous bias from which replicates are fitted from nothing
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
@@ -113,15 +115,18 @@ class _Search:
     mapper: Mapper
     left_out: dict[str, str] = field(default_factory=dict)
     n_replicates: int = 0
+    mistaken: float = 0.0  # share of pixels whose bias may be off by an electron
 
     def run(self) -> Discrepancy:
         """Go through the rounds."""
         classes = candidate_classes(self.settings)
-        train, test, final = (self._observe(part) for part in self._parts())
-        self._check(train)
         # parameters of a third of the frames scatter too much to stand for the pixels
-        plain = self._observe(self._seen()).maps
-        maps = refit_maps(self.stack[self._seen()], plain, self.model).maps if self.model else plain
+        plain = self._observe(self._seen())
+        self._check(plain)
+        self.mistaken = plain.ambiguous
+        train, test, final = (self._observe(part, plain.maps) for part in self._parts())
+        fit = self._refit(plain)
+        maps = likely_truth(fit.maps, fit.covariance)
         null, names = self._null(maps, "r0", self.settings.replicates, (train, test, final))
         z = Measured(*(self._row(evidence, names) for evidence in (train, test, final)))
         first = null
@@ -141,18 +146,19 @@ class _Search:
                 break
             added = self._added(laboratory, choice, shifts, self._noise(null, 2))
             before, self.model = self.model, (*self.model, *(h.effect for h in added.hypotheses))
-            maps = refit_maps(self.stack[self._seen()], plain, self.model).maps
+            fit = self._refit(plain)
+            maps = likely_truth(fit.maps, fit.covariance)
             grown, _ = self._null(
                 maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), first
             )
             added, grown = self._corrected(added, null, grown, z)
             self.model = (*before, *(h.effect for h in added.hypotheses))
-            refit = refit_maps(self.stack[self._seen()], plain, self.model)
-            maps = refit.maps
-            rounds.append(Round(choice, added, tuple(hypotheses), null, grown, refit.moved))
+            fit = self._refit(plain)
+            maps = likely_truth(fit.maps, fit.covariance)
+            rounds.append(Round(choice, added, tuple(hypotheses), null, grown, fit.moved))
             null = grown
             search = still = disagrees(null, z, limit, self._tolerance(rounds))
-        return self._result(rounds, first, null, z, places, train, maps, still)
+        return self._result(rounds, first, null, z, places, train, fit.maps, still)
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -163,16 +169,33 @@ class _Search:
         """Return the positions of the train and test frames."""
         return np.sort(np.concatenate([self.splits.train, self.splits.test]))
 
-    def _observe(self, part: NDArray[np.int64]) -> Evidence:
+    def _observe(self, part: NDArray[np.int64], maps: PixelMaps | None = None) -> Evidence:
+        """Observe some frames, and as replicates are observed: near known maps, and the same pixels.
+
+        A fit from nothing finds a bias that is off by an electron more often than one near the truth: then
+        frames and replicates would differ without any effect.
+        """
         return observe(
-            self.stack[part], self.numbers[part], n_run=self.n_run, block_frames=self.splits.block_frames
+            self.stack[part],
+            self.numbers[part],
+            n_run=self.n_run,
+            block_frames=self.splits.block_frames,
+            exclude=None if maps is None else ~maps.usable,
+            start=maps,
         )
 
-    def _check(self, train: Evidence) -> None:
-        usable = int(train.maps.usable.sum())
+    def _refit(self, plain: Evidence) -> Refit:
+        """Return the fit of the seen frames under the present model."""
+        assert plain.covariance is not None
+        if not self.model:
+            return Refit(plain.maps, {}, plain.covariance)
+        return refit_maps(self.stack[self._seen()], plain.maps, self.model, plain.covariance)
+
+    def _check(self, seen: Evidence) -> None:
+        usable = int(seen.maps.usable.sum())
         if usable < _FEWEST_PIXELS:
             raise InputError(
-                f"{usable} of {train.maps.usable.size} pixels have a usable fit on the train frames, "
+                f"{usable} of {seen.maps.usable.size} pixels have a usable fit, "
                 f"fewer than {_FEWEST_PIXELS}: nothing can be compared; see fit_status, or take more frames"
             )
 
@@ -196,14 +219,15 @@ class _Search:
         """Simulate and observe the present model ``count`` times."""
         text = "|".join(e.model_dump_json() for e in self.model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        taken = self._acquisition()
+        if self.mistaken > _MISTAKEN:
+            taken = replace(taken, beside=self.numbers[self.splits.test])
         tasks = [
-            Replicate(
-                f"{prefix}-null-{digest}-{i}", maps, self.model, self._seed(prefix, i), self._acquisition()
-            )
+            Replicate(f"{prefix}-null-{digest}-{i}", maps, self.model, self._seed(prefix, i), taken)
             for i in range(count)
         ]
         self.n_replicates += count
-        vectors = []
+        vectors: list[Mapping[str, float]] = []
         for result in self.mapper(tasks):
             if isinstance(result, Exception):
                 raise result

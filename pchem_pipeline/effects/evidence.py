@@ -150,6 +150,8 @@ class Evidence:
         z: the vector of statistics, each about N(0, 1) where the PCD holds, by name, in a fixed order (names
             in :mod:`pchem_pipeline.discrepancy.catalogue`). A statistic that these data cannot give is
             absent.
+        covariance: of the pixels' (H, g, mu, sigma) in ``maps``, shape (y, x, 4, 4); None: not known.
+        ambiguous: share of the usable pixels whose bias may be off by an electron.
     """
 
     maps: PixelMaps
@@ -163,6 +165,8 @@ class Evidence:
     code: CodeResiduals
     time: TimeSeries | None
     z: Mapping[str, float] = field(default_factory=dict)
+    covariance: NDArray[np.float64] | None = None
+    ambiguous: float = 0.0
 
     def strongest(self, *names: str) -> float:
         """Return the largest |z| among the named statistics (0 where these data give none of them)."""
