@@ -191,7 +191,6 @@ def test_without_integration_time(shell, frames):
     shell.ok("run", "frames", "--roi", "0:8,0:8", "--until", "maps", "--quiet")
     store = RunStore.open(shell.folder / "run.zarr")
     assert np.nanmedian(store.read("maps/read_noise_e")) > 0
-    assert np.isnan(store.read("maps/dark_current")).all()
 
 
 def test_a_run_stops_where_it_was_told_to(shell, frames):
