@@ -234,7 +234,7 @@ def main() -> None:
     )
     parser.add_argument("frames", type=Path, help="raw file, uint16, little endian, with its sidecar")
     parser.add_argument("--header", default=0, help="bytes before the first frame")
-    parser.add_argument("--pixels", type=int, default=400, help="pixels for the peers of the fit")
+    parser.add_argument("--pixels", type=int, default=24, help="pixels for the peers of the fit")
     parser.add_argument("--rows", type=int, default=16, help="rows for dask.array")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--no-report", dest="report", action="store_false", help="stop at the maps")
