@@ -1,13 +1,13 @@
 """How the pass over the camera file and the fit scale with workers: threads, processes, a local dask cluster.
 
-A stack is made of a simulated block of 64 x 64 pixels and 250 frames, repeated in space and time (or a raw
+A stack is made of a simulated block of 64 x 64 pixels and 1,000 frames, repeated in space and time (or a raw
 file of yours with its sidecar is taken). Each backend runs it with each number of workers, in a process of
 its own; printed are seconds of the stages, start-up of the command left out, and the gain over the fewest
 workers; drawn, too. Every result is compared with the first one to the bit. With threads and processes one
 process reads the file, once; a cluster reads it once for the hash and once by bands of rows, which its
 workers count.
 
-    python scripts/bench/bench_scaling.py --output scaling                    # 512 x 512 pixels, 4,000 frames
+    python scripts/bench/bench_scaling.py --output scaling                    # 512 x 512 pixels, 1,000 frames
     python scripts/bench/bench_scaling.py --frames 500 --side 64 --repeat 1   # a look
 """
 
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from bench_growth import block
+from bench_growth import write_stack
 from running import Outcome, evict, machine, plain_numbers, run_pchem, save_figure
 
 from pchem_pipeline.compute.environment import prepare_environment
@@ -47,11 +47,8 @@ class Row:
 
 def make_stack(folder: Path, frames: int, side: int) -> Path:
     """Write a simulated stack as a raw file."""
-    raw, piece = folder / "stack.raw", block(side)
-    with raw.open("wb") as stream:
-        for start in range(0, frames, len(piece)):
-            stream.write(np.ascontiguousarray(piece[: frames - start]).data)
-    Path(f"{raw}.json").write_text(json.dumps({"shape": [side, side], "dtype": "uint16"}))
+    raw = folder / "stack.raw"
+    write_stack(raw, frames, side)
     return raw
 
 
@@ -139,7 +136,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("raw", type=Path, nargs="?", help="raw file with its sidecar [a simulated stack]")
-    parser.add_argument("--frames", type=int, default=4000, help="of the simulated stack")
+    parser.add_argument("--frames", type=int, default=1000, help="of the simulated stack")
     parser.add_argument("--side", type=int, default=512, help="rows and columns of the simulated stack")
     parser.add_argument("--tile", type=int, default=64, help="run.tile")
     parser.add_argument("--workers", default="1,2")
