@@ -4,7 +4,7 @@ Some frames of a raw file are written as TIFF (zlib), HDF5 (bitshuffle with LZ4)
 in whole frames: by the library itself on one thread, by ours on one thread, and by ours with the hash of the
 bytes on several threads, as ``pchem run`` does.
 
-    python scripts/bench/bench_formats.py /data/full/frames/frames.raw --frames 200 --threads 2
+    python scripts/bench/bench_formats.py /data/full/frames/frames.raw --frames 200 --output formats
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from running import machine
+from running import machine, save_figure
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -80,8 +80,23 @@ def seconds(call: Callable[[], object]) -> float:
     return min(times)
 
 
+def draw(folder: Path, found: dict[str, list[float]], threads: int) -> None:
+    """Draw the speeds side by side."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(5.5, 3), layout="constrained")
+    labels = ("bare decoder", "ours", f"ours with hash, {threads} threads")
+    for place, (label, colour) in enumerate(zip(labels, ("0.65", "tab:blue", "tab:orange"), strict=True)):
+        values = [speeds[place] for speeds in found.values()]
+        axes.bar(np.arange(len(found)) + 0.27 * (place - 1), values, 0.25, label=label, color=colour)
+    axes.set_xticks(range(len(found)), list(found))
+    axes.set_ylabel("MB/s of decoded samples")
+    axes.legend(frameon=False, fontsize=8)
+    save_figure(figure, folder, "formats")
+
+
 def main() -> None:
-    """Measure and print."""
+    """Measure, print and draw."""
     prepare_environment()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -89,6 +104,7 @@ def main() -> None:
     parser.add_argument("raw", type=Path, help="raw file, uint16, with its sidecar")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--output", type=Path, default=Path("bench-formats"), help="folder of the figure")
     given = parser.parse_args()
 
     from pchem_pipeline.frames.open import open_frames
@@ -100,6 +116,7 @@ def main() -> None:
     print(machine())
     print(f"{stack.shape[0]} frames of {stack.shape[1]} x {stack.shape[2]}; MB/s of decoded samples")
     print(f"{'file':<12}{'bare':>8}{'ours':>8}{'ours + hash':>13}  ({given.threads} threads)")
+    found: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="bench-formats-") as folder:
         for name, write in FORMATS.items():
             path = Path(folder) / name
@@ -117,7 +134,9 @@ def main() -> None:
                 once.identity()
 
             speeds = [stack.nbytes / 1e6 / seconds(call) for call in (bare, ours, hashed)]
+            found[name] = speeds
             print(f"{name:<12}{speeds[0]:>8.0f}{speeds[1]:>8.0f}{speeds[2]:>13.0f}")
+    draw(given.output, found, given.threads)
 
 
 if __name__ == "__main__":
