@@ -103,7 +103,9 @@ class SetFit:
             for h, c, is_there in zip(self.hypotheses, self.factors, there, strict=True)
             if is_there
         ]
-        largest = int(np.argmax(self.factors / self.stderr))
+        known = self.stderr > 0.0
+        ratio = np.divide(self.factors, self.stderr, out=np.zeros(self.factors.size), where=known)
+        largest = int(np.argmax(ratio))
         return kept or [(self.hypotheses[largest], max(float(self.factors[largest]), _NEXT_TO_NOTHING))]
 
     def settled(self, close: float) -> bool:
