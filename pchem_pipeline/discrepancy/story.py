@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.disagreement import Measured, misfits
+from pchem_pipeline.discrepancy.disagreement import Measured, contradicted, misfits
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, tolerance
 from pchem_pipeline.discrepancy.gap import Gap, GapMetric
 from pchem_pipeline.discrepancy.naming import Choice, Rival
@@ -75,12 +75,13 @@ def tell(
     metric = GapMetric(first, n_samples)
     before = metric.gap(z.final, first.mean, first.replicates)
     after = metric.gap(z.final, last.mean, last.replicates)
-    steps = _steps(rounds, metric, z, settings, before, after)
     both = z.both
     pulls = first.pulls(both, splits=2), last.pulls(both, splits=2)
+    unfinished = still and after.value > max(after.floor, _LARGEST_REST * before.value)
+    steps = _steps(rounds, metric, z, settings, before, after, pulls[1] if unfinished else None)
     rest = [(name, float(pull)) for name, pull in zip(first.names, pulls[1], strict=True)]
     rest.sort(key=lambda item: -abs(item[1]))
-    verdict = _verdict(steps, still, before, after)
+    verdict = _verdict(steps, still, unfinished)
     named = {s.effect.tag for s in steps if s.effect is not None}
     tentative = {h.tag for r in rounds for h in r.added.hypotheses} - named
     return Discrepancy(
@@ -111,8 +112,12 @@ def _steps(
     settings: DiscrepancySettings,
     before: Gap,
     after: Gap,
+    rest: FloatArray | None,
 ) -> tuple[Step, ...]:
-    """Return one step for every added effect, the weightiest of a round first."""
+    """Return one step for every added effect, the weightiest of a round first.
+
+    ``rest``: the pulls that remain at the end, where they are too many to call the model complete.
+    """
     steps: list[Step] = []
     mean = metric.null.mean
     gap = before
@@ -131,7 +136,11 @@ def _steps(
                 now = metric.gap(z.final, this.grown.mean, this.grown.replicates)
             else:
                 now = metric.gap(z.final, mean, this.null.replicates)
-            steps.append(_step(this, int(member), metric, z, shift, gap, now, settings))
+            closed = gap.value - now.value
+            stands = rest is None or (
+                closed > after.value and not contradicted(this.null, parts[member], rest)
+            )
+            steps.append(_step(this, int(member), metric, z, shift, gap, now, settings, stands))
             gap = now
     return tuple(steps)
 
@@ -149,6 +158,7 @@ def _step(
     before: Gap,
     after: Gap,
     settings: DiscrepancySettings,
+    stands: bool,
 ) -> Step:
     added = this.added.hypotheses[member]
     rivals = this.choice.rivals_of(added.tag)
@@ -156,7 +166,7 @@ def _step(
     kept = _ambiguous_set(rivals, settings.certainty)
     parts = this.added.parts
     allowed = tolerance(parts, settings.model_error)
-    fits = not misfits(this.grown, z, parts[member], settings.significance, allowed)
+    fits = stands and not misfits(this.grown, z, parts[member], settings.significance, allowed)
     named = len(kept) == 1 and fits
     candidates = tuple(
         Candidate(
@@ -227,12 +237,10 @@ def _comparisons(
     return runner_up, placebo
 
 
-def _verdict(steps: Sequence[Step], still: bool, before: Gap, after: Gap) -> Verdict:
+def _verdict(steps: Sequence[Step], still: bool, unfinished: bool) -> Verdict:
     if not steps:
         return "unexplained" if still else "consistent"
-    if any(not step.fits for step in steps):
-        return "unexplained"
-    if still and after.value > after.floor and after.value > _LARGEST_REST * before.value:
+    if unfinished or any(not step.fits for step in steps):
         return "unexplained"
     return "ambiguous" if any(s.effect is None for s in steps) else "named"
 

@@ -5,6 +5,10 @@ whole frame) is projected out. Cuts are added one at a time, that which lowers t
 (binary segmentation: Scott and Knott 1974; Fryzlewicz 2014), with all levels fitted anew after each, so that
 a jump in one series is not taken for jumps in the others. At the end each cut is moved to its best place
 between its neighbours and dropped if it no longer pays.
+
+Contrasts do not tell a jump of one series from the opposite jump of all the others. So the levels are those
+of the series themselves: wherever one was cut all may jump, beside a smooth common mode, and what is no jump
+against its error is taken out again.
 """
 
 from __future__ import annotations
@@ -18,6 +22,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["Steps", "find_steps", "noise_variance"]
+
+
+# cosines of the common mode, and the errors that a jump must be large
+_WAVES = 12
+_JUMP = 4.0
 
 
 @dataclass(frozen=True)
@@ -79,11 +88,71 @@ def find_steps(
         starts[found[2]] = sorted([*starts[found[2]], found[1]])
     for _ in range(2):
         _refine(contrast, starts, bonus, least)
-    levels, _ = _fitted(contrast, starts)
+    if sum(len(s) for s in starts) == m:
+        return [Steps(np.zeros(1, np.int64), np.zeros(1)) for _ in range(m)]
+    starts, levels = _with_common(series, starts, variance * m / (m - 1.0))
     return [
         Steps(np.array(begins, np.int64), _centred(level, begins, n))
         for level, begins in zip(levels, starts, strict=True)
     ]
+
+
+def _with_common(
+    series: NDArray[np.float64], starts: list[list[int]], variance: float
+) -> tuple[list[list[int]], list[NDArray[np.float64]]]:
+    """Return which series jump at the cuts, and the levels of all, the common mode included.
+
+    Least squares in which the common mode counts less, by as much as it is noisier than a mean of ``m`` white
+    series, and may wander smoothly (a few cosines).
+    """
+    n, m = series.shape
+    noise = noise_variance(series.mean(axis=1))
+    weight = min(1.0, float(np.sqrt(variance / m / noise))) if noise > 0 else 1.0
+    metric = np.eye(m) - (1.0 - weight) / m
+    waves = np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(1, _WAVES + 1)) / n)
+    common = np.concatenate([waves[:, None, :] * row.sum() for row in metric], axis=1).reshape(n * m, _WAVES)
+    cuts = _together(sorted({cut for begins in starts for cut in begins[1:]}))
+    starts = [[0, *cuts] for _ in range(m)]
+    while True:
+        segments = np.concatenate(
+            [_indicators(begins, n, metric[:, q]) for q, begins in enumerate(starts)], axis=1
+        )
+        design = np.concatenate([segments, common], axis=1)
+        inverse = np.linalg.pinv(design.T @ design, rcond=1e-10, hermitian=True)
+        found = inverse @ (design.T @ (series @ metric).ravel())
+        owner = np.repeat(np.arange(m), [len(begins) for begins in starts])
+        levels = [found[: owner.size][owner == q] for q in range(m)]
+        weakest: dict[int, tuple[float, int]] = {}
+        place = 0
+        for q, (begins, level) in enumerate(zip(starts, levels, strict=True)):
+            here = np.arange(place, place + len(begins))
+            place += len(begins)
+            spread = np.diag(inverse)[here]
+            errors = variance * (spread[1:] + spread[:-1] - 2.0 * inverse[here[1:], here[:-1]])
+            for cut, square in zip(begins[1:], np.diff(level) ** 2 / errors, strict=True):
+                weakest[cut] = min(weakest.get(cut, (np.inf, q)), (float(square), q))
+        # one series a cut: the others' jumps are the surer without it
+        dropped = {(cut, q) for cut, (square, q) in weakest.items() if square < _JUMP**2}
+        if not dropped:
+            return starts, levels
+        starts = [[cut for cut in begins if (cut, q) not in dropped] for q, begins in enumerate(starts)]
+
+
+def _together(cuts: list[int]) -> list[int]:
+    """Return the cuts with one in place of those that are next to each other."""
+    groups: list[list[int]] = []
+    for cut in cuts:
+        if groups and cut - groups[-1][-1] <= 1:
+            groups[-1].append(cut)
+        else:
+            groups.append([cut])
+    return [group[len(group) // 2] for group in groups]
+
+
+def _indicators(begins: list[int], n: int, row: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the columns of a design that one series' levels have, (n * m, levels)."""
+    inside = np.repeat(np.eye(len(begins)), np.diff([*begins, n]), axis=0)
+    return (inside[:, None, :] * row[:, None]).reshape(n * row.size, len(begins))
 
 
 def _centred(levels: NDArray[np.float64], starts: list[int], n: int) -> NDArray[np.float64]:

@@ -219,3 +219,21 @@ def test_rare_repeats_are_simulated_in_their_mean_number():
     assert (len(many.frames), share) == (20, pytest.approx(0.02 * 999 / 20))
     listed = RepeatedFrames(frames=(3, 9))
     assert listed.representative(numbers) == (listed, 1.0)
+
+
+@pytest.mark.parametrize("noise_of_all", [0.0, 0.6])
+def test_steps_of_pairs_of_series_are_told_from_opposite_steps_of_the_others(noise_of_all):
+    rng = np.random.default_rng(8)
+    first, second = np.zeros(1200), np.zeros(1200)
+    for place in (150, 420, 700, 1000):
+        first[place:] = 1.0 - first[place]
+    for place in (300, 610):
+        second[place:] = 1.0 - second[place]
+    levels = np.stack([first, second, first, second], axis=1)
+    common = (1e-3 * np.arange(1200) + noise_of_all * rng.standard_normal(1200))[:, None]
+    found = find_steps(levels + common + 0.25 * rng.standard_normal(levels.shape))
+    for q, steps in enumerate(found):
+        profile = np.repeat(steps.levels, np.diff([*steps.starts, 1200]))
+        apart = profile - (levels[:, q] - levels[:, q].mean())
+        # what the contrasts leave open is a constant: half a jump wrong at every cut if it were taken
+        assert np.sqrt(np.mean(apart**2)) < 0.1

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
+from pchem_pipeline.discrepancy.disagreement import contradicted
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
 from pchem_pipeline.discrepancy.gap import GapMetric
 from pchem_pipeline.discrepancy.naming import choose, score_set
@@ -231,3 +232,13 @@ def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None
 
 def test_every_statistic_belongs_to_a_family() -> None:
     assert {s.family for s in STATISTICS.values()} == set(FAMILIES)
+
+
+def test_an_effect_that_leaves_much_in_its_own_statistics_is_contradicted() -> None:
+    names = ("shape.C2.mean", "shape.C3.mean", "shape.He4.mean", "code.period16")
+    null = NullModel.from_replicates(names, np.random.default_rng(1).standard_normal((400, 4)))
+    counts = np.array([20.0, 1.0, 0.0, 0.0])
+    assert contradicted(null, counts, np.array([0.0, -16.0, 0.0, 0.0]))
+    # a little is the rest of a strong effect, and what is elsewhere is another one's
+    assert not contradicted(null, counts, np.array([3.0, -5.0, 0.0, 0.0]))
+    assert not contradicted(null, counts, np.array([0.0, 0.0, 30.0, 30.0]))
