@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.electrons import thresholds
@@ -85,7 +87,10 @@ def cluster_edges(
     unit = "e⁻" if in_electrons else "DN"
     low, high, last = cell_range(exposure, gain, bias, sigma)
     if counts is not None and counts.sum() > 0:
-        _bars(axes, counts, origin)
+        # bars beyond the axis would only make the files large
+        first = int(np.clip(np.floor(low) - origin, 0, counts.size - 1))
+        last_bar = int(np.clip(np.ceil(high) - origin, first, counts.size - 1))
+        _bars(axes, counts, origin, slice(first, last_bar + 1))
     x = np.linspace(low, high, 1200)
     axes.plot(
         x,
@@ -127,10 +132,10 @@ def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple
     return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last
 
 
-def _bars(axes: Axes, counts: NDArray[Any], origin: int, label: str = "frames") -> None:
-    """Draw a normalised histogram of DN as gray bars of 1 DN."""
-    edges = origin + np.arange(counts.size + 1) - 0.5
-    axes.stairs(counts / counts.sum(), edges, fill=True, color=GRAY, label=label)
+def _bars(axes: Axes, counts: NDArray[Any], origin: int, where: slice) -> None:
+    """Draw these bins of a histogram of DN, normalised with all of them, as gray bars of 1 DN."""
+    edges = (origin + np.arange(counts.size + 1) - 0.5)[where.start : where.stop + 1]
+    axes.stairs(counts[where] / counts.sum(), edges, fill=True, color=GRAY, label="frames")
 
 
 def _empty(figure: Figure, axes: Axes, text: str) -> Figure:
@@ -196,9 +201,9 @@ def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -
             axes.set(xticks=[], yticks=[])
         return
     where = shown_bins(pixel.counts)
-    _bars(top, pixel.counts, pixel.origin)
     dn = pixel.origin + np.arange(pixel.counts.size)
     low, high = dn[where][0] - 0.5, dn[where][-1] + 0.5
+    _bars(top, pixel.counts, pixel.origin, where)
     top.set_xlim(low, high)
     remarks = [f"{total:,} {'samples' if pixel.channel else 'frames'}"]
     outside = total - int(pixel.counts[where].sum())
@@ -228,7 +233,7 @@ def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) 
     limit = float(np.clip(1.15 * np.max(np.abs(residual), initial=0.0), 3.5, 12.0))
     strip.axhspan(-2.0, 2.0, color="#EDEDED", linewidth=0)
     strip.axhline(0.0, color=BLACK, linewidth=0.6)
-    strip.vlines(dn[where][enough], 0.0, np.clip(residual, -limit, limit), color=BLUE, linewidth=0.7)
+    _sticks(strip, dn[where][enough], np.clip(residual, -limit, limit))
     beyond = np.abs(residual) > limit
     if beyond.any():
         strip.plot(
@@ -240,6 +245,13 @@ def _residual_strip(strip: Axes, pixel: PixelFit, dn: FloatArray, where: slice) 
         )
         note(strip, f"× {int(beyond.sum())} beyond {limit:.0f} σ")
     strip.set_ylim(-limit, limit)
+
+
+def _sticks(axes: Axes, x: FloatArray, y: FloatArray) -> None:
+    """Draw lines from zero to each value, as one path: a fourth of the SVG that a path each takes."""
+    ends = np.stack([np.repeat(x, 2), np.stack([np.zeros_like(y), y], axis=1).ravel()], axis=1)
+    codes = np.tile([Path.MOVETO, Path.LINETO], x.size)
+    axes.add_patch(PathPatch(Path(ends, codes), fill=False, edgecolor=BLUE, linewidth=0.7, zorder=2))
 
 
 def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
