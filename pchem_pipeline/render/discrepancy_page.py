@@ -73,7 +73,8 @@ def discrepancy_view(data: DiscrepancyData, draw: Callable[[Exhibit], Drawn]) ->
         rows = tables.get(id_, [])
         empty = "" if shown or rows else _EMPTY[id_]
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
-    return DiscrepancyView(level, name, headline(data.found), key_facts(data.found), remarks(data), parts)
+    sentence = headline(data.found).replace(" -> ", " → ")
+    return DiscrepancyView(level, name, sentence, key_facts(data.found), remarks(data), parts)
 
 
 _EMPTY = {

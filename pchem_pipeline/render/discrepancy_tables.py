@@ -9,7 +9,7 @@ from pchem_pipeline.render.discrepancy_data import DiscrepancyData
 from pchem_pipeline.render.discrepancy_text import gap_words, parameter_name, probability_words
 from pchem_pipeline.render.findings import Findings, Place, Step
 from pchem_pipeline.render.tables import Table
-from pchem_pipeline.render.wording import count, measured, short, unit_text
+from pchem_pipeline.render.wording import count, measured, short, signed, unit_text
 
 __all__ = ["discrepancy_tables", "place_words"]
 
@@ -54,16 +54,12 @@ def _frame_words(frames: Sequence[int]) -> str:
     return f"{count(len(frames), 'frame')} from {min(frames)} to {max(frames)}"
 
 
-def _sd(z: float) -> str:
-    return f"{z:+.1f}".replace("-", "−") if math.isfinite(z) else "not known"
-
-
 def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
     rows = tuple(
         (
             place.sentence or _sentence(data, place.statistic),
             place.channel or data.statistics.get(place.statistic, ("", ""))[0],
-            _sd(place.z),
+            signed(place.z),
             probability_words(place.p),
             place_words(place) or "everywhere",
             place.statistic,
@@ -188,7 +184,7 @@ def _moved(steps: Sequence[Step]) -> Table:
                     f"{parameter_name(each.name)}{f' ({unit})' if unit else ''}",
                     step.effect,
                     short(each.median) if math.isfinite(each.median) else "not known",
-                    _sd(each.in_stderr),
+                    signed(each.in_stderr),
                 )
             )
     return Table(
@@ -213,7 +209,7 @@ def _untestable(data: DiscrepancyData) -> Table:
 
 def _unexplained(places: Sequence[Place]) -> Table:
     rows = tuple(
-        (place.sentence or place.statistic, _sd(place.z), place_words(place), place.statistic)
+        (place.sentence or place.statistic, signed(place.z), place_words(place), place.statistic)
         for place in places[:_MOST_PLACES]
     )
     return Table(

@@ -270,7 +270,8 @@ def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
         fits = all(len(re.sub(r"\$[^$]*\$", "MM", pair)) < 0.66 * width_mm for pair in pairs)
         lines += pairs if fits else words
     if pixel.status:
-        lines += textwrap.wrap(f"status: {plain(pixel.status)}", max(20, int(width_mm * 0.6)))[:2]
+        letters = max(20, int(width_mm * 0.6))
+        lines += textwrap.wrap(f"status: {plain(pixel.status)}", letters, max_lines=5, placeholder=" …")
     return "\n".join(lines)
 
 

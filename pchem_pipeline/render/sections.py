@@ -76,6 +76,7 @@ def _summary(material: Material) -> Section:
         "numbers": key_numbers(data),
         "flags": flags(data),
         "verdict": material.view,
+        "effects": data.discrepancy.found.effects if data.discrepancy else (),
     }
     return Section("summary", "Is this sensor all right, and can I believe it?", "summary", content)
 

@@ -13,7 +13,16 @@ from pchem_pipeline.render.map_figures import status_counts
 from pchem_pipeline.render.ranges import finite
 from pchem_pipeline.render.trust_figures import noise_shares
 from pchem_pipeline.render.verdict import summaries
-from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol, unit_text
+from pchem_pipeline.render.wording import (
+    count,
+    measured,
+    percent,
+    scientific,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
 
 __all__ = ["Table", "provenance_tables", "result_tables", "size_words"]
 
@@ -207,7 +216,7 @@ def _moments(data: ReportData) -> Table:
             seen, difference = "", ""
         elif error:
             seen = measured(float(observed), float(error))
-            difference = f"{(float(observed) - predicted) / float(error):+.1f}".replace("-", "−")
+            difference = signed((float(observed) - predicted) / float(error))
         else:
             seen, difference = short(float(observed), 5), ""
         rows.append(
@@ -242,10 +251,12 @@ def _electrons(data: ReportData) -> Table:
     expected = np.asarray(arrays["electron_pmf_map"]) if "electron_pmf_map" in arrays else None
     seen = np.flatnonzero(mass > 1e-3)
     last = int(seen[-1]) if seen.size else 0
+    samples = float(np.sum(arrays["electron_counts"])) if "electron_counts" in arrays else 0.0
+    errors = np.sqrt(mass * (1.0 - mass) / samples) if samples else np.full(mass.shape, np.nan)
     rows = [
         (
             str(int(k[i])),
-            f"{mass[i]:.5f}",
+            measured(float(mass[i]), float(errors[i])) if samples else f"{mass[i]:.5f}",
             f"{pmf[i]:.5f}",
             f"{expected[i]:.5f}" if expected is not None else "",
         )
@@ -342,18 +353,18 @@ def _status(data: ReportData) -> Table:
     total = status.size
     unfitted = int(data.unfitted.sum())
     good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
-    rows: list[tuple[str, ...]] = [("good fit", f"{good:,}", percent(good, total), "yes")]
+    rows: list[tuple[str, ...]] = [("good fit", f"{good:,}", percent(good, total), f"{good:,}")]
     if unfitted:
-        rows.append(("not fitted yet", f"{unfitted:,}", percent(unfitted, total), "no"))
+        rows.append(("not fitted yet", f"{unfitted:,}", percent(unfitted, total), "none"))
+    kept = status[(status & data.failed_mask) == 0]
     for bit, text, n in status_counts(status, data.status_words):
-        rows.append(
-            (text, f"{n:,}", percent(n, total), "no" if bit & data.failed_mask else "yes, with caution")
-        )
+        usable = int(((kept & bit) != 0).sum())
+        rows.append((text, f"{n:,}", percent(n, total), f"{usable:,}, with caution" if usable else "none"))
     return Table(
         "failures",
         "Fit status by reason",
         "A pixel can have several reasons and then counts for each.",
-        ("reason", "pixels", "share", "value kept"),
+        ("reason", "pixels", "share", "of them with a value"),
         tuple(rows),
         section="status",
     )

@@ -104,6 +104,7 @@ def left_out(share: NDArray[Any], n_frames: int | None, *, width_mm: float = PAG
         left.stairs(np.histogram(np.minimum(hit, edges[-1] - 1e-9), edges)[0], edges, fill=True, color=GRAY)
         left.xaxis.set_major_locator(MaxNLocator(6, integer=bool(n_frames)))
         left.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        left.set_ylim(0.0, 1.18 * left.get_ylim()[1])  # room for the words above the bars
     else:
         left.set(xticks=[], yticks=[])
     left.set(xlabel=f"{label} of a pixel", ylabel="pixels")
@@ -169,7 +170,7 @@ def uncertainty(
     if end > 100.0:
         left.axvline(100.0, color=VERMILION, linewidth=0.9, linestyle=":")
     left.set_yticks(places, [symbol(name)[0] for name in shares])
-    left.set(xlabel="variance of the map that is noise of the estimates (%)", xlim=(0.0, end))
+    left.set(xlabel="noise in the variance of the map (%)", xlim=(0.0, end))
     if "epcd_stderr" not in ensemble:
         right.set(xticks=[], yticks=[])
         note(right, "no error of the prediction: the model holds effects")

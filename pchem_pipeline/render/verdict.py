@@ -170,10 +170,22 @@ def _failed_pixels(data: ReportData) -> list[Flag]:
     text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
         allowed = percent(data.allowed_failed, 1.0)
-        return [Flag("serious", f"{text}, more than the {allowed} that is allowed.", "sensor")]
+        text = f"{text}, more than the {allowed} that is allowed{_reasons(data)}."
+        return [Flag("serious", text, "sensor")]
     if pixels.failed:
-        return [Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}.", "sensor")]
+        level: Level = "caution" if share > _CAUTION_SHARE else "note"
+        return [Flag(level, f"{text}{_reasons(data)}.", "sensor")]
     return [Flag("good", f"Every {data.noun} has a value.", "sensor")]
+
+
+def _reasons(data: ReportData) -> str:
+    """Return why pixels have no value, the commonest reason first, as the end of a sentence."""
+    status = data.fit.get("fit_status")
+    if status is None:
+        return ""
+    rows = [row for row in status_counts(status, data.status_words) if row[0] & data.failed_mask]
+    rows.sort(key=lambda row: -row[2])
+    return "".join(f"{'; ' if i else '. Why: '}{text} ({n:,})" for i, (_, text, n) in enumerate(rows))
 
 
 def _unfitted(data: ReportData) -> list[Flag]:
@@ -187,11 +199,12 @@ def _cautions(data: ReportData) -> list[Flag]:
     status = data.fit.get("fit_status")
     if status is None:
         return []
-    kept = [row for row in status_counts(status, data.status_words) if not row[0] & data.failed_mask]
+    # what else is odd about a pixel without a value misleads nobody
+    kept = status[(status & data.failed_mask) == 0]
     return [
-        Flag("caution", f"{percent(n, status.size)} of the {data.noun}s: {text}.")
-        for _, text, n in kept
-        if n > _CAUTION_SHARE * status.size
+        Flag("caution", f"{percent(n, kept.size)} of the {data.noun}s with a value: {text}.")
+        for _, text, n in status_counts(kept, data.status_words)
+        if n > _CAUTION_SHARE * kept.size
     ]
 
 
@@ -243,7 +256,7 @@ def _discrepancy(data: ReportData) -> list[Flag]:
         return []
     found = data.discrepancy.found
     levels: dict[str, Level] = {"consistent": "good", "ambiguous": "caution", "unexplained": "serious"}
-    return [Flag(levels.get(found.verdict, "note"), _as_sentence(headline(found)))]
+    return [Flag(levels.get(found.verdict, "note"), _as_sentence(headline(found).replace(" -> ", " → ")))]
 
 
 def _conditions(data: ReportData) -> list[Flag]:

@@ -11,6 +11,7 @@ __all__ = [
     "power_of_ten",
     "scientific",
     "short",
+    "signed",
     "stored_unit",
     "symbol",
     "unit_text",
@@ -74,6 +75,14 @@ def short(value: float, digits: int = 3) -> str:
         return f"{value:.{max(digits - 1 - exponent, 0)}f}".replace("-", "−")
     mantissa = value / 10.0**exponent
     return f"{mantissa:.{digits - 1}f}×10{str(exponent).translate(_SUPERSCRIPT)}".replace("-", "−")
+
+
+def signed(value: float) -> str:
+    """Return a number with its sign and one decimal, as ``+1.2`` or ``−0.3``; ``0.0`` has no sign."""
+    if not math.isfinite(value):
+        return "not known"
+    text = f"{value:+.1f}".replace("-", "−")
+    return text[1:] if text[1:] == "0.0" else text
 
 
 def scientific(value: float, digits: int = 2) -> str:

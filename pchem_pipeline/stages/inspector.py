@@ -45,12 +45,30 @@ _ALL_PIXELS = 4096
 #: Pixels in full in the file of a larger sensor, and how many of them with the mass of a model with effects.
 _SOME_PIXELS, _SOME_MASSES = 2400, 300
 #: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9.
-_MAPS_BUDGET, _MAPS_POWER = 3.1e6, 0.9
+_MAPS_BUDGET, _MAPS_POWER = 2.9e6, 0.9
 _PAPER_PIXELS = 512 * 512
-#: Steps of a map's codes: an eighth of a pixel's standard error, and 2 % of a standard error itself; four
+#: Steps of a map's codes: an eighth of a pixel's standard error, and 4 % of a standard error itself; four
 #: times that for sensors beyond a million pixels.
-_STEPS_PER_ERROR, _STEP_OF_ERRORS = 8.0, 0.02
+_STEPS_PER_ERROR, _STEP_OF_ERRORS = 8.0, 0.04
 _COARSE_PIXELS, _COARSE = 1_000_000, 4.0
+
+#: What people call maps whose names are short for the store.
+_LABELS = {
+    "maps/goodness_q": "false-discovery rate q",
+    "fit/n_iterations": "evaluations of the likelihood",
+    "fit/goodness_chi2": "χ² of the fit",
+    "fit/goodness_dof": "degrees of freedom of χ²",
+    "fit/goodness_p": "goodness of fit p",
+    "fit/outlier_share": "share of frames left out",
+    "summary/lag1_covariance": "covariance with the next frame",
+    "summary/neighbour_covariance_x": "covariance with the neighbour in x",
+    "summary/neighbour_covariance_y": "covariance with the neighbour in y",
+    "histogram/origin": "first DN of the histogram",
+    "histogram/under": "frames below the histogram",
+    "histogram/over": "frames above the histogram",
+    "histogram/minimum": "smallest DN",
+    "histogram/maximum": "largest DN",
+}
 
 #: The maps that are first in the file, in case that not all fit.
 _FIRST = (
@@ -101,6 +119,7 @@ def map_entry(listed: Listed) -> MapEntry:
     # the sentences of these groups begin with the name of the quantity, those of others explain it
     named = variable.group in ("maps", "truth")
     label = variable.long_name.split(":")[0] if named else variable.name.replace("_", " ")
+    label = _LABELS.get(variable.path, label)
     label = label.replace(", quantisation included", "").replace(", quantisation removed", "")
     kind, words = "value", {}
     if variable.path == "fit/fit_status":

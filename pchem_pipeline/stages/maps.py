@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.discovery import false_discovery, poorest
 from pchem_pipeline.model.fisher import covariance_from
+from pchem_pipeline.model.fit_status import FAILED
 from pchem_pipeline.model.maps import derived_maps, quality_map, status_counts, summarise
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
@@ -107,6 +108,10 @@ def _misfits(context: StageContext) -> dict[str, Any]:
     """Say which pixels disagree with the model: q-values of all, and the poorest fits with their numbers."""
     store, settings = context.store, context.config.maps
     chi2, dof, p = (store.read(f"fit/goodness_{name}") for name in ("chi2", "dof", "p"))
+    # a pixel without a value has no model that it could disagree with
+    failed = (store.read("fit/fit_status") & int(FAILED)) != 0
+    for values in (chi2, dof, p):
+        values[failed] = np.nan
     q = false_discovery(p)
     store.write("maps/goodness_q", (slice(None), slice(None)), q)
     worst = [

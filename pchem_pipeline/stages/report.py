@@ -208,6 +208,10 @@ def gather(
     suspects = [place for each in discrepancy.found.where for place in each.pixels] if discrepancy else []
     if store.has("maps/goodness_q"):
         fit["goodness_q"] = store.read("maps/goodness_q")
+    if "fit_status" in fit:
+        # only what has a value can agree with its model or not
+        failed = (fit["fit_status"] & int(FAILED)) != 0
+        fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
     misfits = store.attributes("maps").get("goodness", {})
     worst = [(f"q = {row['q']:.2g}", row["y"], row["x"]) for row in misfits.get("worst", ())]
     ensemble = _group(store, "ensemble")

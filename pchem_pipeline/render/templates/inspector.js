@@ -675,6 +675,7 @@
   let turn = 0;
   const choose = async (i, { quiet = false } = {}) => {
     state.pixel = i;
+    byId("inspector-trouble").hidden = true;
     reveal(i);
     redraw();
     showHistogram();
@@ -840,7 +841,11 @@
     putUpright(s, (top + floor) / 2, s.all ? `${facts.samples} per DN` : "density");
   };
   const drawResiduals = (s) => {
-    if (!s.all || !s.theta) return null;
+    if (!s.all) return null;
+    if (!s.theta) {
+      putText(s, (s.area.left + s.area.right) / 2, (s.area.stripTop + s.area.stripFloor) / 2 + 4, "middle", "no fit, no residuals");
+      return null;
+    }
     const expected = s.bins.map((dn) => [dn, s.expectedAt(dn)]).filter(([, e]) => e >= 1);
     const residuals = expected.map(([dn, e]) => [dn, (s.countAt(dn) - e) / Math.sqrt(e)]);
     if (!residuals.length) return null;
@@ -1002,6 +1007,8 @@
       const map = await layer(path), wanted = errorPath(path);
       state.error = wanted && usable(factOf.get(wanted)) ? await layer(wanted) : null;
       map.counts ??= countCodes(map, null);
+      // the ends of a selection are values of the map that it was made on
+      if (state.map && state.map !== map) for (const id of ["inspector-from", "inspector-to"]) byId(id).value = "";
       state.map = map;
     } catch (error) {
       layers.delete(path);
@@ -1042,6 +1049,12 @@
     byId("inspector-y-label").hidden = ny === 1;
     byId("inspector-truth").hidden = !hasTruth;
   };
+  // words for the eye and for the ear
+  const tell = (text, where) => {
+    byId("inspector-spoken").textContent = text;
+    byId(where).textContent = text;
+    byId(where).hidden = false;
+  };
   const listen = () => {
     byId("inspector-map").addEventListener("change", (event) => showMap(event.target.value));
     byId("inspector-colours").addEventListener("change", (event) => {
@@ -1061,7 +1074,7 @@
       if (Number.isInteger(y) && Number.isInteger(x) && y >= 0 && x >= 0 && y < ny && x < nx) choose(y * nx + x);
       else {
         const ends = `y is 0 to ${ny - 1}, x is 0 to ${nx - 1}`;
-        byId("inspector-spoken").textContent = `There is no such ${facts.noun}: ${ends}.`;
+        tell(`There is no such ${facts.noun}: ${ends}.`, "inspector-trouble");
       }
     };
     byId("inspector-go").addEventListener("click", go);
@@ -1085,12 +1098,16 @@
     byId("inspector-nearest").addEventListener("click", nearest);
     byId("inspector-copy").addEventListener("click", async () => {
       const link = new URL(address(), location.href).href;
-      try { await navigator.clipboard.writeText(link); byId("inspector-spoken").textContent = "Link copied."; }
-      catch { byId("inspector-spoken").textContent = link; }
+      try { await navigator.clipboard.writeText(link); tell("Link copied.", "inspector-note"); }
+      catch { tell(`Copy this link: ${link}`, "inspector-note"); }
     });
     byId("inspector-link").addEventListener("click", (event) => event.preventDefault());
     window.addEventListener("hashchange", () => {
       const asked = fromAddress();
+      if (asked.colours && asked.colours !== state.colours) {
+        byId("inspector-colours").value = asked.colours;
+        byId("inspector-colours").dispatchEvent(new Event("change"));
+      }
       if (asked.path && asked.path !== state.map.fact.path) showMap(asked.path);
       if (asked.pixel >= 0 && asked.pixel !== state.pixel) choose(asked.pixel, { quiet: true });
     });
