@@ -54,12 +54,12 @@ def test_the_list_is_that_of_the_store(store: RunStore) -> None:
 def test_a_new_array_appears_by_itself(
     store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch, group: str
 ) -> None:
-    new = Variable(f"{group}/outlier_share", ("y", "x"), "float64", "DN", "share of samples far away")
+    new = Variable(f"{group}/far_share", ("y", "x"), "float64", "DN", "share of samples far away")
     monkeypatch.setitem(variables.VARIABLES, new.path, new)
     store.write_array(new.path, np.full(SHAPE, 0.25))
     shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
     entry = next(each for each in shown.maps if each.path == new.path)
-    assert (entry.label, entry.unit, entry.sentence) == ("outlier share", "DN", "share of samples far away")
+    assert (entry.label, entry.unit, entry.sentence) == ("far share", "DN", "share of samples far away")
     assert entry.packed is not None
     assert (shown.sample.exact[new.path] == 0.25).all()
 
@@ -74,7 +74,7 @@ def test_words_and_kinds(store: RunStore) -> None:
     assert entries["fit/fit_status"].words == {int(bit): text for bit, text in MEANINGS.items()}
     assert entries["maps/quality"].words == {0: "good", 1: "use with caution", 2: "no value"}
     assert entries["truth/defect"].words == {0: "nothing", 1: "hot", 2: "dead", 3: "stuck"}
-    assert entries["fit/goodness_p"].label == "goodness p"
+    assert entries["fit/goodness_p"].label == "goodness of fit p"
 
 
 def test_what_does_not_fit_is_left_to_the_server(

@@ -2,7 +2,16 @@
 
 import pytest
 
-from pchem_pipeline.render.wording import count, measured, percent, scientific, short, symbol, unit_text
+from pchem_pipeline.render.wording import (
+    count,
+    measured,
+    percent,
+    scientific,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
 from pchem_pipeline.variables import VARIABLES
 
 
@@ -90,3 +99,11 @@ def test_the_units_of_maps_are_those_of_the_store() -> None:
         "dark_current",
     ):
         assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.24, "+1.2"), (-0.3, "−0.3"), (-0.04, "0.0"), (0.0, "0.0"), (float("nan"), "not known")],
+)
+def test_signed(value: float, text: str) -> None:
+    assert signed(value) == text

@@ -203,6 +203,18 @@ def test_a_third_of_the_pixels_failed() -> None:
     assert "✕ Serious" in page.text
 
 
+def test_cautions_are_of_pixels_with_a_value_and_failures_have_reasons() -> None:
+    data = report_data((24, 24), failed=0.34)
+    status = data.fit["fit_status"].copy()
+    failed = (status & data.failed_mask) != 0
+    status[failed] |= int(FitStatus.BIAS_AMBIGUOUS)
+    status[~failed] = 0
+    said = flags(replace(data, fit={**data.fit, "fit_status": status}))
+    assert not [flag for flag in said if "bias ambiguous" in flag.text]
+    lost = int(((status & int(FitStatus.TOO_FEW_BINS)) != 0).sum())
+    assert f"fewer than 3 occupied bins ({lost})" in next(f.text for f in said if f.level == "serious")
+
+
 def all_failed() -> ReportData:
     data = report_data((8, 8))
     nan = np.full((8, 8), np.nan)
