@@ -13,7 +13,7 @@ from pchem_pipeline.render.style import COLUMN_MM, figure_bytes, small_png
 __all__ = ["DrawAll", "Drawn", "Picture", "draw_exhibit", "draw_picture", "longest_first", "ready_picture"]
 
 #: SVG files beyond this size are embedded as PNG, which is drawn once more.
-_LARGEST_SVG = 320_000
+_LARGEST_SVG = 260_000
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ _ALL_PIXELS = 4096
 #: Pixels in full in the file of a larger sensor, and how many of them with the mass of a model with effects.
 _SOME_PIXELS, _SOME_MASSES = 2400, 300
 #: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9.
-_MAPS_BUDGET, _MAPS_POWER = 2.9e6, 0.9
+_MAPS_BUDGET, _MAPS_POWER = 2.8e6, 0.9
 _PAPER_PIXELS = 512 * 512
 #: Steps of a map's codes: an eighth of a pixel's standard error, and 4 % of a standard error itself; four
 #: times that for sensors beyond a million pixels.
