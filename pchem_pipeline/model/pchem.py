@@ -48,8 +48,10 @@ class FitResult:
             single Gaussian (g to infinity). A gap below 30 is exact: the runner-up was polished to its
             maximum. A larger one says that the neighbour was given up when, by the quadratic through it,
             twice its expected rise would have left it more than 30 below; its height is then taken from that
-            quadratic. Negative only with a reason in ``fit_status``: one Gaussian, or a climb that did not
-            converge, stands higher.
+            quadratic. Where the fit is good, 1/g above 5 DN, and the neighbour expected to be more than 80
+            below (four gap thresholds if that is more), it is not visited: its height is the one expected.
+            Negative only with a reason in ``fit_status``: one Gaussian, or a climb that did not converge,
+            stands higher.
         fit_status: bits of :class:`~pchem_pipeline.model.fit_status.FitStatus`, uint16, shape (n,).
         n_iterations: evaluations of the likelihood, all starts and neighbours together, int32, shape (n,).
         goodness_chi2: Pearson chi-square, adjacent DN merged until 5 counts are expected, shape (n,).
@@ -102,10 +104,10 @@ def fit_histograms(
     The likelihood is that of the PCD at whole DN (Hendrickson et al. 2023, eq. X_density). A start from the
     empirical characteristic function is improved by damped Newton steps with Louis' observed information, by
     EM steps, eqs. (update_eqns) to (gamma_nk), where that does not help (``algorithm: em``: by EM steps
-    alone), until the expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried and
-    the likeliest is kept; a pixel whose goodness of fit or read noise raises suspicion gets other starts. No
-    pixel raises: what cannot be fitted holds NaN and a reason. The answer for a pixel does not depend on the
-    others in the batch.
+    alone), until the expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried,
+    unless a good fit leaves them no chance, and the likeliest is kept; a pixel whose goodness of fit or read
+    noise raises suspicion gets other starts. No pixel raises: what cannot be fitted holds NaN and a reason.
+    The answer for a pixel does not depend on the others in the batch.
 
     Samples that the model does not expect at all are left out (setting ``tail_guard``): a few outliers move
     nothing, and a pixel without any has the very estimates that it would have without the guard.

@@ -118,6 +118,25 @@ def test_a_gap_below_thirty_is_that_to_the_polished_neighbour() -> None:
     assert result.log_likelihood[0] - max(heights) == pytest.approx(result.likelihood_gap[0], abs=1e-3)
 
 
+@pytest.mark.parametrize("case", [(1.0, 0.2), (2.8, 0.35), (4.0, 0.22), (5.6, 0.3)])
+def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(
+    case: tuple[float, float],
+) -> None:
+    pixels = draw(np.random.default_rng(38), case[0], 11.0, case[1])
+    result = fit_histograms(pixels.counts, pixels.origin)
+    h, g, mu, sigma = estimates(result)[0]
+    origin, heights = int(pixels.origin[0]), []
+    for d in (-1, 1):
+        if h + d > 0.1:
+            path = em_trace(pixels.counts[0], origin, (h + d, g, mu - d / g, sigma), 3000)
+            if abs(path.parameters[-1, 2] - mu) > 0.3 / g:
+                heights.append(path.log_likelihood[-1])
+    gap = result.log_likelihood[0] - max(heights)
+    assert result.n_iterations[0] < 8  # the neighbours were not visited
+    assert gap > 80
+    assert result.likelihood_gap[0] == pytest.approx(gap, rel=0.4)
+
+
 @pytest.mark.parametrize("case", [(2.0, 11.0, 0.3), (0.1, 9.0, 0.45), (6.0, 12.0, 0.6), (30.0, 9.0, 0.3)])
 def test_em_never_lowers_the_likelihood(case: tuple[float, float, float]) -> None:
     pixels = draw(np.random.default_rng(36), *case)
