@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
 _SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
 # of what an effect does to its strongest statistic, the most that may remain in statistics of that kind
-_LARGEST_CONTRADICTION = 0.5
+_LARGEST_CONTRADICTION = 0.3
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
 
 
