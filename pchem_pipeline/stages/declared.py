@@ -78,14 +78,14 @@ _ALL = (
     ),
     Declaration(
         "fit",
-        3,
+        4,
         ("histogram",),
         ("fit", "model", "run.tile"),
         ("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),
         ("fit",),
         identities.adc_limits,
     ),
-    Declaration("maps", 2, ("fit",), ("maps", "run.tile"), ("fit",), ("maps",), identities.integration_time),
+    Declaration("maps", 3, ("fit",), ("maps", "run.tile"), ("fit",), ("maps",), identities.integration_time),
     Declaration(
         "ensemble",
         2,
@@ -106,7 +106,7 @@ _ALL = (
     Declaration("electrons", 1, ("ingest", "fit"), ("run.tile",), ("frames", "fit"), ("electrons",)),
     Declaration(
         "discrepancy",
-        2,
+        3,
         ("ingest",),
         ("discrepancy",),
         ("frames",),
