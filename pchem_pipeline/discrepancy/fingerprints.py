@@ -23,8 +23,6 @@ FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
 _LEAK = 0.1
-_SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
-_NEXT_TO_NOTHING = 1e-3
 _LARGEST_CORRECTION = 0.4
 
 
@@ -95,18 +93,10 @@ class SetFit:
         """Predicted shift by effect, shape (e, m)."""
         return np.array([c * h.fingerprint for c, h in zip(self.factors, self.hypotheses, strict=True)])
 
-    def substantial(self) -> list[tuple[Hypothesis, float]]:
-        """Return the hypotheses of which there is more than their errors, with factors; at least one."""
-        there = (self.factors > _SMALLEST_FACTOR * self.stderr) | self.certain
-        kept = [
-            (h, float(c))
-            for h, c, is_there in zip(self.hypotheses, self.factors, there, strict=True)
-            if is_there
-        ]
-        known = self.stderr > 0.0
-        ratio = np.divide(self.factors, self.stderr, out=np.zeros(self.factors.size), where=known)
-        largest = int(np.argmax(ratio))
-        return kept or [(self.hypotheses[largest], max(float(self.factors[largest]), _NEXT_TO_NOTHING))]
+    def established(self, least: float) -> tuple[Hypothesis, ...]:
+        """Return those whose strength is at least so many standard errors, or that an exact count proves."""
+        there = (self.factors > least * self.stderr) | self.certain
+        return tuple(h for h, is_there in zip(self.hypotheses, there, strict=True) if is_there)
 
     def settled(self, close: float) -> bool:
         """Tell whether all strengths are what the data ask for, to ``close`` or half a standard error."""

@@ -45,6 +45,9 @@ _TELLING = (
     4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
 )
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
+# standard errors of its strength at which an effect is there: of some hundred guesses the best may be tried,
+# and one in a thousand stacks without it reaches this
+_ESTABLISHED = 4.5
 _MISTAKEN = 0.003  # share of pixels with an ambiguous bias from which replicates are fitted from nothing
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
@@ -145,6 +148,8 @@ class _Search:
             if choice is None or not (still or choice.advantage > _CONVINCING):
                 break
             added = self._added(laboratory, choice, shifts, self._noise(null, 2))
+            if added is None:
+                break
             before, self.model = self.model, (*self.model, *(h.effect for h in added.hypotheses))
             fit = self._refit(plain)
             maps = likely_truth(fit.maps, fit.covariance)
@@ -294,17 +299,19 @@ class _Search:
         choice: Choice,
         shifts: tuple[FloatArray, FloatArray],
         noise: Noise,
-    ) -> SetFit:
-        """Refine the strengths of the chosen set together; drop what comes to nothing."""
+    ) -> SetFit | None:
+        """Refine the strengths of the chosen set together; drop what may be nothing; None if that is all."""
         noise = replace(noise, model_error=_FINE_ERROR)
         shift = (shifts[0] + shifts[1]) / 2.0
         chosen = choice.present(self.settings.certainty)
-        for _ in range(len(chosen)):
+        while chosen:
             [chosen] = laboratory.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
-            kept = tuple(h for h, _ in fit_set(chosen, shift, noise).substantial())
+            kept = fit_set(chosen, shift, noise).established(_ESTABLISHED)
             if len(kept) == len(chosen):
                 break
             chosen = kept
+        else:
+            return None
         fit = fit_set(chosen, shift, noise)
         near = np.where(np.abs(fit.factors - 1.0) < _NEAR, fit.factors, 1.0)
         last = [

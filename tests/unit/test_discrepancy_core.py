@@ -8,7 +8,7 @@ from scipy import stats
 
 from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.disagreement import contradicted
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, fit_set
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
 from pchem_pipeline.discrepancy.gap import GapMetric
 from pchem_pipeline.discrepancy.naming import choose, score_set
 from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
@@ -242,3 +242,13 @@ def test_an_effect_that_leaves_much_in_its_own_statistics_is_contradicted() -> N
     # a little is the rest of a strong effect, and what is elsewhere is another one's
     assert not contradicted(null, counts, np.array([3.0, -5.0, 0.0, 0.0]))
     assert not contradicted(null, counts, np.array([0.0, 0.0, 30.0, 30.0]))
+
+
+def test_established_is_what_is_many_errors_strong_or_counted_exactly() -> None:
+    tags = ("row_noise", "frame_noise", "exposure_drift")
+    first, second, third = (_hypothesis(tag, row) for tag, row in zip(tags, np.eye(3), strict=True))
+    fit = SetFit(
+        (first, second, third), np.array([5.0, 4.0, 0.5]), np.ones(3), np.array([False, False, True])
+    )
+    assert fit.established(4.5) == (first, third)
+    assert fit.established(6.0) == (third,)
