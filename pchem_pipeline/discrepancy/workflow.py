@@ -45,8 +45,8 @@ _TELLING = (
     4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
 )
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
-# standard errors of its strength at which an effect is there: of some hundred guesses the best may be tried,
-# and one in a thousand stacks without it reaches this
+# standard errors of its strength, before the replicates correct it, that an effect must have: the best of
+# some hundred guesses reaches more than a single one would by chance
 _ESTABLISHED = 4.5
 _MISTAKEN = 0.003  # share of pixels with an ambiguous bias from which replicates are fitted from nothing
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count

@@ -129,7 +129,8 @@ def _with_common(
             place += len(begins)
             spread = np.diag(inverse)[here]
             errors = variance * (spread[1:] + spread[:-1] - 2.0 * inverse[here[1:], here[:-1]])
-            for cut, square in zip(begins[1:], np.diff(level) ** 2 / errors, strict=True):
+            squares = np.diff(level) ** 2 / np.maximum(errors, np.finfo(np.float64).tiny)
+            for cut, square in zip(begins[1:], squares, strict=True):
                 weakest[cut] = min(weakest.get(cut, (np.inf, q)), (float(square), q))
         # one series a cut: the others' jumps are the surer without it
         dropped = {(cut, q) for cut, (square, q) in weakest.items() if square < _JUMP**2}
