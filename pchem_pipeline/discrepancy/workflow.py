@@ -45,8 +45,8 @@ _TELLING = (
     4.0  # standard deviations by which a statistic must move to tell how well a simulation predicted it
 )
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
-# standard errors of its strength, before the replicates correct it, that an effect must have: the best of
-# some hundred guesses reaches more than a single one would by chance
+# standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
+# than a single one would by chance
 _ESTABLISHED = 4.5
 _MISTAKEN = 0.003  # share of pixels with an ambiguous bias from which replicates are fitted from nothing
 _FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
@@ -103,6 +103,16 @@ def find_discrepancies(
     return search.run()
 
 
+@dataclass(frozen=True)
+class _Grown:
+    """The model with the effects of a round: how strong they are, what it predicts, and the pixels' fit."""
+
+    added: SetFit
+    null: NullModel
+    fit: Refit
+    maps: PixelMaps
+
+
 @dataclass
 class _Search:
     """The state of the workflow."""
@@ -128,8 +138,7 @@ class _Search:
         self._check(plain)
         self.mistaken = plain.ambiguous
         train, test, final = (self._observe(part, plain.maps) for part in self._parts())
-        fit = self._refit(plain)
-        maps = likely_truth(fit.maps, fit.covariance)
+        fit, maps = self._mapped(plain)
         null, names = self._null(maps, "r0", self.settings.replicates, (train, test, final))
         z = Measured(*(self._row(evidence, names) for evidence in (train, test, final)))
         first = null
@@ -147,21 +156,11 @@ class _Search:
             self.left_out |= laboratory.left_out
             if choice is None or not (still or choice.advantage > _CONVINCING):
                 break
-            added = self._added(laboratory, choice, shifts, self._noise(null, 2))
-            if added is None:
+            grown = self._grow(plain, laboratory, choice, null, first, z)
+            if grown is None:
                 break
-            before, self.model = self.model, (*self.model, *(h.effect for h in added.hypotheses))
-            fit = self._refit(plain)
-            maps = likely_truth(fit.maps, fit.covariance)
-            grown, _ = self._null(
-                maps, f"r{number + 1}", self.settings.grown_replicates, (train, test, final), first
-            )
-            added, grown = self._corrected(added, null, grown, z)
-            self.model = (*before, *(h.effect for h in added.hypotheses))
-            fit = self._refit(plain)
-            maps = likely_truth(fit.maps, fit.covariance)
-            rounds.append(Round(choice, added, tuple(hypotheses), null, grown, fit.moved))
-            null = grown
+            rounds.append(Round(choice, grown.added, tuple(hypotheses), null, grown.null, grown.fit.moved))
+            fit, maps, null = grown.fit, grown.maps, grown.null
             search = still = disagrees(null, z, limit, self._tolerance(rounds))
         return self._result(rounds, first, null, z, places, train, fit.maps, still)
 
@@ -293,17 +292,46 @@ class _Search:
         shift = (shifts[0] + shifts[1]) / 2.0
         return laboratory.refined(hypotheses, shift, noise)
 
-    def _added(
+    def _grow(
         self,
+        plain: Evidence,
         laboratory: Laboratory,
         choice: Choice,
-        shifts: tuple[FloatArray, FloatArray],
-        noise: Noise,
+        null: NullModel,
+        first: NullModel,
+        z: Measured,
+    ) -> _Grown | None:
+        """Put the chosen effects into the model; None, and the model as it was, where none is established.
+
+        Asked twice: of the strengths as one simulation gives them, and as the replicates correct them.
+        """
+        before, chosen = self.model, choice.present(self.settings.certainty)
+        while chosen:
+            added = self._added(laboratory, chosen, z.both - null.mean, self._noise(null, 2))
+            if added is None:
+                break
+            self.model = (*before, *(h.effect for h in added.hypotheses))
+            _, maps = self._mapped(plain)
+            count = self.settings.grown_replicates
+            grown, _ = self._null(maps, f"{laboratory.prefix}-grown", count, (), first)
+            added, grown = self._corrected(added, null, grown, z)
+            chosen = added.established(_ESTABLISHED)
+            if len(chosen) == len(added.hypotheses):
+                self.model = (*before, *(h.effect for h in added.hypotheses))
+                return _Grown(added, grown, *self._mapped(plain))
+        self.model = before
+        return None
+
+    def _mapped(self, plain: Evidence) -> tuple[Refit, PixelMaps]:
+        """Return the fit under the present model, and the maps that replicates are drawn from."""
+        fit = self._refit(plain)
+        return fit, likely_truth(fit.maps, fit.covariance)
+
+    def _added(
+        self, laboratory: Laboratory, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise
     ) -> SetFit | None:
         """Refine the strengths of the chosen set together; drop what may be nothing; None if that is all."""
         noise = replace(noise, model_error=_FINE_ERROR)
-        shift = (shifts[0] + shifts[1]) / 2.0
-        chosen = choice.present(self.settings.certainty)
         while chosen:
             [chosen] = laboratory.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
             kept = fit_set(chosen, shift, noise).established(_ESTABLISHED)
