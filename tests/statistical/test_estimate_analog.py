@@ -96,6 +96,18 @@ def test_a_path_of_the_gain_is_found():
     assert np.abs(seen_course - true_course).max() < 0.02
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_gain_that_settles_is_found_as_such(sign):
+    effect = GainDrift(drift=0.06 * sign, shape="settling", settling_fraction=0.1)
+    [first] = [e for e in GainDrift.estimate(evidence_of(effect)) if e.shape == "settling"]
+    assert 0.05 <= first.settling_fraction <= 0.2
+    position = np.linspace(0, 1, 50)
+    apart = first.drift * first._course(position) - effect.drift * effect._course(position)
+    assert np.abs(apart).max() < 0.02
+    line = effect.drift * (position - 0.5) - effect.drift * effect._course(position)
+    assert np.abs(line).max() > 0.02  # what the limit would catch
+
+
 @pytest.mark.parametrize(
     "effect",
     [

@@ -102,6 +102,12 @@ def test_a_drift_of_its_own_shape_is_found_as_a_path():
     assert [e.shape for e in estimated(BiasDrift(drift_dn=0.6))] == ["linear"]
 
 
+def test_a_bias_that_settles_is_found_as_such():
+    first = estimated(BiasDrift(drift_dn=0.6, shape="settling", settling_fraction=0.1))[0]
+    assert first.shape == "settling" and 0.05 <= first.settling_fraction <= 0.2
+    assert first.drift_dn == pytest.approx(0.6, abs=0.1)
+
+
 def test_jumps_are_found_with_their_frames_and_levels():
     path = (((0, 0.0), (1000, 1.0)), ((0, 0.0),), ((0, 0.0), (400, -1.0), (2000, 0.0)), ((0, 0.0),))
     effect = BiasJumps(amplitude_dn=0.8, path=path)

@@ -45,6 +45,7 @@ STRONG: list[Effect] = [
     FlickerNoise(share=0.9, correlation_frames=90.0, spectrum="one_over_f"),
     GainDrift(drift=0.4),
     GainDrift(drift=0.4, shape="path", path=BOW),
+    GainDrift(drift=0.4, shape="settling"),
     HeavyTailedNoise(share=0.3, factor=4.0),
     InterpixelCapacitance(coupling=0.1, anisotropy=0.3),
     NoiseSkew(share=-0.9),

@@ -66,6 +66,7 @@ STRONG = [
     BiasDrift(drift_dn=9),
     BiasDrift(drift_dn=9, shape="path", path=(1.0, 5.0, -3.0)),
     BiasDrift(drift_dn=9, shape="walk"),
+    BiasDrift(drift_dn=9, shape="settling"),
     BiasJumps(amplitude_dn=9, rate=0.2, levels=4),
     BiasJumps(amplitude_dn=9, path=JUMPS),
     BiasJumps(amplitude_dn=9, rate=0.2, parts="left_right"),
@@ -168,6 +169,15 @@ def test_linear_drift_ends_where_it_says_and_keeps_the_mean():
     np.testing.assert_allclose(added.mean(axis=0), 0.0, atol=1e-12)
     before = offsets(BiasDrift(drift_dn=-0.3), context_of(n_frames=101, frames=[-5, 0]))
     np.testing.assert_array_equal(before[0], before[1])
+
+
+def test_a_bias_settles_by_an_exponential_and_keeps_the_mean():
+    effect = BiasDrift(drift_dn=2.0, shape="settling", settling_fraction=0.25)
+    added = offsets(effect, context_of(n_frames=401))[:, 0, 0]
+    assert added[-1] - added[0] == pytest.approx(2.0)
+    rest = (added[-1] - added) + 2.0 * np.exp(-4.0) / -np.expm1(-4.0)
+    np.testing.assert_allclose(rest[100] / rest[0], np.exp(-1.0))
+    assert abs(added.mean()) < 2.0 * 3 / 401
 
 
 def test_a_path_goes_through_its_nodes():

@@ -51,6 +51,7 @@ def smeared(added: np.ndarray) -> np.ndarray:
     [
         BiasDrift(drift_dn=2.0),
         BiasDrift(drift_dn=-2.0, shape="path", path=(0.0, 0.2, 1.0, -0.1)),
+        BiasDrift(drift_dn=2.0, shape="settling", settling_fraction=0.3),
         PeriodicPickup(amplitude_dn=1.0, cycles_per_frame=0.2137),
         ReadoutAlternation(alternation_dn=-0.8),
         BiasJumps(amplitude_dn=1.0, rate=0.4, levels=5),

@@ -9,7 +9,7 @@ of the same camera may do. A slow sine is ``periodic_pickup`` at a few cycles pe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -23,6 +23,7 @@ from pchem_pipeline.effects.common_modes import (
     run_position,
     with_offsets,
 )
+from pchem_pipeline.effects.courses import SETTLING, settling
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,6 +37,7 @@ __all__ = ["BiasDrift"]
 _NODES = (3, 5, 9, 17, 33)
 _FRAMES_PER_NODE = 12
 _LOBES = 7
+_WORTH_A_CURVE = 4.0  # of the Bayesian information criterion, beyond a line
 
 
 @register_effect
@@ -66,11 +68,16 @@ class BiasDrift(Effect):
     drift_dn: float = Field(
         ge=-1e6,
         le=1e6,
-        description="linear: bias at the end less that at the start, DN; path: its scale, DN; walk: standard "
-        "deviation of the end less the start, DN",
+        description="linear, settling: bias at the end less that at the start, DN; path: its scale, DN; "
+        "walk: standard deviation of the end less the start, DN",
     )
-    shape: Literal["linear", "path", "walk"] = Field(
-        default="linear", description="linear; path: as listed in `path`; walk: random walk"
+    shape: Literal["linear", "settling", "path", "walk"] = Field(
+        default="linear",
+        description="linear; settling: exponential approach to the end; path: as listed in `path`; walk: "
+        "random walk",
+    )
+    settling_fraction: float = Field(
+        default=0.2, gt=0, le=10, description="settling: time constant in lengths of the run"
     )
     path: tuple[float, ...] = Field(
         default=(),
@@ -96,6 +103,8 @@ class BiasDrift(Effect):
 
     def _path_at(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
+        if self.shape == "settling":
+            return settling(position, self.settling_fraction)
         nodes = np.array(self.path or (-0.5, 0.5))
         mean = (nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1)
         return np.asarray(np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes) - mean)
@@ -108,9 +117,10 @@ class BiasDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the frames' means on time: linear, and a path where it explains more.
+        """Return the regression of the frames' means on time: a line, and courses that explain more.
 
-        The number of nodes of the path is that of the smallest Bayesian information criterion.
+        Those are an exponential approach, a path with as many nodes as the Bayesian information criterion
+        asks for, and a random walk like that path.
         """
         if evidence.time is None or evidence.time.frames.size < 8:
             return ()
@@ -118,16 +128,22 @@ class BiasDrift(Effect):
         position = run_position(time.frames, time.n_run)
         slope, error = _slope(position, time.frame_readout)
         linear = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []
-        path = _best_path(position, time)
+        settled, path = _settled(position, time.frame_readout), _best_path(position, time.frame_readout)
+        if settled is not None:
+            size, fraction = settled.values[1] / alpha, settled.fraction
+            linear.insert(0, cls(drift_dn=size, shape="settling", settling_fraction=fraction))
         if path is None:
             if linear or evidence.strongest("frame.readout.slow") <= 3.0:
                 return linear
             return [cls(drift_dn=max(_wander(time), 1e-9) / alpha, shape="walk")]
-        size = float(np.ptp(path)) or 1.0
-        bent = cls(drift_dn=size / alpha, shape="path", path=tuple(np.round(path / size, 6).tolist()))
+        nodes = path.values
+        size = float(np.ptp(nodes)) or 1.0
+        bent = cls(drift_dn=size / alpha, shape="path", path=tuple(np.round(nodes / size, 6).tolist()))
         # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
-        walk = float(np.sqrt((np.diff(path) ** 2).sum())) / alpha
-        return [bent, *linear, cls(drift_dn=walk, shape="walk")]
+        walk = cls(drift_dn=float(np.sqrt((np.diff(nodes) ** 2).sum())) / alpha, shape="walk")
+        if settled is not None and settled.criterion < path.criterion:
+            return [*linear, bent, walk]
+        return [bent, *linear, walk]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law smeared over the path (a variance where the drift is small against the noise)."""
@@ -167,19 +183,41 @@ def _wander(time: TimeSeries) -> float:
     return float(np.sqrt(6.0 * max(excess, 0.0)))
 
 
-def _best_path(position: NDArray[np.float64], time: TimeSeries) -> NDArray[np.float64] | None:
-    """Return the values of the piecewise linear path at its nodes, DN; None if a line does as well."""
-    means = time.frame_readout
-    best, least = None, _criterion(means, np.stack([np.ones_like(position), position], 1))[0] - 4.0
+class _Curve(NamedTuple):
+    """A fit of the means: Bayesian information criterion, coefficients in DN, time constant in runs."""
+
+    criterion: float
+    values: NDArray[np.float64]
+    fraction: float = np.nan
+
+
+def _settled(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
+    """Return mean and size of the best exponential approach to the end; None if a line does as well."""
+    one = np.ones_like(position)
+    curves = [
+        _Curve(*_criterion(means, np.stack([one, settling(position, s)], 1)), fraction=s) for s in SETTLING
+    ]
+    return _better_than_line(min(curves, key=lambda curve: curve.criterion), position, means)
+
+
+def _best_path(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
+    """Return the values of the piecewise linear path at its nodes; None if a line does as well."""
+    paths = []
     for count in _NODES:
         if position.size < _FRAMES_PER_NODE * count:
             break
         knots = np.linspace(0.0, 1.0, count)
         hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
-        criterion, values = _criterion(means, hats)
-        if criterion < least:
-            best, least = values, criterion
-    return best
+        paths.append(_Curve(*_criterion(means, hats)))
+    best = min(paths, key=lambda path: path.criterion, default=None)
+    return None if best is None else _better_than_line(best, position, means)
+
+
+def _better_than_line(
+    curve: _Curve, position: NDArray[np.float64], means: NDArray[np.float64]
+) -> _Curve | None:
+    line = _criterion(means, np.stack([np.ones_like(position), position], 1))[0]
+    return curve if curve.criterion < line - _WORTH_A_CURVE else None
 
 
 def _criterion(means: NDArray[np.float64], basis: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.common_modes import run_position
+from pchem_pipeline.effects.courses import SETTLING, settling
 from pchem_pipeline.effects.pixel_law import PixelLaw, typical_pixels
 
 if TYPE_CHECKING:
@@ -63,8 +64,12 @@ class GainDrift(Effect):
         description="linear: relative change of the gain (DN/e-) from the first frame to the last, no unit; "
         "path: its scale",
     )
-    shape: Literal["linear", "path"] = Field(
-        default="linear", description="linear; path: as listed in `path`"
+    shape: Literal["linear", "settling", "path"] = Field(
+        default="linear",
+        description="linear; settling: exponential approach to the end; path: as listed in `path`",
+    )
+    settling_fraction: float = Field(
+        default=0.2, gt=0, le=10, description="settling: time constant in lengths of the run"
     )
     path: tuple[float, ...] = Field(
         default=(),
@@ -76,9 +81,9 @@ class GainDrift(Effect):
     def _path_where_it_belongs(self) -> Self:
         if self.shape == "path" and len(self.path) < 2:
             raise ValueError("gain_drift: shape path needs `path` with 2 values or more")
-        if self.shape == "linear" and self.path:
-            raise ValueError("gain_drift: `path` is for shape path, not linear; leave one of them out")
-        if abs(self.drift) * float(np.abs(self._nodes() - _path_mean(self._nodes())).max()) >= 1:
+        if self.shape != "path" and self.path:
+            raise ValueError(f"gain_drift: `path` is for shape path, not {self.shape}; leave one of them out")
+        if abs(self.drift) * float(np.abs(self._course(np.linspace(0.0, 1.0, 4097))).max()) >= 1:
             raise ValueError("gain_drift: drift times path takes the gain to zero; make one of them smaller")
         return self
 
@@ -96,46 +101,45 @@ class GainDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the gain of the blocks on time: linear, and a path where it explains more.
+        """Return the regression of the gain of the blocks on time: a line, and courses that explain more.
 
-        The number of nodes of the path is that of the smallest Bayesian information criterion.
+        Those are an exponential approach and a path with as many nodes as the Bayesian information criterion
+        asks for; the likeliest comes first.
         """
         if evidence.time is None or evidence.time.block_start.size < 3:
             return ()
         gain, error, position = _block_gains(evidence, evidence.time)
         if gain.size < 3:
             return ()
+        price = float(np.log(gain.size))
         flat = _chi_square(gain, error, np.ones((gain.size, 1)))[0]
-        line, (_, slope) = _chi_square(gain, error, np.stack([np.ones_like(position), position - 0.5], 1))
-        linear = [cls(drift=float(np.clip(slope, -0.5, 0.5)))] if flat - line > _SIGMAS**2 else []
-        best, least = None, line + 2.0 * np.log(gain.size)
-        for count in _NODES:
-            if 3 * count > gain.size:
-                break
-            knots = np.linspace(0.0, 1.0, count)
-            hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
-            left, values = _chi_square(gain, error, hats)
-            if flat - left > _improvement(count) and left + count * np.log(gain.size) < least:
-                best, least = values, left + count * np.log(gain.size)
-        if best is None:
-            return linear
-        size = min(float(np.ptp(best)), 0.4)
-        if size <= 0:
-            return linear
-        return [cls(drift=size, shape="path", path=tuple(np.round(best / np.ptp(best), 4).tolist())), *linear]
+        line, slope = _along(gain, error, position - 0.5)
+        curve, size, fraction = min((*_along(gain, error, settling(position, s)), s) for s in SETTLING)
+        straight = line + 2.0 * price
+        found: list[tuple[float, Self]] = []
+        if flat - line > _SIGMAS**2:
+            found.append((straight, cls(drift=slope)))
+        if flat - curve > _improvement(3) and curve + 3.0 * price < straight:
+            found.append((curve + 3.0 * price, cls(drift=size, shape="settling", settling_fraction=fraction)))
+        left, path = _best_path(gain, error, position)
+        if flat - left > _improvement(path.size) and left + path.size * price < straight:
+            size = min(float(np.ptp(path)), 0.4)
+            nodes = tuple(np.round(path / np.ptp(path), 4).tolist())
+            found.append((left + path.size * price, cls(drift=size, shape="path", path=nodes)))
+        return [effect for _, effect in sorted(found, key=lambda pair: pair[0])]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with the variance of the gain: that of the peaks grows as k^2."""
         course = self.drift * self._course(np.linspace(0.0, 1.0, 1001))
         return model.with_variance(per_electron2=float(course.var()))
 
-    def _nodes(self) -> NDArray[np.float64]:
-        return np.array(self.path or (-0.5, 0.5))
-
     def _course(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
-        nodes = self._nodes()
-        return np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes) - _path_mean(nodes)
+        if self.shape == "settling":
+            return settling(position, self.settling_fraction)
+        nodes = np.array(self.path or (-0.5, 0.5))
+        course: NDArray[np.float64] = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
+        return course - _path_mean(nodes)
 
 
 def _improvement(nodes: int) -> float:
@@ -155,6 +159,28 @@ def _chi_square(
     """Return chi squared of a weighted least-squares fit, and its coefficients."""
     found = np.linalg.lstsq(basis / error[:, None], values / error, rcond=1e-6)[0]
     return float((((values - basis @ found) / error) ** 2).sum()), np.asarray(found, np.float64)
+
+
+def _along(
+    gain: NDArray[np.float64], error: NDArray[np.float64], course: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Return chi squared that a course at its best scale leaves, and the scale within limits."""
+    left, (_, size) = _chi_square(gain, error, np.stack([np.ones_like(course), course], 1))
+    return left, float(np.clip(size, -0.5, 0.5))
+
+
+def _best_path(
+    gain: NDArray[np.float64], error: NDArray[np.float64], position: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
+    """Return chi squared of the path of the smallest Bayesian information criterion, and its nodes."""
+    fits: list[tuple[float, NDArray[np.float64]]] = []
+    for count in _NODES:
+        if fits and 3 * count > gain.size:
+            break
+        knots = np.linspace(0.0, 1.0, count)
+        hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
+        fits.append(_chi_square(gain, error, hats))
+    return min(fits, key=lambda fit: fit[0] + fit[1].size * np.log(gain.size))
 
 
 def _block_gains(

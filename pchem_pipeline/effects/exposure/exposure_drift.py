@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.charge_sums import ExposureCourse, exposure_course, exposure_nodes
+from pchem_pipeline.effects.courses import SETTLING, settling
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +32,6 @@ _T = TypeVar("_T", bound="ExposureDrift")
 # nodes of a free path, and the chi-square that each must explain
 _NODES = (5, 9, 17, 33)
 _PRICE_OF_NODE = 2.5
-_SETTLING = (0.05, 0.1, 0.2, 0.4)
 # chi-square that the choice of the time constant explains by chance
 _PRICE_OF_SETTLING = 3.0
 
@@ -99,7 +99,7 @@ class ExposureDrift(Effect):
             course: NDArray[np.float64] = (values - mean) / np.ptp(nodes)
             return course
         if self.settling_fraction is not None:
-            return _settling(position, self.settling_fraction)
+            return settling(position, self.settling_fraction)
         return position - 0.5
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
@@ -134,9 +134,9 @@ class ExposureDrift(Effect):
         position = course.frames / max(evidence.time.n_run - 1, 1)
         # what flickers from frame to frame is noise to a drift
         noise = max(course.variance, 0.5 * float(np.mean(np.diff(course.deviation) ** 2)))
-        settling = [_fit(cls(drift=1.0, settling_fraction=s), course, position, noise) for s in _SETTLING]
+        curves = [_fit(cls(drift=1.0, settling_fraction=s), course, position, noise) for s in SETTLING]
         line = _fit(cls(drift=1.0), course, position, noise)
-        curve = max(settling, key=lambda pair: pair[0])
+        curve = max(curves, key=lambda pair: pair[0])
         path = _fit_path(cls, course, position, noise)
         net = [line, (curve[0] - _PRICE_OF_SETTLING, curve[1]), path]
         best = max(chi2 for chi2, _ in net)
@@ -147,13 +147,6 @@ class ExposureDrift(Effect):
         """Return the law mixed over the exposures of the run."""
         factors = 1.0 + self.drift * self.course(np.linspace(0.0, 1.0, 401))
         return model.with_exposures(*exposure_nodes(factors))
-
-
-def _settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
-    whole = -np.expm1(-1.0 / fraction)
-    mean = (1.0 - fraction * whole) / whole
-    course: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
-    return course
 
 
 def _fit(unit: _T, course: ExposureCourse, position: NDArray[np.float64], noise: float) -> tuple[float, _T]:
