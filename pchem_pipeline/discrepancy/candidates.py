@@ -109,18 +109,18 @@ class Laboratory:
     left_out: dict[str, str] = field(default_factory=dict)
     _base: FloatArray | None = None
 
-    def guesses(self, classes: Mapping[str, type[Effect]], train: Evidence, test: Evidence) -> list[Effect]:
+    def guesses(self, classes: Mapping[str, type[Effect]], evidence: Sequence[Evidence]) -> list[Effect]:
         """Ask every candidate for hypotheses; one that raises is left out.
 
-        What shows nothing in the train frames may by chance do so in the test frames. A guess says only what
-        to look at: strengths are fitted on one split and scored on the other, both ways round.
+        The first evidence in which a candidate sees anything counts. A guess says only what to look at:
+        strengths are fitted on one split and scored on the other, both ways round.
         """
         found: list[Effect] = []
         for tag, effect in classes.items():
             if tag in {present.tag for present in self.model} | self.left_out.keys():
                 continue
             try:
-                guessed = list(effect.estimate(train)) or list(effect.estimate(test))
+                guessed = next(filter(None, (list(effect.estimate(one)) for one in evidence)), [])
                 found += guessed[:_MOST_HYPOTHESES]
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:

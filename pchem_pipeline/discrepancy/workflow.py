@@ -151,7 +151,8 @@ class _Search:
             number = len(rounds)
             laboratory = self._laboratory(maps, names, number)
             shifts = (z.train - null.mean, z.test - null.mean)
-            hypotheses = self._hypotheses(laboratory, classes, (train, test), shifts, self._noise(null, 2))
+            seen = plain, train, test
+            hypotheses = self._hypotheses(laboratory, classes, seen, shifts, self._noise(null, 2))
             choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
             self.left_out |= laboratory.left_out
             if choice is None or not (still or choice.advantage > _CONVINCING):
@@ -282,11 +283,11 @@ class _Search:
         self,
         laboratory: Laboratory,
         classes: Mapping[str, type[Effect]],
-        evidence: tuple[Evidence, Evidence],
+        evidence: Sequence[Evidence],
         shifts: tuple[FloatArray, FloatArray],
         noise: Noise,
     ) -> list[Hypothesis]:
-        guesses = laboratory.guesses(classes, *evidence)
+        guesses = laboratory.guesses(classes, evidence)
         placebo = placebo_for(guesses, classes)
         hypotheses = laboratory.fingerprints([*guesses, *placebo])
         shift = (shifts[0] + shifts[1]) / 2.0
