@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set, log_density, tolerance
 
-__all__ = ["Choice", "Rival", "ScoredSet", "choose", "score_set"]
+__all__ = ["Choice", "Rival", "ScoredSet", "choose", "score_set", "seen_beside"]
 
 FloatArray = NDArray[np.float64]
 
@@ -238,12 +238,22 @@ def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise:
         return False
     parts = (first.parts + second.parts) / 2.0
     shift = (shifts[0] + shifts[1]) / 2.0
-    chance = np.diag(noise.covariance) / 2.0
-    for member, part in enumerate(parts):
-        others = np.delete(parts, member, axis=0)
-        if len(others):
-            scale = np.sqrt(chance + (_BLUR * tolerance(others, noise.model_error)) ** 2)
-            left, own = (shift - others.sum(axis=0)) / scale, part / scale
-            if not np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)):
-                return False
-    return True
+    both = replace(noise, covariance=noise.covariance / 2.0)
+    return len(parts) == 1 or all(
+        seen_beside(part, np.delete(parts, member, axis=0), shift, both) for member, part in enumerate(parts)
+    )
+
+
+def seen_beside(part: FloatArray, others: FloatArray, shift: FloatArray, noise: Noise) -> bool:
+    """Tell whether a statistic deviates from what other effects make of it, in the direction of an effect.
+
+    Args:
+        part: what the effect does to the statistics, shape (m,).
+        others: what the other effects do to them, shape (e, m).
+        shift: what is seen of all, shape (m,).
+        noise: of the shift.
+    """
+    blur = _BLUR * tolerance(others, noise.model_error)
+    scale = np.sqrt(np.diag(noise.covariance) + blur**2)
+    left, own = (shift - others.sum(axis=0)) / scale, part / scale
+    return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)))

@@ -19,7 +19,7 @@ from pchem_pipeline.discrepancy.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees, suspicious
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, correction, fit_set, tolerance
 from pchem_pipeline.discrepancy.likely_truth import likely_truth
-from pchem_pipeline.discrepancy.naming import Choice, choose
+from pchem_pipeline.discrepancy.naming import Choice, choose, seen_beside
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
 from pchem_pipeline.discrepancy.refit import Refit, expected_codes, refit_maps
@@ -306,9 +306,10 @@ class _Search:
 
         Asked twice: of the strengths as one simulation gives them, and as the replicates correct them.
         """
-        before, chosen = self.model, choice.present(self.settings.certainty)
+        before, shift, noise = self.model, z.both - null.mean, self._noise(null, 2)
+        chosen = self._needed(laboratory, choice.present(self.settings.certainty), shift, noise)
         while chosen:
-            added = self._added(laboratory, chosen, z.both - null.mean, self._noise(null, 2))
+            added = self._added(laboratory, chosen, shift, noise)
             if added is None:
                 break
             self.model = (*before, *(h.effect for h in added.hypotheses))
@@ -327,6 +328,25 @@ class _Search:
         """Return the fit under the present model, and the maps that replicates are drawn from."""
         fit = self._refit(plain)
         return fit, likely_truth(fit.maps, fit.covariance)
+
+    def _needed(
+        self, laboratory: Laboratory, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise
+    ) -> tuple[Hypothesis, ...]:
+        """Drop, the weakest first, what is not seen beside the others once these have their best strengths.
+
+        The comparison of the sets extrapolates strengths; of a strong effect that leaves enough for another.
+        """
+        weight = np.diag(noise.covariance) ** -0.5
+        certain = fit_set(chosen, shift, noise).certain
+        doubtful = [h for h, is_certain in zip(chosen, certain, strict=True) if not is_certain]
+        for one in sorted(doubtful, key=lambda h: float(np.sum((weight * h.fingerprint) ** 2))):
+            others = tuple(h for h in chosen if h.tag != one.tag)
+            if others:
+                [others] = laboratory.tuned([others], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
+                parts = fit_set(others, shift, noise).parts
+                if not seen_beside(one.fingerprint, parts, shift, noise):
+                    chosen = others
+        return chosen
 
     def _added(
         self, laboratory: Laboratory, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise

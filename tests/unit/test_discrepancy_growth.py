@@ -1,0 +1,108 @@
+"""How a chosen set enters the model: what is not needed, or not established in the end, stays outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.disagreement import Measured
+from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit
+from pchem_pipeline.discrepancy.naming import seen_beside
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.workflow import _Search
+from pchem_pipeline.effects.registry import effect_class
+
+M = 6
+NOISE = Noise(np.eye(M), 0.05)
+STRENGTHS = {"row_noise": "row_noise_dn", "frame_noise": "frame_noise_dn", "exposure_drift": "drift"}
+
+
+def hypothesis(tag: str, place: int, size: float) -> Hypothesis:
+    effect = effect_class(tag).model_validate({"tag": tag, STRENGTHS[tag]: 0.1})
+    return Hypothesis(effect, size * np.eye(M)[place])
+
+
+ROW, FRAME, DRIFT = hypothesis("row_noise", 0, 40.0), hypothesis("frame_noise", 1, 9.0), hypothesis(
+    "exposure_drift", 2, 6.0
+)  # fmt: skip
+
+
+class Exact:
+    """A laboratory in which strengths are what they are."""
+
+    prefix = "r0"
+
+    def tuned(self, sets: Sequence[Any], *_: Any, **__: Any) -> list[Any]:
+        return list(sets)
+
+
+class Chosen:
+    def __init__(self, *hypotheses: Hypothesis) -> None:
+        self.hypotheses = hypotheses
+
+    def present(self, certainty: float) -> tuple[Hypothesis, ...]:
+        return self.hypotheses
+
+
+def search(corrected: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> _Search:
+    """Return a search whose replicates correct the strengths to so many standard errors."""
+    rows = np.zeros(1, np.int64)
+    found = _Search(np.zeros((1, 1, 1), np.uint16), rows, None, DiscrepancySettings(), 1, 8, 1.0, (), list)  # type: ignore[arg-type]
+
+    def correct(added: SetFit, *_: Any) -> tuple[SetFit, str]:
+        errors = [1.0 / corrected[h.tag] for h in added.hypotheses]
+        return SetFit(added.hypotheses, np.ones(len(errors)), np.array(errors), added.certain), "grown"
+
+    monkeypatch.setattr(found, "_noise", lambda *_: NOISE)
+    monkeypatch.setattr(found, "_mapped", lambda *_: ("fit", "maps"))
+    monkeypatch.setattr(found, "_null", lambda *_: ("null", ()))
+    monkeypatch.setattr(found, "_corrected", correct)
+    return found
+
+
+def grow(found: _Search, *hypotheses: Hypothesis) -> Any:
+    total = sum(h.fingerprint for h in hypotheses)
+    z = Measured(*(np.asarray(total),) * 3)
+
+    class Nothing:
+        mean = np.zeros(M)
+
+    return found._grow(None, Exact(), Chosen(*hypotheses), Nothing(), None, z)  # type: ignore[arg-type]
+
+
+def test_what_the_replicates_correct_to_less_than_a_finding_is_taken_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = search({"row_noise": 12.0, "exposure_drift": 4.0}, monkeypatch)
+    grown = grow(found, ROW, DRIFT)
+    assert [h.tag for h in grown.added.hypotheses] == ["row_noise"]
+    assert [e.tag for e in found.model] == ["row_noise"]
+    both = search({"row_noise": 12.0, "exposure_drift": 5.0}, monkeypatch)
+    assert len(grow(both, ROW, DRIFT).added.hypotheses) == 2
+
+
+def test_where_nothing_is_left_the_model_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = search({"exposure_drift": 3.0}, monkeypatch)
+    found.model = (ROW.effect,)
+    assert grow(found, DRIFT) is None
+    assert found.model == (ROW.effect,)
+
+
+def test_an_effect_that_no_statistic_asks_for_beside_the_others_is_dropped() -> None:
+    found = _Search.__new__(_Search)
+    strong = ROW.fingerprint
+    twin = hypothesis("frame_noise", 0, 8.0)  # moves only what the strong one moves, by a fifth of it
+    kept = found._needed(Exact(), (ROW, twin), 1.1 * strong, NOISE)  # type: ignore[arg-type]
+    assert [h.tag for h in kept] == ["row_noise"]
+    kept = found._needed(Exact(), (ROW, FRAME), strong + FRAME.fingerprint, NOISE)  # type: ignore[arg-type]
+    assert [h.tag for h in kept] == ["row_noise", "frame_noise"]
+
+
+def test_seen_beside_needs_the_direction_of_the_effect() -> None:
+    others, own = np.array([ROW.fingerprint]), FRAME.fingerprint
+    assert seen_beside(own, others, ROW.fingerprint + own, NOISE)
+    assert not seen_beside(own, others, ROW.fingerprint - own, NOISE)
+    assert not seen_beside(own, others, ROW.fingerprint + 0.2 * own, NOISE)
