@@ -11,6 +11,7 @@ from discrepancy_cases import EFFECTS, twins_of
 
 Record = dict[str, Any]
 _LARGEST_SET = 3
+_GOOD_SENSOR = 0.32  # e-, about the middle of the sensors that are drawn
 
 
 class Answer:
@@ -51,6 +52,11 @@ class Answer:
     def answered(self) -> bool:
         """Some name was given, alone or in a set."""
         return bool(self.named or self.sets)
+
+    @property
+    def silent(self) -> bool:
+        """The frames were found to agree with the model."""
+        return self.verdict == "consistent"
 
     @property
     def word(self) -> str:
@@ -107,6 +113,7 @@ def print_figures(records: Iterable[Record]) -> None:
     answers = [Answer(record) for record in records]
     _confusion(answers)
     _naming(answers)
+    _by_read_noise(records, answers)
     _gaps([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
     compared = [(r, a) for r, a in zip(records, answers, strict=True) if r.get("bias")]
     _bias_titles()
@@ -170,6 +177,21 @@ def _naming(answers: Sequence[Answer]) -> None:
                 most=0.05,
             )
         _share(f"{title}: unexplained", group, lambda a: a.verdict == "unexplained", least=0.5)
+
+
+def _by_read_noise(records: Sequence[Record], answers: Sequence[Answer]) -> None:
+    """Print how naming depends on the sensor: the hidden strengths are those of a typical one."""
+    print(f"\nSingle effects by the read noise of the sensor (above or below {_GOOD_SENSOR:g} e-)")
+    for level in (4.0, 1.5):
+        for title, low, high in (("below", 0.0, _GOOD_SENSOR), ("above", _GOOD_SENSOR, math.inf)):
+            group = [
+                a
+                for r, a in zip(records, answers, strict=True)
+                if a.kind == "single" and a.level == level and low <= r.get("read_noise_e", math.nan) < high
+            ]
+            for words, true in (("named or in a set of <= 3", "within"), ("nothing said", "silent")):
+                hits = sum(getattr(a, true) for a in group)
+                _line(f"{level:g} s95, {title}: {words}", hits, len(group), "-", None)
 
 
 def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:

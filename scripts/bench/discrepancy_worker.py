@@ -31,6 +31,7 @@ def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, 
             record |= _look(case, frames, options)
             # only now is the key opened
             record["hidden"] = json.loads(key.read_text())["effects"]
+            record["read_noise_e"] = float(np.median(np.load(key.with_suffix(".npz"))["read_noise_e"]))
             effects = record.pop("effects")
             if with_bias:
                 record |= _compared(case, frames, effects, key)
