@@ -20,7 +20,7 @@ from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.registry import broken_plugins, effect_classes
 from pchem_pipeline.errors import ConfigError, PchEmError
 
-__all__ = ["Laboratory", "Mapper", "candidate_classes", "placebo_for", "serial"]
+__all__ = ["REPEATS", "Laboratory", "Mapper", "candidate_classes", "placebo_for", "serial"]
 
 FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
@@ -32,7 +32,11 @@ _MOST_HYPOTHESES = 6  # of one effect
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 _LARGEST_STEP = 30.0
+REPEATS = 3  # simulations of the hypotheses that sets are made of
+# standard deviations of what a single simulation may show by chance, below and above which it is nothing or
+# all of it; of the mean of several, in its own standard errors
 _CHANCE, _CERTAIN = 2.0, 4.0
+_CHANCE_OF_MEAN, _CERTAIN_OF_MEAN = 1.0, 2.0
 
 
 def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
@@ -107,7 +111,7 @@ class Laboratory:
     prefix: str
     seed: int
     left_out: dict[str, str] = field(default_factory=dict)
-    _base: FloatArray | None = None
+    _rows: dict[str, FloatArray] = field(default_factory=dict)
 
     def guesses(self, classes: Mapping[str, type[Effect]], evidence: Sequence[Evidence]) -> list[Effect]:
         """Ask every candidate for hypotheses; one that raises is left out.
@@ -127,35 +131,53 @@ class Laboratory:
                 self._leave_out(tag, error)
         return found
 
-    def fingerprints(self, effects: Sequence[Effect]) -> list[Hypothesis]:
-        """Simulate effects on the random numbers of the model without them; failures are left out."""
-        base = [] if self._base is not None else [self._replicate(())]
-        shown = [effect.representative(self.acquisition.numbers) for effect in effects]
-        tasks = [self._replicate((effect,)) for effect, _ in shown]
-        if not tasks:
+    def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
+        """Simulate effects on the random numbers of the model without them; failures are left out.
+
+        Args:
+            effects: with their parameters.
+            repeats: simulations of each; what moves a statistic by less than chance does in a single one is
+                lost there, and that is what tells relatives apart.
+        """
+        if not effects:
             return []
-        results = self.mapper([*base, *tasks])
-        if base:
-            first = results.pop(0)
-            if isinstance(first, Exception):
-                raise first
-            self._base = self._row(first)
-        assert self._base is not None
-        found = []
-        for effect, (_, share), result in zip(effects, shown, results, strict=True):
-            if isinstance(result, Exception):
-                self._leave_out(effect.tag, result)
+        shown = [effect.representative(self.acquisition.numbers) for effect in effects]
+        self._simulate([None, *(effect for effect, _ in shown)], repeats)
+        base = self._known(None, repeats)
+        return [
+            Hypothesis(effect, share * _without_chance(self._known(one, repeats) - base))
+            for effect, (one, share) in zip(effects, shown, strict=True)
+            if all(self._replicate(one, j).key in self._rows for j in range(repeats))
+        ]
+
+    def _simulate(self, effects: Sequence[Effect | None], repeats: int) -> None:
+        """Simulate the model with each effect, and with none (which must succeed), unless that is known."""
+        tasks = [(effect, self._replicate(effect, j)) for effect in effects for j in range(repeats)]
+        new = {task.key: (effect, task) for effect, task in tasks if task.key not in self._rows}
+        results = self.mapper([task for _, task in new.values()]) if new else []
+        for (effect, task), result in zip(new.values(), results, strict=True):
+            if not isinstance(result, Exception):
+                self._rows[task.key] = self._row(result)
+            elif effect is None:
+                raise result
             else:
-                found.append(Hypothesis(effect, share * _without_chance(self._row(result) - self._base)))
-        return found
+                self._leave_out(effect.tag, result)
+
+    def _known(self, effect: Effect | None, repeats: int) -> FloatArray:
+        """Return the statistics of the model with an effect, shape (repeat, statistic)."""
+        return np.array([self._rows[self._replicate(effect, j).key] for j in range(repeats)])
 
     def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
-        """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself."""
+        """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
+
+        Those are simulated several times in the end.
+        """
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         order = np.argsort([-fit.log_score(shift, noise) for fit in fits], kind="stable")
         chosen = [int(i) for i in order[:_REFINED] if fits[i].factors[0] > 0.0]
         tuned = self.tuned([(hypotheses[i],) for i in chosen], shift, noise, steps=2, close=_CLOSE)
-        better = {i: one for i, (one,) in zip(chosen, tuned, strict=True)}
+        sharp = {id(h.effect): h for h in self.fingerprints([one.effect for (one,) in tuned], REPEATS)}
+        better = {i: sharp.get(id(one.effect), one) for i, (one,) in zip(chosen, tuned, strict=True)}
         return [better.get(int(i), hypotheses[i]) for i in order]
 
     def tuned(
@@ -166,6 +188,7 @@ class Laboratory:
         *,
         steps: int,
         close: float,
+        repeats: int = 1,
     ) -> list[tuple[Hypothesis, ...]]:
         """Tune the strengths within each set, by simulation; a step that predicts worse is halved.
 
@@ -177,25 +200,25 @@ class Laboratory:
             noise: of the shift.
             steps: simulations of each hypothesis, at most.
             close: relative change of a strength that is not worth a simulation.
+            repeats: simulations of each at each strength.
         """
         states = [_Tuning(one, _as_simulated(one, shift, noise)) for one in sets]
         for _ in range(steps):
             proposals = [state.proposal(shift, noise, close) for state in states]
             effects = [effect for proposal in proposals for effect in proposal]
-            simulated = {id(h.effect): h for h in self.fingerprints(effects)}
+            simulated = {id(h.effect): h for h in self.fingerprints(effects, repeats)}
             for state, proposal in zip(states, proposals, strict=True):
                 new = tuple(simulated[id(e)] for e in proposal if id(e) in simulated)
                 if new and len(new) == len(proposal):
                     state.judge(new, _as_simulated(new, shift, noise))
         return [state.best for state in states]
 
-    def _replicate(self, effects: tuple[Effect, ...]) -> Replicate:
-        text = json.dumps([e.model_dump(mode="json") for e in effects], sort_keys=True)
+    def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
+        text = json.dumps([] if effect is None else [effect.model_dump(mode="json")], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        label = effects[0].tag if effects else "base"
-        return Replicate(
-            f"{self.prefix}-{label}-{digest}", self.maps, (*self.model, *effects), self.seed, self.acquisition
-        )
+        label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
+        effects = self.model if effect is None else (*self.model, effect)
+        return Replicate(f"{self.prefix}-{label}", self.maps, effects, self.seed + repeat, self.acquisition)
 
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
@@ -207,14 +230,21 @@ class Laboratory:
         _log.warning("effect %s left out: %s", tag, self.left_out[tag])
 
 
-def _without_chance(shift: FloatArray) -> FloatArray:
-    """Return a fingerprint without what is likely chance: 0 below 2 standard deviations, all of it above 4.
+def _without_chance(shifts: FloatArray) -> FloatArray:
+    """Return the mean shift of simulations, (repeat, statistic), without what is likely chance.
 
     The random numbers are shared with the model without the effect, but where every sample moves a little the
     histograms are drawn anew; regressed on such chance, every strength would come out too low.
     """
-    weight = np.clip((np.abs(shift) - _CHANCE) / (_CERTAIN - _CHANCE), 0.0, 1.0)
-    return np.asarray(shift * weight)
+    mean, repeats = shifts.mean(axis=0), shifts.shape[0]
+    low, high, error = _CHANCE, _CERTAIN, np.ones_like(mean)
+    if repeats > 1:
+        scatter = shifts.std(axis=0, ddof=1)
+        # few simulations do not know their scatter well: never below that of most statistics
+        error = np.maximum(scatter, np.sqrt(np.mean(scatter**2))) / np.sqrt(repeats)
+        low, high = _CHANCE_OF_MEAN, _CERTAIN_OF_MEAN
+    weight = np.clip((np.abs(mean) - low * error) / np.maximum((high - low) * error, 1e-12), 0.0, 1.0)
+    return np.asarray(mean * weight)
 
 
 @dataclass

@@ -14,7 +14,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.candidates import Laboratory, Mapper, candidate_classes, placebo_for, serial
+from pchem_pipeline.discrepancy.candidates import (
+    REPEATS,
+    Laboratory,
+    Mapper,
+    candidate_classes,
+    placebo_for,
+    serial,
+)
 from pchem_pipeline.discrepancy.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.disagreement import Measured, disagrees, suspicious
 from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, correction, fit_set, tolerance
@@ -342,7 +349,9 @@ class _Search:
         for one in sorted(doubtful, key=lambda h: float(np.sum((weight * h.fingerprint) ** 2))):
             others = tuple(h for h in chosen if h.tag != one.tag)
             if others:
-                [others] = laboratory.tuned([others], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
+                [others] = laboratory.tuned(
+                    [others], shift, noise, steps=_REFINEMENTS, close=_CLOSE, repeats=REPEATS
+                )
                 parts = fit_set(others, shift, noise).parts
                 if not seen_beside(one.fingerprint, parts, shift, noise):
                     chosen = others
@@ -354,7 +363,9 @@ class _Search:
         """Refine the strengths of the chosen set together; drop what may be nothing; None if that is all."""
         noise = replace(noise, model_error=_FINE_ERROR)
         while chosen:
-            [chosen] = laboratory.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE)
+            [chosen] = laboratory.tuned(
+                [chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE, repeats=REPEATS
+            )
             kept = fit_set(chosen, shift, noise).established(_ESTABLISHED)
             if len(kept) == len(chosen):
                 break
@@ -422,3 +433,11 @@ class _Search:
                 "final": int(self.splits.final.size),
             },
         )
+
+
+def _tuned(
+    laboratory: Laboratory, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise
+) -> tuple[Hypothesis, ...]:
+    """Return a set at the strengths that explain the shift best."""
+    [best] = laboratory.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE, repeats=REPEATS)
+    return best
