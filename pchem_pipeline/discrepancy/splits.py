@@ -25,7 +25,7 @@ class Splits:
     Attributes:
         train: to estimate on.
         test: to score on.
-        final: used for the remaining gap only.
+        final: used for the remaining gap, and to confirm what was found without them.
         block_frames: frames in a block of consecutive ones.
     """
 

@@ -63,9 +63,9 @@ def search(corrected: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> _Sea
     return found
 
 
-def grow(found: _Search, *hypotheses: Hypothesis) -> Any:
-    total = sum(h.fingerprint for h in hypotheses)
-    z = Measured(*(np.asarray(total),) * 3)
+def grow(found: _Search, *hypotheses: Hypothesis, final: Sequence[Hypothesis] | None = None) -> Any:
+    total, last = (sum(h.fingerprint for h in some) for some in (hypotheses, final or hypotheses))
+    z = Measured(np.asarray(total), np.asarray(total), np.asarray(last))
 
     class Nothing:
         mean = np.zeros(M)
@@ -84,6 +84,11 @@ def test_what_the_replicates_correct_to_less_than_a_finding_is_taken_back(
     assert len(grow(both, ROW, DRIFT).added.hypotheses) == 2
 
 
+def test_what_the_final_frames_do_not_show_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = search({"row_noise": 12.0, "exposure_drift": 6.0}, monkeypatch)
+    assert [h.tag for h in grow(found, ROW, DRIFT, final=[ROW]).added.hypotheses] == ["row_noise"]
+
+
 def test_where_nothing_is_left_the_model_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     found = search({"exposure_drift": 3.0}, monkeypatch)
     found.model = (ROW.effect,)
@@ -91,10 +96,10 @@ def test_where_nothing_is_left_the_model_is_as_it_was(monkeypatch: pytest.Monkey
     assert found.model == (ROW.effect,)
 
 
-def test_an_effect_that_no_statistic_asks_for_beside_the_others_is_dropped() -> None:
+def test_an_effect_that_explains_little_beside_the_others_is_dropped() -> None:
     found = _Search.__new__(_Search)
     strong = ROW.fingerprint
-    twin = hypothesis("frame_noise", 0, 8.0)  # moves only what the strong one moves, by a fifth of it
+    twin = hypothesis("frame_noise", 0, 8.0)  # moves only what the strong one moves
     kept = found._needed(Exact(), (ROW, twin), 1.1 * strong, NOISE)  # type: ignore[arg-type]
     assert [h.tag for h in kept] == ["row_noise"]
     kept = found._needed(Exact(), (ROW, FRAME), strong + FRAME.fingerprint, NOISE)  # type: ignore[arg-type]
