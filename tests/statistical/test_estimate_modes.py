@@ -104,7 +104,8 @@ def test_a_drift_of_its_own_shape_is_found_as_a_path():
 
 def test_a_bias_that_settles_is_found_as_such():
     first = estimated(BiasDrift(drift_dn=0.6, shape="settling", settling_fraction=0.1))[0]
-    assert first.shape == "settling" and 0.05 <= first.settling_fraction <= 0.2
+    assert first.shape == "settling"
+    assert 0.05 <= first.settling_fraction <= 0.2
     assert first.drift_dn == pytest.approx(0.6, abs=0.1)
 
 
