@@ -147,6 +147,8 @@ def _discrepancy() -> list[Variable]:
         ("code_observed", ("code",), "float64", "1", "samples at each DN, all usable pixels"),
         ("code_expected", ("code",), "float64", "1", "samples expected at each DN from the fitted PCDs"),
         ("code_grown", ("code",), "float64", "1", "samples expected at each DN from the grown model"),
+        ("added_exposure", ("added_level", *_MAP), "float64", "e-", "exposure that effects add to pixels"),
+        ("added_weight", ("added_level", *_MAP), "float64", "1", "part of the frames at each added exposure"),
         ("frame_number", ("frame",), "int64", "1", "frame number in the run"),
         ("frame_charge", ("frame",), "float64", "1", "relative deviation of the exposure of each frame"),
         ("frame_readout", ("frame",), "float64", "DN", "mean readout residual of each frame"),

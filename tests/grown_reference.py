@@ -12,6 +12,7 @@ from pchem_pipeline.model.marginal import MarginalModel
 EVERYTHING = (
     MarginalModel()
     .with_exposures([0.3, 0.7], [1.2, (1 - 0.36) / 0.7])
+    .with_added_exposure([[0.0, 0.4, 1.1]], [[0.5, 0.3, 0.2]])
     .with_noise(
         [0.2, 0.5, 0.3],
         shift_sigma=[-0.5, 0.1, 0.4],
@@ -30,6 +31,7 @@ LAWS = {
     "hardly_dispersed": MarginalModel().with_counts("negative_binomial", 2e-4),
     "borel": MarginalModel().with_counts("borel", 0.1),
     "mixture": MarginalModel().with_exposures([0.5, 0.5], [0.8, 1.2]),
+    "added": MarginalModel().with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]]),
     "skew": MarginalModel().with_noise([0.7, 0.3], shift_sigma=[-0.3, 0.7], width=0.9),
     "variance": MarginalModel().with_variance(dn2=0.5, e2=0.01, per_electron=0.02, per_electron2=0.003),
     "levels": MarginalModel().with_levels(scale=0.98, shift_e=0.2, curvature=0.02),
@@ -78,8 +80,9 @@ def reference_mass(model: MarginalModel, parameters: tuple[float, ...], codes: r
     parts = []
     for k in range(int(exposure + 20 * math.sqrt(exposure) + 60)):
         weight = sum(
-            w * electron_mass(model, k, exposure * f)
+            w * u * electron_mass(model, k, exposure * f + d)
             for w, f in zip(model.exposure_weights, model.exposure_factors, strict=True)
+            for u, d in zip(model.added_weights[0], model.added_exposure[0], strict=True)
         )
         level = model.level_scale[0] * k * (1 + model.curvature * (k - 1) / 2) + model.level_shift_e[0]
         for w, shift_e, shift_dn, shift_sigma, width in zip(*lobes, strict=True):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.evidence import PixelMaps
@@ -42,6 +43,7 @@ def refit_maps(
     maps: PixelMaps,
     effects: Sequence[Effect],
     covariance: NDArray[np.float64],
+    added: AddedExposure | None = None,
 ) -> Refit:
     """Fit the pixels of some frames with effects in their law.
 
@@ -50,6 +52,7 @@ def refit_maps(
         maps: plain fit of the same frames; pixels that are not usable stay so.
         effects: of the grown model.
         covariance: of the plain fit, shape (y, x, 4, 4).
+        added: exposure that the effects add to each pixel; None: it counts as part of H.
 
     Returns:
         New maps; the old ones where the effects cannot be fitted with.
@@ -58,7 +61,7 @@ def refit_maps(
     old = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
     flat = tuple(values.ravel() for values in old)
     try:
-        law = marginal_model(effects, pixel_maps(flat, maps.usable))
+        law = marginal_model(effects, pixel_maps(flat, maps.usable), added)
     except ConfigError:
         return Refit(maps, {}, covariance)
     histograms = histogram_frames(frames)

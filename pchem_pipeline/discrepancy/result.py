@@ -13,6 +13,7 @@ from pchem_pipeline.discrepancy.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.catalogue import VERSION as STATISTICS_VERSION
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.where import Place
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 
@@ -182,6 +183,7 @@ class Discrepancy:
         residuals: codes that the final model does not account for (ready-made histograms).
         set_aside: codes that its fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
             limit.
+        added: exposure that the effects add to single pixels beside the H of ``maps``; None: nothing.
         code_grown: samples expected at each code of ``evidence.code`` from the final model; None where
             nothing was added or the model gives no law.
     """
@@ -205,6 +207,7 @@ class Discrepancy:
     residuals: tuple[Residual, ...] = ()
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
     code_grown: NDArray[np.float64] | None = None
+    added: AddedExposure | None = None
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -19,7 +19,8 @@ Halos and histories of several effects add up.
 The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
 :attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
 (:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.marginal`), so that the
-fit of the four parameters can run with it.
+fit of the four parameters can run with it. What it adds to the exposure of single pixels, it finds in the
+frames (:meth:`~Effect.added_exposure`).
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from pchem_pipeline.effects.added import AddedExposure
     from pchem_pipeline.effects.context import EffectContext
     from pchem_pipeline.effects.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.marginal import MarginalModel
@@ -139,6 +141,23 @@ class Effect(Section):
             The law with the effect; the same one where it leaves a pixel's own histogram as it is.
         """
         return model
+
+    def added_exposure(
+        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+    ) -> AddedExposure | None:
+        """Return what it adds to the exposure of each pixel: H is then the exposure without.
+
+        For effects on single pixels, whose histograms show the mean exposure whatever it is made of.
+
+        Args:
+            frames: (frame, y, x), DN; not to be changed.
+            numbers: their numbers in the run, increasing, shape (frame,).
+            maps: plain fit of these pixels, (y, x) each.
+
+        Returns:
+            Levels and weights, (j, y, x) each; None where it adds nothing, or only in proportion to H.
+        """
+        return None
 
     def halo(self) -> int:
         """Return how many rows on either side a row depends on, px."""

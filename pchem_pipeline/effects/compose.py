@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.evidence import PixelMaps
 from pchem_pipeline.errors import ConfigError
@@ -31,12 +32,15 @@ def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.boo
     return PixelMaps(exposure, gain, bias, sigma, known)
 
 
-def marginal_model(effects: Sequence[Effect], maps: PixelMaps) -> MarginalModel:
+def marginal_model(
+    effects: Sequence[Effect], maps: PixelMaps, added: AddedExposure | None = None
+) -> MarginalModel:
     """Return the law of the pixels' samples with all effects, composed in their order.
 
     Args:
         effects: of the run's model.
         maps: what is known of the n pixels before, each (n,).
+        added: exposure that effects add to these pixels, (j, n) each or of that many pixels; None: nothing.
 
     Raises:
         ConfigError: if an effect cannot say what it does to these pixels; it is named.
@@ -51,6 +55,9 @@ def marginal_model(effects: Sequence[Effect], maps: PixelMaps) -> MarginalModel:
                 f"model.effects: {effect.tag} ({type(effect).__module__}) cannot be fitted with: "
                 f"{type(error).__name__}: {error}; remove it from model.effects"
             ) from error
+    if added is not None:
+        exposure, weight = added.flat()
+        model = model.with_added_exposure(exposure.T, weight.T)
     return model
 
 

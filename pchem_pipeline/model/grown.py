@@ -262,6 +262,9 @@ def _climb(
         np.zeros(n, np.int64) if plain is None else plain.fit_status.astype(np.int64) & int(FAILED),
     )
     gaps = np.full(n, np.inf) if plain is None else plain.likelihood_gap
+    # the plain fit of an exposure that is not one may be an electron off
+    mixed = ((model.added_weights > 0.0) & (model.added_exposure > 0.0)).any(axis=1)
+    gaps = np.where(mixed, np.minimum(gaps, 0.999 * _CLEAR_GAP), gaps)
     grown_tile_numba.fit_tile(
         counts,
         origin,

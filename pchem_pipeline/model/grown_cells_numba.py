@@ -89,7 +89,7 @@ def _list_numbers(
         farthest = max(farthest, shift + abs(cells.lobes[SHIFT_SIGMA, lobe]) * math.sqrt(analog2))
     from_below, to_above = cells.bottom >= 0, cells.top <= cells.n_bins
     last = cells.first + cells.n_bins + cells.margin
-    most = exposure * np.max(law.exposure_factors)
+    most = exposure * np.max(law.exposure_factors) + np.max(cells.added_exposure)
     count, previous = 0, -math.inf
     k = 0.0
     while count < numbers.shape[0]:
@@ -102,7 +102,14 @@ def _list_numbers(
         previous = level
         if from_below or mean + around > cells.first - cells.margin:
             mass, slope, bend = electron_number(
-                law.law, law.dispersion, int(k), exposure, law.exposure_weights, law.exposure_factors
+                law.law,
+                law.dispersion,
+                int(k),
+                exposure,
+                law.exposure_weights,
+                law.exposure_factors,
+                cells.added_weights,
+                cells.added_exposure,
             )
             if mass > cut:
                 numbers[count, 0], numbers[count, 1] = k, mass

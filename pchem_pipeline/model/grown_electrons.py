@@ -27,6 +27,7 @@ def nearest_pcd(parameters: Parameters, model: MarginalModel) -> tuple[FloatArra
         The four, each (n,): DN and e- as given.
     """
     exposure, gain, bias, sigma = columns_of(parameters).T
+    exposure = exposure + (model.added_weights * model.added_exposure).sum(axis=1)
     step, analog = 1.0 / gain, np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.0))
     weights = model.lobe_weights
     shift = (

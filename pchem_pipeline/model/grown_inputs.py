@@ -90,7 +90,12 @@ def pack(model: MarginalModel, n: int) -> Law:
     lobes = {
         name: np.array(np.broadcast_to(per_pixel(f"lobe_{name}"), shape), order="C") for name in _LOBE_FIELDS
     }
-    for weights in (model.exposure_weights[None], lobes["weights"]):
+    both = np.broadcast_shapes(model.added_exposure.shape, model.added_weights.shape)
+    added = {
+        name: np.array(np.broadcast_to(per_pixel(f"added_{name}"), both), order="C")
+        for name in ("exposure", "weights")
+    }
+    for weights in (model.exposure_weights[None], added["weights"], lobes["weights"]):
         if not np.allclose(weights.sum(axis=1), 1.0, rtol=0, atol=1e-6):
             raise ValueError("the weights of a mixture do not sum to 1")
     return Law(
@@ -98,6 +103,8 @@ def pack(model: MarginalModel, n: int) -> Law:
         float(model.dispersion),
         np.ascontiguousarray(model.exposure_weights, np.float64),
         np.ascontiguousarray(model.exposure_factors, np.float64),
+        added["exposure"],
+        added["weights"],
         per_pixel("level_scale"),
         per_pixel("level_shift_e"),
         float(model.curvature),

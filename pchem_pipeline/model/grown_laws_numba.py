@@ -60,6 +60,8 @@ def electron_number(
     exposure: float,
     weights: NDArray[np.float64],
     factors: NDArray[np.float64],
+    added_weights: NDArray[np.float64],
+    added: NDArray[np.float64],
 ) -> tuple[float, float, float]:
     """Return P(k) of a mixture of exposures and its first two derivatives in log exposure.
 
@@ -70,14 +72,25 @@ def electron_number(
         exposure: H, e-.
         weights: of the exposures, shape (m,).
         factors: exposures in units of H, shape (m,).
+        added_weights: of the exposures beside it, shape (j,).
+        added: these exposures, e-, shape (j,).
     """
     mass = slope = bend = 0.0
     for b in range(weights.size):
-        log_mass, first, second = _one_law(law, dispersion, float(k), exposure * factors[b])
-        part = weights[b] * math.exp(log_mass)
-        mass += part
-        slope += part * first
-        bend += part * (second + first * first)
+        own = exposure * factors[b]
+        for j in range(added.size):
+            if added_weights[j] == 0.0:
+                continue
+            whole = own + added[j]
+            log_mass, first, second = _one_law(law, dispersion, float(k), whole)
+            # from the logarithm of the whole exposure to that of H: d log whole = share d log H
+            share = own / whole
+            second = (second * share + first * (1.0 - share)) * share
+            first *= share
+            part = weights[b] * added_weights[j] * math.exp(log_mass)
+            mass += part
+            slope += part * first
+            bend += part * (second + first * first)
     return mass, slope, bend
 
 

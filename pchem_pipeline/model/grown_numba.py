@@ -42,7 +42,9 @@ N_WORDS = 3
 
 _ROUNDING = 1.0 / 12.0
 _LEAST_VARIANCE = 1e-6  # DN^2
-_LEAST_SHARE = 0.1  # of the variance that the plain fit found, left to the pixel itself at the start
+_LEAST_SHARE = (
+    0.1  # of the variance and the exposure that the plain fit found, left to the pixel itself at the start
+)
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -125,6 +127,8 @@ def make_cells(
         float(first_code - centre) - 0.5,
         lobes,
         count,
+        law.added_exposure[_row(law.added_exposure, pixel)],
+        law.added_weights[_row(law.added_weights, pixel)],
         law.level_scale[_row(law.level_scale, pixel)],
         law.level_shift_e[_row(law.level_shift_e, pixel)],
         law.extra_variance_e2[_row(law.extra_variance_e2, pixel)],
@@ -143,11 +147,16 @@ def to_theta(
 ) -> None:
     """Fill ``theta`` from (H, g, mu, sigma).
 
-    Unless ``warm``, the read noise is that of a plain fit, which holds all that widens the peaks: what the
-    law adds is taken off, but for a tenth.
+    Unless ``warm``, H and the read noise are those of a plain fit, which hold the mean exposure and all that
+    widens the peaks: what the law adds is taken off, but for a tenth.
     """
     a = 1.0 / parameters[1]
-    theta[LOG_EXPOSURE] = math.log(parameters[0])
+    exposure = parameters[0]
+    if not warm:
+        for j in range(cells.added_exposure.size):
+            exposure -= cells.added_weights[j] * cells.added_exposure[j]
+        exposure = max(exposure, _LEAST_SHARE * parameters[0])
+    theta[LOG_EXPOSURE] = math.log(exposure)
     theta[STEP] = a
     theta[BIAS] = parameters[2] - centre
     analog2 = max(parameters[3] * parameters[3] - _ROUNDING, _LEAST_VARIANCE)

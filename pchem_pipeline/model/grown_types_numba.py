@@ -28,6 +28,8 @@ class Law(NamedTuple):
     dispersion: float
     exposure_weights: NDArray[np.float64]
     exposure_factors: NDArray[np.float64]
+    added_exposure: NDArray[np.float64]
+    added_weights: NDArray[np.float64]
     level_scale: NDArray[np.float64]
     level_shift_e: NDArray[np.float64]
     curvature: float
@@ -64,6 +66,7 @@ class Cells(NamedTuple):
         first: place of the first edge, less the centre, without any shift.
         lobes: resolved lobes, shape (N_LOBE_ROWS, at least n_lobes).
         n_lobes: lobes in use.
+        added_exposure, added_weights: exposures beside H, e-, and their weights, shape (j,).
         level_scale, level_shift: of the comb, and e-.
         extra_e2, extra_dn2: variance, e-^2 and DN^2.
     """
@@ -77,6 +80,8 @@ class Cells(NamedTuple):
     first: float
     lobes: NDArray[np.float64]
     n_lobes: int
+    added_exposure: NDArray[np.float64]
+    added_weights: NDArray[np.float64]
     level_scale: float
     level_shift: float
     extra_e2: float

@@ -34,9 +34,9 @@ def _zero() -> FloatArray:
 class MarginalModel:
     """The mass of code x given (H, g, mu, sigma) of a pixel.
 
-    ``P(x) = sum_b w_b sum_k P(k; H f_b) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]`` with mean
-    ``m = mu + (level_scale k (1 + curvature (k - 1) / 2) + level_shift_e + shift_e_l) / g + shift_dn_l +
-    shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron
+    ``P(x) = sum_bj w_b u_j sum_k P(k; H f_b + d_j) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]``
+    with mean ``m = mu + (level_scale k (1 + curvature (k - 1) / 2) + level_shift_e + shift_e_l) / g +
+    shift_dn_l + shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron
     k + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 = sigma^2 - 1/12 is the
     analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and code edges
     ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there. A share of
@@ -48,6 +48,8 @@ class MarginalModel:
             H / (1 - l)^2 at mean H; no unit.
         exposure_weights, exposure_factors: discrete mixture of exposures H f_b, shape (m,) each; weights sum
             to 1 and the mean factor is 1.
+        added_exposure, added_weights: discrete mixture of exposures d_j beside H, e-, >= 0, and its weights
+            u_j, shape (n or 1, j) each; weights sum to 1 along j.
         level_scale: DN per electron of the comb relative to 1/g, shape (n,) or (1,).
         level_shift_e: shift of all levels, e-, shape (n,) or (1,).
         curvature: relative change of the step per electron, no unit.
@@ -73,6 +75,8 @@ class MarginalModel:
     dispersion: float = 0.0
     exposure_weights: FloatArray = field(default_factory=_one)
     exposure_factors: FloatArray = field(default_factory=_one)
+    added_exposure: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    added_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     level_scale: FloatArray = field(default_factory=_one)
     level_shift_e: FloatArray = field(default_factory=_zero)
     curvature: float = 0.0
@@ -119,6 +123,17 @@ class MarginalModel:
             self,
             exposure_weights=np.outer(self.exposure_weights, w).ravel(),
             exposure_factors=np.outer(self.exposure_factors, f).ravel(),
+        )
+
+    def with_added_exposure(self, exposure_e: ArrayLike, weights: ArrayLike) -> MarginalModel:
+        """Return a copy whose pixels also get one of several exposures, (n, j) e- each (all sums)."""
+        d, u = (np.atleast_2d(np.asarray(values, np.float64)) for values in (exposure_e, weights))
+        sums = self.added_exposure[:, :, None] + d[:, None, :]
+        products = self.added_weights[:, :, None] * u[:, None, :]
+        return replace(
+            self,
+            added_exposure=np.ascontiguousarray(sums.reshape(sums.shape[0], -1)),
+            added_weights=np.ascontiguousarray(products.reshape(products.shape[0], -1)),
         )
 
     def with_noise(
@@ -239,6 +254,8 @@ class MarginalModel:
 
 #: Fields that may have one row per pixel.
 _PER_PIXEL = (
+    "added_exposure",
+    "added_weights",
     "level_scale",
     "level_shift_e",
     "extra_variance_e2",

@@ -83,7 +83,7 @@ _ALL = (
         ("fit", "model", "run.tile"),
         ("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),
         ("fit",),
-        identities.adc_limits,
+        identities.fit_inputs,
     ),
     Declaration("maps", 3, ("fit",), ("maps", "run.tile"), ("fit",), ("maps",), identities.integration_time),
     Declaration(

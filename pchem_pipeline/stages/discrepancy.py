@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.workflow import find_discrepancies
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.settings import ModelSettings
 from pchem_pipeline.errors import PchEmError, StoreError, quoted
+from pchem_pipeline.stages.added_exposure import write_added_exposure
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.discrepancy_arrays import evidence_arrays
@@ -132,6 +133,8 @@ def run(context: StageContext) -> None:
         # the search counts pixels from the corner of its window, people from that of the sensor
         place["pixels"] = [[y + window.rows[0], x + window.columns[0]] for y, x in place["pixels"]]
     _write(context, found, result, before)
+    write_added_exposure(context.store, found.added, found.model, window.rows, window.columns)
+    _grow(context, found, before)
 
 
 def _run_histograms(context: StageContext) -> None:
@@ -148,6 +151,7 @@ def _run_histograms(context: StageContext) -> None:
         model=before,
     )
     _write(context, found, found.to_json(), before)
+    _grow(context, found, before)
     context.run_units([WHOLE], _nothing_left, by_tiles=False)
 
 
@@ -228,6 +232,10 @@ def _write(
     )
     for tag, reason in found.left_out.items():
         context.note(f"effect {tag} left out: {reason}")
+
+
+def _grow(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
+    """Put what was found into the model of the run, if wanted."""
     if context.config.discrepancy.add and found.model != tuple(before):
         grow_model(context, found.model, found.set_aside)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.errors import InputError
 from pchem_pipeline.model.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
+from pchem_pipeline.stages.added_exposure import fitted_added_exposure
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.fitted_model import deciding_maps, fitted_effects
@@ -89,7 +90,9 @@ def _do_band(band: Band, *, store: Path, source: FrameSource, depth: int) -> dic
     opened = open_store(store)
     rows = slice(band.y0, band.y1)
     maps = [opened.read(f"fit/{name}", (rows, slice(None))) for name in PARAMETERS]
-    parameters = deciding_maps(maps, fitted_effects(opened))
+    effects = fitted_effects(opened)
+    added = fitted_added_exposure(opened, effects, (rows, slice(None)))
+    parameters = deciding_maps(maps, effects, added)
     start = 0
     for frames in read_ahead(source, (band.y0, band.y1), depth):
         stop = start + frames.shape[0]

@@ -22,6 +22,7 @@ from pchem_pipeline.model.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.fisher import covariance_from
 from pchem_pipeline.model.histogram_numba import count_frames
 from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.stages.added_exposure import fitted_added_exposure
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.ensemble_result import pixels_of, write_result
@@ -194,6 +195,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     lobes = None
     if job.effects:
         lobes = tuple(store.read(f"fit/{name}", rows) for name in FREE_LOBES)
+    added = fitted_added_exposure(store, job.effects, rows)
     covariance = None
     if store.has("fit/correlation"):
         stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)
@@ -201,7 +203,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
-    errors = _compare(job, band, deciding_maps(maps, job.effects)) if job.truth is not None else {}
+    errors = _compare(job, band, deciding_maps(maps, job.effects, added)) if job.truth is not None else {}
     for key in band.keys:
         number, tile = job.tiles[key]
         part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
@@ -215,6 +217,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             job.effects,
             None if lobes is None else (lobes[0][part].ravel(), lobes[1][part].ravel()),
             None if covariance is None else covariance[part].reshape(n, 4, 4),
+            None if added is None else added.of(part).flat(),
         )
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
@@ -151,6 +152,7 @@ def ensemble_tile(
     effects: Sequence[Effect] = (),
     lobes: tuple[FloatArray, FloatArray] | None = None,
     covariance: FloatArray | None = None,
+    added: AddedExposure | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return what some pixels add to the ensemble.
 
@@ -163,6 +165,7 @@ def ensemble_tile(
         effects: of the run's model, the axes being ``grown`` where there are any.
         lobes: amplitude (e-) and weight of the pixels' free lobes, shape (n,); None: none.
         covariance: of the maps, shape (n, 4, 4); None: not known.
+        added: exposure that the effects add to the pixels, (j, n); None: nothing.
 
     Returns:
         A row of integers and a row of floats, in the places that ``axes`` gives.
@@ -170,7 +173,8 @@ def ensemble_tile(
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)
     pixels, mask = PixelParameters.from_maps(maps)
-    deciding = PixelParameters(*deciding_maps(pixels.columns(), effects))
+    added = None if added is None else added.of(mask)
+    deciding = PixelParameters(*deciding_maps(pixels.columns(), effects, added))
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
     chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
@@ -190,7 +194,8 @@ def ensemble_tile(
             _add_group(part, decider, origin[group], *sets, axes, integers, floats)
             if effects:
                 own = None if lobes is None else (lobes[0][mask][group], lobes[1][mask][group])
-                _add_grown(part, own, int(n), axes, effects, floats)
+                more = None if added is None else added.of(group)
+                _add_grown(part, own, int(n), axes, (effects, more), floats)
     return integers, floats
 
 
@@ -199,12 +204,13 @@ def _add_grown(
     lobes: tuple[FloatArray, FloatArray] | None,
     n: int,
     axes: EnsembleAxes,
-    effects: Sequence[Effect],
+    law: tuple[Sequence[Effect], AddedExposure | None],
     floats: FloatArray,
 ) -> None:
     """Add what the grown law predicts of pixels that have the same number of samples."""
+    effects, added = law
     maps = pixel_maps(pixels.columns(), np.ones(len(pixels), bool))
-    grown = grown_sums(pixels, lobes, marginal_model(effects, maps), axes.dn, axes.nuced)
+    grown = grown_sums(pixels, lobes, marginal_model(effects, maps, added), axes.dn, axes.nuced)
     sums = grown.sums
     parts: dict[str, Any] = {
         "pcd": sums.raw,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
 from pchem_pipeline.model.beside import Interval, fit_beside
@@ -23,6 +24,7 @@ from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.outliers import without_outliers
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.stages.added_exposure import read_added_exposure
 from pchem_pipeline.stages.base import StageContext, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.fit_start import drop_fit, kept_fit
@@ -56,6 +58,7 @@ def fit_tile(
     effects: Sequence[Effect] = (),
     set_aside: Sequence[Interval] = (),
     start: NDArray[np.float64] | None = None,
+    added: AddedExposure | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the group ``fit`` of a tile, by name.
 
@@ -68,6 +71,7 @@ def fit_tile(
         effects: of the run's model.
         set_aside: codes that the fit leaves out, e- on the comb of the plain fit.
         start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
+        added: exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
     """
     counts = histogram["counts"]
     shape = counts.shape[:2]
@@ -80,7 +84,7 @@ def fit_tile(
         # from a start no neighbours are tried; the gap to them was the old one, and grows with the frames
         plain = replace(plain, likelihood_gap=np.fmin(plain.likelihood_gap, old[:, len(PARAMETERS)]))
     if effects:
-        result = _grown(rows, flat["origin"], plain, settings, effects)
+        result = _grown(rows, flat["origin"], plain, settings, effects, added)
     else:
         result = refine(rows, flat["origin"], plain, settings, adc_limits)
     if set_aside:
@@ -121,11 +125,12 @@ def _grown(
     plain: FitResult,
     settings: FitSettings,
     effects: Sequence[Effect],
+    added: AddedExposure | None,
 ) -> FitResult:
     """Fit again with the law that the effects compose, as they see the pixels after the plain fit."""
     usable = (plain.fit_status & int(_UNUSABLE)) == 0
     maps = pixel_maps([getattr(plain, name) for name in PARAMETERS], usable)
-    return fit_grown(counts, origin, plain, marginal_model(effects, maps), settings, plain=plain)
+    return fit_grown(counts, origin, plain, marginal_model(effects, maps, added), settings, plain=plain)
 
 
 def _law(parameters: NDArray[np.float64], *, effects: Sequence[Effect]) -> MarginalModel:
@@ -195,7 +200,9 @@ def _do_tile(
     run_store = open_store(store)
     histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
     start = kept_fit(store, tile.region)
-    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start)
+    ny, nx = run_store.array("histogram/origin").shape
+    added = read_added_exposure(run_store, effects, (ny, nx), tile.region)
+    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start, added)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]

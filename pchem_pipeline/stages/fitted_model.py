@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from pchem_pipeline.effects.added import AddedExposure
     from pchem_pipeline.effects.base import Effect
     from pchem_pipeline.store.run_store import RunStore
 
@@ -33,18 +34,19 @@ def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
 
 
 def deciding_maps(
-    maps: Sequence[NDArray[np.float64]], effects: Sequence[Effect]
+    maps: Sequence[NDArray[np.float64]], effects: Sequence[Effect], added: AddedExposure | None = None
 ) -> tuple[NDArray[np.float64], ...]:
     """Return the parameters with which electron numbers are decided: the maps themselves without effects.
 
     Args:
         maps: fitted (H, g, mu, sigma), each of the same shape; NaN where the fit failed.
         effects: with which they were fitted.
+        added: exposure that these add to the pixels, a pixel for each of the maps; None: nothing.
 
     Returns:
         The four, in that shape; with effects those of the nearest PCD.
     """
     if not effects:
         return tuple(maps)
-    model = marginal_model(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)))
+    model = marginal_model(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), added)
     return tuple(values.reshape(maps[0].shape) for values in nearest_pcd(list(maps), model))

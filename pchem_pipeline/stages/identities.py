@@ -7,13 +7,18 @@ from typing import TYPE_CHECKING, Any
 from pchem_pipeline.stages.input_identity import known_identity
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pchem_pipeline.stages.base import StageContext
+    from pchem_pipeline.store.run_store import RunStore
 
 __all__ = [
     "adc_limits",
+    "fit_inputs",
     "input_content",
     "integration_time",
     "joint_samples",
+    "known_added_exposure",
     "other_samples",
     "search_start",
     "verdict",
@@ -40,6 +45,26 @@ def adc_limits(context: StageContext) -> dict[str, Any]:
     """Return what the files may say and the settings of the fit do not: the limits of the ADC."""
     limits = context.adc_limits
     return {"adc_limits": None if limits is None else list(limits)}
+
+
+def fit_inputs(context: StageContext) -> dict[str, Any]:
+    """Return what the files say to the fit, and which exposure the effects of the model add to pixels."""
+    effects = [effect.model_dump(mode="json") for effect in context.config.model.effects]
+    digest = known_added_exposure(context.store, effects)
+    return {**adc_limits(context), **({} if digest is None else {"added_exposure": digest})}
+
+
+def known_added_exposure(store: RunStore, effects: Sequence[dict[str, Any]]) -> str | None:
+    """Return the digest of the exposure that effects add to pixels; None where none is known of them.
+
+    Args:
+        store: the run.
+        effects: of a model, as JSON data.
+    """
+    attributes = store.attributes("discrepancy/added_exposure")
+    if not attributes or any(effect not in effects for effect in attributes["effects"]):
+        return None
+    return str(attributes["digest"])
 
 
 def integration_time(context: StageContext) -> dict[str, Any]:

@@ -21,11 +21,13 @@ from pchem_pipeline.model.fit_status import MEANINGS
 from pchem_pipeline.model.grown import marginal_mass
 from pchem_pipeline.render.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.render.packing import PackedMap, choose_scale, pack_map
+from pchem_pipeline.stages.added_exposure import fitted_added_exposure
 from pchem_pipeline.stages.fitted_model import deciding_maps, fitted_effects
 from pchem_pipeline.stages.inspected_pixels import ChosenPixels, choose_inspected
 from pchem_pipeline.variables import FREE_LOBES, PARAMETERS, VARIABLES, Variable
 
 if TYPE_CHECKING:
+    from pchem_pipeline.effects.added import AddedExposure
     from pchem_pipeline.effects.base import Effect
     from pchem_pipeline.stages.sensor import SensorInfo
     from pchem_pipeline.store.run_store import RunStore
@@ -260,13 +262,17 @@ def read_sample(
     deciding, masses = None, []
     if effects:
         columns = [store.read(f"maps/{name}").reshape(-1)[index] for name in PARAMETERS]
+        every = fitted_added_exposure(store, effects)
+        added = None if every is None else every.flat().of(index)
         known = np.isfinite(columns).all(axis=0)
         deciding = np.full((4, index.size), np.nan)
         if known.any():
-            deciding[:, known] = deciding_maps([column[known] for column in columns], effects)
+            own = None if added is None else added.of(np.flatnonzero(known))
+            deciding[:, known] = deciding_maps([column[known] for column in columns], effects, own)
         some = slice(0, _SOME_MASSES)
         lobes = [store.read(f"fit/{name}").reshape(-1)[index][some] for name in FREE_LOBES]
-        masses = grown_masses(effects, [c[some] for c in columns], lobes, origin[some], counts[some])
+        first = None if added is None else added.of(some)
+        masses = grown_masses(effects, [c[some] for c in columns], lobes, origin[some], counts[some], first)
     return PixelSample(index, exact, origin, counts, deciding, masses, chosen.reasons)
 
 
@@ -276,6 +282,7 @@ def grown_masses(
     lobes: Sequence[NDArray[np.float64]],
     origin: NDArray[np.integer[Any]],
     counts: Sequence[NDArray[np.integer[Any]]],
+    added: AddedExposure | None = None,
 ) -> list[NDArray[np.float64]]:
     """Return the probability of each bin of each pixel under a model with effects; NaN without parameters.
 
@@ -285,6 +292,7 @@ def grown_masses(
         lobes: amplitude (e-) and weight of their free levels.
         origin: DN of the first bin of each.
         counts: their histograms, all of one length.
+        added: exposure that the effects add to them, (j, n); None: nothing.
     """
     if not counts:
         return []
@@ -293,7 +301,8 @@ def grown_masses(
     known = np.isfinite(columns).all(axis=0)
     if known.any():
         kept = [column[known] for column in columns]
-        model = marginal_model(effects, pixel_maps(kept, np.ones(kept[0].size, bool)))
+        own = None if added is None else added.of(np.flatnonzero(known))
+        model = marginal_model(effects, pixel_maps(kept, np.ones(kept[0].size, bool)), own)
         codes = origin[known][:, None] + np.arange(n_bins)
         found[known] = marginal_mass(model, kept, codes, lobes=(lobes[0][known], lobes[1][known]))
     return list(found)

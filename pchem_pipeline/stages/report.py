@@ -23,6 +23,7 @@ from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
 from pchem_pipeline.render.method_exhibits import METHOD_FIGURE
 from pchem_pipeline.render.plan_exhibits import PLAN_FIGURE
 from pchem_pipeline.render.report import RenderedReport, render_report
+from pchem_pipeline.stages.added_exposure import fitted_added_exposure
 from pchem_pipeline.stages.base import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.stages.discrepancy_result import read_discrepancy
@@ -344,7 +345,8 @@ def _grown_mass(
         return None
     region = tuple(slice(i, i + 1) for i in place)
     lobes = tuple(store.read(f"fit/{name}", region).ravel() for name in FREE_LOBES)
-    model = marginal_model(effects, pixel_maps(columns, np.ones(1, bool)))
+    added = fitted_added_exposure(store, effects, (region[0], region[1]))
+    model = marginal_model(effects, pixel_maps(columns, np.ones(1, bool)), added)
     mass: NDArray[np.float64] = marginal_mass(model, columns, codes, lobes=(lobes[0], lobes[1]))[0]
     return mass
 

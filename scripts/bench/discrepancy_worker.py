@@ -32,12 +32,12 @@ def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, 
             # only now is the key opened
             record["hidden"] = json.loads(key.read_text())["effects"]
             record["read_noise_e"] = float(np.median(np.load(key.with_suffix(".npz"))["read_noise_e"]))
-            effects = record.pop("effects")
+            found = record.pop("found")
             if with_bias:
-                record |= _compared(case, frames, effects, key)
+                record |= _compared(case, frames, found, key)
         # a study of hundreds of cases goes on, and counts this one as failed
         except Exception as error:
-            record.pop("effects", None)
+            record.pop("found", None)
             record["error"] = f"{type(error).__name__}: {error}"
             record["trace"] = traceback.format_exc()[-2000:]
     return record
@@ -64,11 +64,13 @@ def _look(case: Case, frames: NDArray[np.uint16], options: dict[str, Any]) -> di
         "seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,
         "verdict": found.to_json(),
-        "effects": found.model,
+        "found": found,
     }
 
 
-def fit_maps(frames: NDArray[np.uint16], effects: tuple[Any, ...] = ()) -> dict[str, NDArray[np.float64]]:
+def fit_maps(
+    frames: NDArray[np.uint16], effects: tuple[Any, ...] = (), added: Any = None
+) -> dict[str, NDArray[np.float64]]:
     """Fit the whole stack with the PCD, or with the model that effects make of it.
 
     Returns:
@@ -83,7 +85,7 @@ def fit_maps(frames: NDArray[np.uint16], effects: tuple[Any, ...] = ()) -> dict[
     flat = [a.ravel() for a in (histograms.origin, histograms.under, histograms.over)]
     result = fit_histograms(counts, *flat)
     if effects:
-        result = _grown(result, counts, flat[0], effects)
+        result = _grown(result, counts, flat[0], effects, added)
     shape = frames.shape[1:]
     g, sigma = result.conversion_gain, result.read_noise_dn
     variance = np.diagonal(result.covariance, axis1=1, axis2=2)
@@ -104,33 +106,26 @@ def fit_maps(frames: NDArray[np.uint16], effects: tuple[Any, ...] = ()) -> dict[
     return {name: np.asarray(values).reshape(shape) for name, values in maps.items()}
 
 
-def _grown(plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tuple[Any, ...]) -> Any:
+def _grown(
+    plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tuple[Any, ...], added: Any
+) -> Any:
     """Fit again with the law that the effects make of the PCD."""
-    from pchem_pipeline.effects.evidence import PixelMaps
+    from pchem_pipeline.effects.compose import marginal_model, pixel_maps
     from pchem_pipeline.model.fit_status import FAILED
     from pchem_pipeline.model.grown import fit_grown
-    from pchem_pipeline.model.marginal import MarginalModel
 
-    maps = PixelMaps(
-        plain.quanta_exposure,
-        plain.conversion_gain,
-        plain.bias,
-        plain.read_noise_dn,
-        (plain.fit_status & FAILED) == 0,
-    )
-    model = MarginalModel()
-    for effect in effects:
-        model = effect.marginal(model, maps)
+    parameters = [plain.quanta_exposure, plain.conversion_gain, plain.bias, plain.read_noise_dn]
+    model = marginal_model(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)
     return fit_grown(counts, origin, plain, model, plain=plain)
 
 
-def _compared(case: Case, frames: NDArray[np.uint16], effects: tuple[Any, ...], key: Path) -> dict[str, Any]:
+def _compared(case: Case, frames: NDArray[np.uint16], found: Any, key: Path) -> dict[str, Any]:
     """Return the bias of the maps, or why there is none: the verdict stands by itself."""
     affected = np.load(key.with_suffix(".npz"))[f"affected_{case.hidden[0]}"]
     folder = key.parents[1] / "twin"
     make((), case.level, case.seed, case.shape, folder, folder / "key.json")
     try:
-        return {"bias": _bias(frames, np.load(folder / "frames.npy"), effects, affected)}
+        return {"bias": _bias(frames, np.load(folder / "frames.npy"), found, affected)}
     except Exception as error:
         return {"bias_error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()[-2000:]}
 
@@ -138,15 +133,15 @@ def _compared(case: Case, frames: NDArray[np.uint16], effects: tuple[Any, ...], 
 def _bias(
     frames: NDArray[np.uint16],
     twin: NDArray[np.uint16],
-    effects: tuple[Any, ...],
+    found: Any,
     affected: NDArray[np.bool_],
 ) -> dict[str, Any]:
     """Compare fits without and with the named effects to the plain fit of the twin without the effect."""
     reference, before = fit_maps(twin), fit_maps(frames)
     # where nothing was named the bias stays what it is
-    after = fit_maps(frames, effects) if effects else before
+    after = fit_maps(frames, found.model, found.added) if found.model else before
     good = affected & reference["good"] & before["good"] & after["good"]
-    found: dict[str, Any] = {"pixels": int(good.sum()), "affected": int(affected.sum())}
+    bias: dict[str, Any] = {"pixels": int(good.sum()), "affected": int(affected.sum())}
     for name in PARAMETERS:
         error = reference[f"{name}_stderr"][good]
         moved = [(maps[name] - reference[name])[good] for maps in (before, after)]
@@ -154,10 +149,10 @@ def _bias(
         n = max(int(use.sum()), 1)
         # a few lost pixels must not decide over the mean of all
         low, high = (np.clip((m / error)[use], -50, 50) for m in moved)
-        found[name] = {
+        bias[name] = {
             "before": float(low.mean()) if use.any() else 0.0,
             "after": float(high.mean()) if use.any() else 0.0,
             "chance": float(high.std() / np.sqrt(n)) if use.any() else 0.0,
             "pixels": n,
         }
-    return found
+    return bias

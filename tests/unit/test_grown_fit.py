@@ -12,6 +12,7 @@ from scipy.optimize import root
 
 from pchem_pipeline.model.fit_status import FitStatus
 from pchem_pipeline.model.grown import GrownFit, fit_grown, log_likelihood, marginal_mass
+from pchem_pipeline.model.grown_electrons import nearest_pcd
 from pchem_pipeline.model.marginal import MarginalModel
 from pchem_pipeline.model.pcd import pcd_mass
 from pchem_pipeline.model.pchem import FitResult, fit_histograms
@@ -182,6 +183,28 @@ def test_neighbour_is_taken_where_it_is_likelier() -> None:
     # a warm start is believed
     stays = fit_grown(counts, origins(5), wrong, MarginalModel(), warm=True)
     assert (abs(stays.bias - right.bias)[1:] > 5).all()
+
+
+def test_exposure_that_is_added_leaves_h_as_it_is_without() -> None:
+    # half of the frames get 0.9 e- in the first three pixels, a third 1.4 e- in the fourth, none in the last
+    added = [[0.0, 0.9]] * 3 + [[0.0, 1.4], [0.0, 0.0]]
+    weights = [[0.5, 0.5]] * 3 + [[2 / 3, 1 / 3], [1.0, 0.0]]
+    model = MarginalModel().with_added_exposure(added, weights)
+    truth = [np.tile(column, 20) for column in TRUTH]
+    every = np.tile(np.arange(5), 20)
+    counts = drawn(model.of(every), truth, seed=11)
+    plain = fit_histograms(counts, origins(100))
+    grown = fit_grown(counts, origins(100), plain, model.of(every), plain=plain)
+    pull = (columns(grown) - np.stack(truth, axis=1)) / stderr(grown)
+    for i in range(5):
+        # the mean of twenty pulls, four standard errors
+        assert abs(pull[i::5].mean(axis=0)).max() < 4 / np.sqrt(20)
+    assert ((plain.quanta_exposure - truth[0]) / stderr(grown)[:, 0])[every < 4].mean() > 10
+    same = fit_grown(counts, origins(100), plain, MarginalModel(), plain=plain)
+    np.testing.assert_array_equal(columns(grown)[every == 4], columns(same)[every == 4])
+    # electron numbers are decided with the mean exposure
+    mean = nearest_pcd(columns(grown).T.tolist(), model.of(every))[0]
+    np.testing.assert_allclose(mean, columns(grown)[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
 
 
 def test_free_lobes_are_found_where_they_are_and_nowhere_else() -> None:

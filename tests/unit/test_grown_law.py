@@ -45,8 +45,10 @@ def test_mass_is_the_docstring_term_by_term(name: str) -> None:
 
 def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> None:
     laws = [LAWS["levels"], MarginalModel().with_variance(e2=0.04, dn2=0.2), LAWS["skew"]]
+    laws[1] = laws[1].with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]])
     both = MarginalModel().with_levels(scale=[0.98, 1, 1], shift_e=[0.2, 0, 0], curvature=0.0)
     both = both.with_variance(e2=[0, 0.04, 0], dn2=[0, 0.2, 0])
+    both = both.with_added_exposure([[0, 0], [0, 0.8], [0, 0]], [[1, 0], [0.6, 0.4], [1, 0]])
     both = both.with_noise(
         [[1, 0], [1, 0], [0.7, 0.3]],
         shift_sigma=[[0, 0], [0, 0], [-0.3, 0.7]],
@@ -140,18 +142,18 @@ def test_normal_tail_keeps_its_digits() -> None:
 
 @pytest.mark.parametrize(("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2)])
 def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int, dispersion: float) -> None:
-    weights, factors = np.array([0.25, 0.75]), np.array([1.6, 0.8])
+    # 0.6 e- of the mean are added, and do not grow with H
+    mixtures = np.array([0.25, 0.75]), np.array([1.6, 0.8]), np.array([0.4, 0.6]), np.array([0.0, 1.0])
     k = np.arange(400)
-    rows = np.array([electron_number(law, dispersion, int(i), 3.0, weights, factors) for i in k])
+    rows = np.array([electron_number(law, dispersion, int(i), 2.4, *mixtures) for i in k])
     assert rows[:, 0].sum() == pytest.approx(1.0, abs=1e-10)
     assert rows[:, 0] @ k == pytest.approx(3.0, rel=1e-8)
-    excess = {0: 3.0, 1: 3.0 + dispersion * (9 * 1.12), 2: 3.0 / (1 - dispersion) ** 2}[law]
-    assert rows[:, 0] @ (k - 3.0) ** 2 == pytest.approx(excess + 9 * 0.12, rel=1e-7)
+    mixed = 2.4**2 * 0.12 + 0.24
+    excess = {0: 3.0, 1: 3.0 + dispersion * (9.0 + mixed), 2: 3.0 / (1 - dispersion) ** 2}[law]
+    assert rows[:, 0] @ (k - 3.0) ** 2 == pytest.approx(excess + mixed, rel=1e-7)
     h = 1e-4
     above, below = (
-        np.array(
-            [electron_number(law, dispersion, int(i), 3.0 * np.exp(s), weights, factors)[0] for i in k[:40]]
-        )
+        np.array([electron_number(law, dispersion, int(i), 2.4 * np.exp(s), *mixtures)[0] for i in k[:40]])
         for s in (h, -h)
     )
     np.testing.assert_allclose(rows[:40, 1], (above - below) / (2 * h), atol=1e-8)
@@ -193,6 +195,8 @@ def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:
         marginal_mass(MarginalModel().with_variance(e2=[0.1, 0.2]), columns, [1, 2])
     with pytest.raises(ValueError, match="do not sum to 1"):
         marginal_mass(MarginalModel().with_noise([0.5, 0.4]), columns, [1, 2])
+    with pytest.raises(ValueError, match="do not sum to 1"):
+        marginal_mass(MarginalModel().with_added_exposure([[0, 1]], [[0.5, 0.4]]), columns, [1, 2])
     with pytest.raises(ValueError, match="increase by 1"):
         marginal_mass(MarginalModel(), columns, [1, 3])
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
 from pchem_pipeline.effects.charge_sums import BlockCharge, block_charge
 
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.telegraph import Telegraph
 
 __all__ = ["DarkCurrentRts"]
 
@@ -107,6 +109,37 @@ class DarkCurrentRts(Effect):
         passed = np.searchsorted(changes, np.maximum(context.frames, 0), side="right")
         added: NDArray[np.float64] = step * ((passed % 2 == 0) == starts_high)
         return added
+
+    def added_exposure(
+        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+    ) -> AddedExposure | None:
+        """Return the levels above the lowest one, and the time spent there, of the pixels seen to blink.
+
+        Each is fitted by itself, whatever the mean step of all: with up to two defects and their own steps.
+        """
+        from pchem_pipeline.model.telegraph import find_telegraph
+
+        if self.fraction == 0 or self.step_e == 0:
+            return None
+        found: dict[tuple[int, int], Telegraph] = {}
+        good = maps.usable
+        columns = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+        for y in np.flatnonzero(good.any(axis=1)):
+            row = np.ascontiguousarray(frames[:, y].T)
+            for x in np.flatnonzero(good[y]):
+                telegraph = find_telegraph(row[x], numbers, np.array([values[y, x] for values in columns]))
+                if telegraph is not None:
+                    found[int(y), int(x)] = telegraph
+        # where most of them seem to blink, it is something else
+        if not 0 < len(found) <= _MOST_OF_A_SENSOR * good.size:
+            return None
+        levels = max(telegraph.added.size for telegraph in found.values())
+        exposure, weight = np.zeros((levels, *good.shape)), np.zeros((levels, *good.shape))
+        weight[0] = 1.0
+        for place, telegraph in found.items():
+            own = (slice(telegraph.added.size), *place)
+            exposure[own], weight[own] = telegraph.added, telegraph.weight
+        return AddedExposure(exposure, weight)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from pchem_pipeline.effects.added import AddedExposure
 from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.charge_sums import block_charge
+from pchem_pipeline.effects.charge_sums import block_charge, exposure_nodes
 from pchem_pipeline.effects.fading_images import FadingCells, fading_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence
+    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 
 __all__ = ["Persistence"]
 
@@ -112,14 +113,33 @@ class Persistence(Effect):
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
         if self.peak_e == 0:
             return values.copy()
-        # frames before the run are simulated only as memory of the first: as exposed as that one
-        t = np.maximum(context.frames, 0)
-        left = np.exp(-t / self.decay_frames)
-        if self.slow_decay_frames is not None:
-            left = (1.0 - self.slow_share) * left + self.slow_share * np.exp(-t / self.slow_decay_frames)
-        left = self.peak_e * left
+        left = self._left(context.frames)
         result: NDArray[Any] = values + left[:, None, None] * self.pattern(context.rows, context.shape)
         return result
+
+    def added_exposure(
+        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+    ) -> AddedExposure | None:
+        """Return the ghost, with three levels for its course."""
+        left = self._left(numbers)
+        mean = float(left.mean())
+        if not mean > 0:
+            return None
+        weights, nodes = exposure_nodes(left / mean)
+        rows, columns = maps.usable.shape
+        image = mean * self.pattern(np.arange(rows), (rows, columns))
+        return AddedExposure(
+            nodes[:, None, None] * image, np.broadcast_to(weights[:, None, None], (nodes.size, rows, columns))
+        )
+
+    def _left(self, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what is left of the largest value in each frame, e-."""
+        # frames before the run are simulated only as memory of the first: as exposed as that one
+        t = np.maximum(frames, 0)
+        left: NDArray[np.float64] = np.exp(-t / self.decay_frames)
+        if self.slow_decay_frames is not None:
+            left = (1.0 - self.slow_share) * left + self.slow_share * np.exp(-t / self.slow_decay_frames)
+        return self.peak_e * left
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
