@@ -36,11 +36,11 @@ class MarginalModel:
 
     ``P(x) = sum_bj w_b u_j sum_k P(k; H f_b + d_j) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]``
     with mean ``m = mu + (level_scale k (1 + curvature (k - 1) / 2) + level_shift_e + shift_e_l) / g +
-    shift_dn_l + shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 + variance_per_electron
-    k + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 = sigma^2 - 1/12 is the
-    analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and code edges
-    ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there. A share of
-    the samples may be outliers, anywhere.
+    shift_dn_l + shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 +
+    variance_per_electron k + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 =
+    sigma^2 - 1/12 is the analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and
+    code edges ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there. A
+    share of the samples may be outliers, anywhere.
 
     Attributes:
         law: law of the electron number; its mean is H whatever the law.

@@ -106,7 +106,7 @@ _ALL = (
     Declaration("electrons", 1, ("ingest", "fit"), ("run.tile",), ("frames", "fit"), ("electrons",)),
     Declaration(
         "discrepancy",
-        3,
+        4,
         ("ingest",),
         ("discrepancy",),
         ("frames",),

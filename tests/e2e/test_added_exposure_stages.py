@@ -1,0 +1,70 @@
+"""A sensor with pixels whose dark current blinks: after the search the fit gives their steady exposure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.stages.session import Command, find_run, run_stages, run_status
+from pchem_pipeline.store.run_store import RunStore
+
+QUIET = Command(quiet=True)
+BLINKING = {
+    "tag": "dark_current_rts",
+    "fraction": 0.08,
+    "step_e": 1.2,
+    "dwell_low_frames": 60,
+    "dwell_high_frames": 60,
+}
+
+
+def states(path: Path) -> dict[str, str]:
+    return {state.stage: state.words() for state in run_status(find_run(path))}
+
+
+def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None:
+    content = {
+        "run": {"tile": 8},
+        "simulate": {"shape": [16, 20], "n_frames": 2400, "seed": 3, "format": "npy", "effects": [BLINKING]},
+        "discrepancy": {
+            "replicates": 20,
+            "grown_replicates": 12,
+            "candidates": ["dark_current_rts", "exposure_flicker"],
+        },
+        "compute": {"backend": "serial"},
+    }
+    path = tmp_path / "run.yaml"
+    path.write_text(dump_config(RunConfig.model_validate(content)), encoding="utf-8")
+    run_stages(find_run(path), ["simulate", "ingest", "histogram", "fit"], QUIET)
+    store = RunStore.open(tmp_path / "run.zarr")
+    truth = store.read("truth/quanta_exposure")
+    before, stderr = store.read("fit/quanta_exposure"), store.read("fit/quanta_exposure_stderr")
+    run_stages(find_run(path), ["discrepancy"], QUIET)
+    assert find_run(path).config.model.effects[0].tag == "dark_current_rts"
+    assert "not run" not in states(path)["discrepancy"]
+    blinks = (before - truth) / stderr > 6
+    assert 12 < blinks.sum() < 40
+    added = store.read("discrepancy/added_exposure")
+    assert ((added > 0).any(axis=0) & blinks).sum() > 0.9 * blinks.sum()
+    run_stages(find_run(path), ["fit", "maps", "ensemble", "electrons", "report"], QUIET)
+    after = store.read("fit/quanta_exposure")
+    bias = [np.clip((h - truth) / stderr, -50, 50)[blinks].mean() for h in (before, after)]
+    assert bias[0] > 10
+    assert abs(bias[1]) < bias[0] / 5
+    others = ~(added > 0).any(axis=0) & np.isfinite(after)
+    assert abs(((after - truth) / stderr)[others & ~blinks].mean()) < 4 / np.sqrt(others.sum())
+    # the ensemble is predicted with what was added: its mean is that of the frames
+    ensemble = {name: store.read(f"ensemble/{name}") for name in ("dn", "pcd", "counts")}
+    mean = [np.average(ensemble["dn"], weights=ensemble[name]) for name in ("pcd", "counts")]
+    spread = np.sqrt(np.average((ensemble["dn"] - mean[1]) ** 2, weights=ensemble["counts"]))
+    assert abs(mean[0] - mean[1]) < 4 * spread / np.sqrt(ensemble["counts"].sum())
+    # the same arrays: nothing to do; without them the fit is another one
+    assert "complete" in states(path)["fit"]
+    store.delete("discrepancy/added_exposure")
+    assert "complete" not in states(path)["fit"]
+    run_stages(find_run(path), ["fit"], QUIET)
+    mean_again = store.read("fit/quanta_exposure")
+    np.testing.assert_allclose(mean_again[blinks], before[blinks], atol=4 * stderr[blinks].max())
