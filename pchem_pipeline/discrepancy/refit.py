@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.effects.added import AddedExposure
+from pchem_pipeline.discrepancy.result import Discrepancy
+from pchem_pipeline.effects.added import AddedExposure, added_exposures
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.compose import marginal_model, pixel_maps
-from pchem_pipeline.effects.evidence import PixelMaps
+from pchem_pipeline.effects.evidence import Evidence, PixelMaps
 from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.model.grown import fit_grown, marginal_mass
 from pchem_pipeline.model.histogram import histogram_frames
 
-__all__ = ["Refit", "expected_codes", "refit_maps"]
+__all__ = ["Refit", "expected_codes", "refit_maps", "with_steady_exposure"]
 
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
@@ -77,6 +78,36 @@ def refit_maps(
     }
     new_maps = PixelMaps(exposure, gain, bias, noise, good.reshape(shape))
     return Refit(new_maps, moved, fit.covariance[:, :4, :4].reshape(*shape, 4, 4))
+
+
+def with_steady_exposure(
+    found: Discrepancy,
+    plain: Evidence,
+    stack: NDArray[np.unsignedinteger],
+    numbers: NDArray[np.int64],
+    seen: NDArray[np.int64],
+) -> Discrepancy:
+    """Return what was found with that taken out of H which the effects of the model add to single pixels.
+
+    It is looked for in all frames, since those are fitted in the end, and nothing else is drawn from it. The
+    replicates of the search are simulated with the pixels' mean exposure: which ones blink is drawn anew.
+
+    Args:
+        found: a result with the maps of the last refit.
+        plain: evidence of the frames that were fitted.
+        stack: (frame, y, x), DN.
+        numbers: of its frames in the run, shape (frame,).
+        seen: positions of the frames that were fitted.
+    """
+    assert plain.covariance is not None
+    try:
+        added = added_exposures(found.model, stack, numbers, plain.maps)
+    except ConfigError as error:
+        return replace(found, left_out={**found.left_out, "added exposure": str(error)})
+    if added is None:
+        return found
+    fit = refit_maps(stack[seen], plain.maps, found.model, plain.covariance, added)
+    return replace(found, maps=fit.maps, added=added)
 
 
 def expected_codes(

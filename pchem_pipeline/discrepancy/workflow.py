@@ -29,17 +29,16 @@ from pchem_pipeline.discrepancy.likely_truth import likely_truth
 from pchem_pipeline.discrepancy.naming import Choice, choose
 from pchem_pipeline.discrepancy.null import NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe import observe
-from pchem_pipeline.discrepancy.refit import Refit, expected_codes, refit_maps
+from pchem_pipeline.discrepancy.refit import Refit, expected_codes, refit_maps, with_steady_exposure
 from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.result import Discrepancy
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
 from pchem_pipeline.discrepancy.story import Round, tell
 from pchem_pipeline.discrepancy.where import Place, locate
-from pchem_pipeline.effects.added import added_exposures
 from pchem_pipeline.effects.base import Effect
 from pchem_pipeline.effects.evidence import Evidence, PixelMaps
-from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.errors import InputError
 
 __all__ = ["find_discrepancies"]
 
@@ -173,7 +172,8 @@ class _Search:
             rounds.append(Round(choice, grown.added, tuple(hypotheses), null, grown.null, grown.fit.moved))
             fit, maps, null = grown.fit, grown.maps, grown.null
             search = still = disagrees(null, z, limit, self._tolerance(rounds))
-        return self._steady(self._result(rounds, first, null, z, places, train, fit.maps, still), plain)
+        found = self._result(rounds, first, null, z, places, train, fit.maps, still)
+        return with_steady_exposure(found, plain, self.stack, self.numbers, self._seen())
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -205,23 +205,6 @@ class _Search:
         if not self.model:
             return Refit(plain.maps, {}, plain.covariance)
         return refit_maps(self.stack[self._seen()], plain.maps, self.model, plain.covariance)
-
-    def _steady(self, found: Discrepancy, plain: Evidence) -> Discrepancy:
-        """Take what the effects of the final model add to single pixels out of their H.
-
-        It is looked for in all frames, since those are fitted in the end; nothing else is drawn from it. The
-        replicates are simulated with the mean exposure of the pixels: which ones blink is drawn anew there.
-        """
-        assert plain.covariance is not None
-        try:
-            added = added_exposures(found.model, self.stack, self.numbers, plain.maps)
-        except ConfigError as error:
-            return replace(found, left_out={**found.left_out, "added exposure": str(error)})
-        if added is None:
-            return found
-        frames = self.stack[self._seen()]
-        fit = refit_maps(frames, plain.maps, found.model, plain.covariance, added)
-        return replace(found, maps=fit.maps, added=added)
 
     def _check(self, seen: Evidence) -> None:
         usable = int(seen.maps.usable.sum())
