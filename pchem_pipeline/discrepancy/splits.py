@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,12 @@ class Splits:
     test: NDArray[np.int64]
     final: NDArray[np.int64]
     block_frames: int
+
+    def examined(self, shape: tuple[int, ...]) -> dict[str, Any]:
+        """Return what was looked at of a stack of some shape (frame, y, x), as ``discrepancy.json`` has it."""
+        parts = {"train": self.train, "test": self.test, "final": self.final}
+        sizes = {name: int(part.size) for name, part in parts.items()}
+        return {"frames": shape[0], "rows": [0, shape[1]], "columns": [0, shape[2]], **sizes}
 
 
 def block_length(n_frames: int, wanted: int | None = None) -> int:

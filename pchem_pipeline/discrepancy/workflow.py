@@ -438,14 +438,7 @@ class _Search:
             still=still,
             left_out=self.left_out,
             n_replicates=self.n_replicates,
-            examined={
-                "frames": int(self.numbers.size),
-                "rows": [0, self.stack.shape[1]],
-                "columns": [0, self.stack.shape[2]],
-                "train": int(self.splits.train.size),
-                "test": int(self.splits.test.size),
-                "final": int(self.splits.final.size),
-            },
+            examined=self.splits.examined(self.stack.shape),
         )
 
 
