@@ -36,7 +36,7 @@ class Splits:
     block_frames: int
 
     def examined(self, shape: tuple[int, ...]) -> dict[str, Any]:
-        """Return what was looked at of a stack of some shape (frame, y, x), as ``discrepancy.json`` has it."""
+        """Return what was looked at of a stack of a shape (frame, y, x), as ``discrepancy.json`` has it."""
         parts = {"train": self.train, "test": self.test, "final": self.final}
         sizes = {name: int(part.size) for name, part in parts.items()}
         return {"frames": shape[0], "rows": [0, shape[1]], "columns": [0, shape[2]], **sizes}
