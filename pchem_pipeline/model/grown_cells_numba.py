@@ -220,9 +220,8 @@ def all_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room, s
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
-def evaluate(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
-    """Return the log-likelihood at ``theta``; fill score, empirical and observed information."""
-    count, reach = masses(theta, cells, law, room)
+def _sum_up(cells: Cells, law: Law, room: Room) -> float:
+    """Return the log-likelihood of the masses in ``room``; fill score, empirical information and ratio."""
     score, empirical, slopes = room.score, room.empirical, room.slopes
     for i in range(N_THETA):
         score[i] = 0.0
@@ -246,6 +245,23 @@ def evaluate(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> 
         for j in range(i + 1):
             empirical[j, i] = empirical[i, j]
             room.information[i, j] = empirical[i, j]
+            room.information[j, i] = empirical[i, j]
+    return loglik
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def glance(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
+    """Return the log-likelihood; fill the score, and the empirical information also for the observed one."""
+    masses(theta, cells, law, room)
+    loglik: float = _sum_up(cells, law, room)
+    return loglik
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def evaluate(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
+    """Return the log-likelihood at ``theta``; fill score, empirical and observed information."""
+    count, reach = masses(theta, cells, law, room)
+    loglik: float = _sum_up(cells, law, room)
     _subtract_curvature(theta, cells, law, reach, count, room)
     return loglik
 

@@ -35,7 +35,9 @@ from pchem_pipeline.model.grown_numba import (
 )
 from pchem_pipeline.model.grown_types_numba import (
     LOBE,
+    LOG_VARIANCE,
     N_THETA,
+    STEP,
     Cells,
     Law,
     Room,
@@ -44,7 +46,9 @@ from pchem_pipeline.model.grown_types_numba import (
 from pchem_pipeline.model.workspace_numba import Histogram, load
 
 _LEAST_MASS = 1e-300
-_SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for other starts of free lobes
+# what calls for other starts of free lobes: a bad fit (standard normal), or one without resolved peaks, e-
+_SUSPICIOUS = 2.3
+_UNRESOLVED = 0.45
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
@@ -100,7 +104,8 @@ def fit_pixel(
     out[CHI2], freedom = _goodness(cells, histogram.n, room)
     amplitude = 0.0
     if amplitudes.size > 0:
-        poor = normal_score(out[CHI2], freedom) > _SUSPICIOUS
+        noise = math.exp(0.5 * theta[LOG_VARIANCE]) / theta[STEP]
+        poor = normal_score(out[CHI2], freedom) > _SUSPICIOUS or noise > _UNRESOLVED
         unsure = out[GAP] < limits[CLEAR_GAP]
         amplitude, count = search_lobes(
             theta, loglik, histogram, cells, law, place, amplitudes, unsure, poor, limits, room

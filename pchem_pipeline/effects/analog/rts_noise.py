@@ -39,7 +39,9 @@ _PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
 _LIMITS = np.array([4.2, 6.0, 4.2, 4.5, 4.5, 5.0])
 # standard deviations of a correlation in time beyond which a pixel has a slow trap
 _SLOW = 5.0
-_EQUAL, _EXPONENTIAL = (0.6, 0.8, 1.0, 1.25, 1.6), (0.3, 0.55, 1.0, 1.6, 2.5)
+# amplitudes tried in every pixel, in units of that of the effect
+_EQUAL, _EXPONENTIAL = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0), (0.35, 0.5, 0.7, 1.0, 1.35, 1.8, 2.5, 3.4)
+_ALARM = 0.1  # pixels wrongly given levels, of those that have some
 
 
 @register_effect
@@ -229,7 +231,8 @@ class RtsNoise(Effect):
         """
         factors = _EQUAL if self.spread == "equal" else _EXPONENTIAL
         steps = [f * self.amplitude_e for f in factors if self.amplitude_e > 0]
-        return model.with_free_lobes(steps, pattern=self._pattern())
+        alarm = min(max(_ALARM * self.fraction, 1e-5), 1e-3)
+        return model.with_free_lobes(steps, pattern=self._pattern(), alarm=alarm)
 
     def _pattern(self) -> list[tuple[float, float]]:
         """Return (shift in steps, weight) of the levels beside the quiet one."""
