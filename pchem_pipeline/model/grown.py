@@ -134,7 +134,8 @@ def lobe_threshold(model: MarginalModel) -> float:
     At a weight of 0, the border of what is allowed, twice the rise is 0 or, half of the time, chi-square
     with one degree of freedom. The amplitude means nothing there, so the largest of the rises at all
     amplitudes counts (Davies 1987); by Bonferroni's bound over them a pixel without lobes is given some with
-    at most the probability ``free_lobe_alarm``.
+    about the probability ``free_lobe_alarm``: neighbouring amplitudes rise together, which lowers it, and the
+    best one is refined, which raises it.
     """
     trials = max(len(model.free_lobes), 1)
     return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * model.free_lobe_alarm / trials)))

@@ -194,7 +194,7 @@ def _with_cumulants(
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")
 def _height(amplitude: float, theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
-    """Return the log-likelihood with lobes, from the masses without in ``room``, moved by whole and part DN."""
+    """Return the log-likelihood with lobes: the masses without in ``room``, moved by whole and part DN."""
     n, weight = cells.n_bins, theta[LOBE]
     for i in range(n):
         room.ratio[i] = (1.0 - weight) * room.mass[i]

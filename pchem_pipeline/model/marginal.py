@@ -64,11 +64,11 @@ class MarginalModel:
         outlier_share, outlier_codes: share of the samples that can be anything, evenly over so many codes:
             they then count for nothing in the fit (particle hits).
         free_lobes: amplitudes A, e-, of which one may be found in a pixel, with a weight q of its own; the
-            fit tries each, and keeps the best where the likelihood rises by enough. Empty: none is tried.
+            fit tries each, refines the best, and keeps it where the likelihood rises by enough. Empty: none.
         free_lobe_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps 1 - q;
             the weights sum to 1 and q multiplies them. The default is a trap read by correlated double
             sampling: -A, 0, +A with q/2, 1 - q, q/2.
-        free_lobe_alarm: probability that a pixel without such levels is given some.
+        free_lobe_alarm: about the probability that a pixel without such levels is given some.
     """
 
     law: CountLaw = "poisson"

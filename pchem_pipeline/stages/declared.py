@@ -78,7 +78,7 @@ _ALL = (
     ),
     Declaration(
         "fit",
-        4,
+        5,
         ("histogram",),
         ("fit", "model", "run.tile"),
         ("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),

@@ -239,6 +239,47 @@ def test_free_lobes_are_found_where_they_are_and_nowhere_else() -> None:
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-6)
 
 
+def test_telegraph_levels_are_found_where_the_plain_fit_is_astray() -> None:
+    """Steps near 1 e- are taken for electrons: the fit alone is off by one, or finds another comb."""
+    n = 60
+    rng = np.random.default_rng(21)
+    truth = [rng.uniform(0.6, 3.2, n), 1 / rng.normal(12.0, 0.2, n), np.full(n, 100.0), np.full(n, 3.9)]
+    amplitude, weight = rng.uniform(0.9, 1.35, n), rng.uniform(0.3, 0.48, n)
+    shares = np.stack([0.5 * weight, 1 - weight, 0.5 * weight], axis=1)
+    shifts = np.stack([-amplitude, 0 * amplitude, amplitude], axis=1)
+    counts = drawn(MarginalModel().with_noise(shares, shift_e=shifts), truth)
+    plain = fit_histograms(counts, origins(n))
+    law = MarginalModel().with_free_lobes([0.5, 0.7, 1.0, 1.4, 2.0], alarm=1e-3)
+    grown = fit_grown(counts, origins(n), plain, law, plain=plain)
+    astray = abs(columns(plain) - np.stack(truth, axis=1))[:, 0] > 0.5
+    assert astray.mean() > 0.5
+    found = grown.lobe_weight > 0
+    assert found.mean() > 0.9
+    off = abs(columns(grown) - np.stack(truth, axis=1))[:, 0] > 0.5
+    assert off.mean() < 0.1
+    # between the amplitudes of the grid, too, the fit is likelier than the truth
+    of_truth = log_likelihood(counts, origins(n), truth, law, lobes=(amplitude, weight))
+    assert (grown.log_likelihood > of_truth)[found & ~off].all()
+    pulls = (columns(grown) - np.stack(truth, axis=1))[found & ~off] / stderr(grown)[found & ~off]
+    # the amplitude's own uncertainty is not in the errors, so single pulls are wider; their mean is not
+    assert (abs(pulls.mean(axis=0)) < 5 * pulls.std(axis=0) / np.sqrt(len(pulls))).all()
+    assert (abs(np.median(pulls, axis=0)) < 1.0).all()
+
+
+def test_pixels_without_levels_are_rarely_given_some() -> None:
+    n, alarm = 400, 1e-3
+    rng = np.random.default_rng(22)
+    noise = 12.0 * rng.uniform(0.25, 0.45, n)
+    truth = [rng.uniform(0.5, 3.5, n), np.full(n, 1 / 12), np.full(n, 100.0), noise]
+    counts = drawn(MarginalModel(), truth)
+    plain = fit_histograms(counts, origins(n))
+    law = MarginalModel().with_free_lobes([0.5, 0.7, 1.0, 1.4, 2.0], alarm=alarm)
+    grown = fit_grown(counts, origins(n), plain, law, plain=plain)
+    false = int((grown.lobe_weight > 0).sum())
+    # Poisson: more than 5 of 0.4 expected have a probability below 1e-5
+    assert false <= 5
+
+
 def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
     counts = drawn(MarginalModel(), TRUTH)
     clean = fit_histograms(counts, origins(5))
