@@ -32,7 +32,13 @@ __all__ = ["RtsNoise"]
 # draws that are no frame's
 _WHERE, _SIZE = 0xFFFFFFFE, 0xFFFFFFFF
 # steps, e-, and samples averaged that the estimator looks for, with probabilities
-_STEPS = ((0.5, 1), (0.7, 1), (1.0, 1), (1.5, 1), (2.5, 1), (4.0, 1), (1.5, 4), (3.0, 4))
+_STEPS = (
+    (0.5, 1), (0.7, 1), (1.0, 1), (1.5, 1), (2.5, 1), (4.0, 1), (1.3, 2), (2.0, 2), (1.5, 4), (3.0, 4),
+)  # fmt: skip
+# pixels that must stand out: most with strong traps are led so far astray that their fit is not usable
+_FEWEST = 2
+# share of the pixels guessed at least: what moves no statistic clearly cannot be scaled to what is there
+_LEAST_FRACTION = 0.04
 _PROBABILITIES = (0.01, 0.03, 0.08, 0.2, 0.4)
 # what outlying pixels are compared by, with goodness of fit before, and how far they must stand out
 _PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
@@ -168,8 +174,8 @@ class RtsNoise(Effect):
     def _correlated(cls, evidence: Evidence) -> list[Self]:
         outlying = _outlying(evidence)
         n, count = int(evidence.maps.usable.sum()), int(outlying.sum())
-        # fewer are chance; where most pixels stand out something else is wrong
-        if count < 4 or count > 0.3 * n:
+        # where most pixels stand out something else is wrong
+        if count < _FEWEST or count > 0.3 * n:
             return []
         seen = np.array([np.median(values[outlying]) for values in _profile(evidence)])
         chosen = typical_pixels(evidence.maps, 3)[0]
@@ -186,7 +192,8 @@ class RtsNoise(Effect):
             at = step[np.argmin(misfit[step])]
             # those too weak to stand out count too
             power = max(_survival(float((_LIMITS - _departure(profiles[at])).min())), 0.3)
-            best.append((misfit[at], kinds[at].model_copy(update={"fraction": min(count / n / power, 1.0)})))
+            share = min(max(count / n / power, _LEAST_FRACTION), 1.0)
+            best.append((misfit[at], kinds[at].model_copy(update={"fraction": share})))
         ranked = [effect for _, effect in sorted(best, key=lambda item: float(item[0]))]
         # real traps differ; the mean of those that stand out is well above that of all
         spread = ranked[0].model_copy(
