@@ -199,7 +199,10 @@ class RtsNoise(Effect):
         spread = ranked[0].model_copy(
             update={"spread": "exponential", "amplitude_e": 0.7 * ranked[0].amplitude_e}
         )
-        return [ranked[0], spread, *ranked[1:]]
+        # how many samples are averaged shows little in these profiles: the best of each is a guess
+        likeliest = {effect.samples: effect for effect in reversed(ranked)}
+        first = sorted(likeliest.values(), key=ranked.index)
+        return [*first, spread, *(effect for effect in ranked if effect not in first)]
 
     @classmethod
     def _single(cls, evidence: Evidence) -> list[Self]:
