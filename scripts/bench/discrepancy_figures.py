@@ -84,7 +84,8 @@ def wilson(hits: int, n: int) -> tuple[float, float]:
         return 0.0, 1.0
     z, p = 1.96, hits / n
     middle, spread = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return (middle - spread) / (1 + z * z / n), (middle + spread) / (1 + z * z / n)
+    low, high = ((middle + side * spread) / (1 + z * z / n) for side in (-1, 1))
+    return max(low, 0.0), min(high, 1.0)
 
 
 def _line(title: str, hits: int, n: int, target: str, reached: bool | None) -> None:
