@@ -314,7 +314,8 @@ class _Search:
     ) -> _Grown | None:
         """Put the chosen effects into the model; None, and the model as it was, where none is established.
 
-        Asked twice: of the strengths as one simulation gives them, and as the replicates correct them.
+        Asked three times: of the strengths as few simulations give them, as the replicates correct them, and
+        of the final frames.
         """
         before, shift, noise = self.model, z.both - null.mean, self._noise(null, 2)
         chosen = self._needed(laboratory, choice.present(self.settings.certainty), shift, noise)
@@ -368,9 +369,7 @@ class _Search:
         """Refine the strengths of the chosen set together; drop what may be nothing; None if that is all."""
         noise = replace(noise, model_error=_FINE_ERROR)
         while chosen:
-            [chosen] = laboratory.tuned(
-                [chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE, repeats=REPEATS
-            )
+            chosen = _tuned(laboratory, chosen, shift, noise)
             kept = fit_set(chosen, shift, noise).established(_ESTABLISHED)
             if len(kept) == len(chosen):
                 break

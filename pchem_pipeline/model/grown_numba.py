@@ -42,9 +42,8 @@ N_WORDS = 3
 
 _ROUNDING = 1.0 / 12.0
 _LEAST_VARIANCE = 1e-6  # DN^2
-_LEAST_SHARE = (
-    0.1  # of the variance and the exposure that the plain fit found, left to the pixel itself at the start
-)
+# of the variance and the exposure that the plain fit found, left to the pixel itself at the start
+_LEAST_SHARE = 0.1
 
 
 @nb.njit(nogil=True, cache=True, error_model="numpy")

@@ -21,7 +21,7 @@ __all__ = ["Telegraph", "find_telegraph"]
 FloatArray = NDArray[np.float64]
 
 # rise of the log-likelihood, nats, that the first and the second process must bring; pixels of constant
-# exposure reach the first by chance in about one of 500
+# exposure reach the first by chance in about one of 340
 _RISES = (6.0, 5.0)
 # rise that one of the starts must bring by itself, nats: one pixel in fifty of constant exposure does
 _PROMISING = 2.0
