@@ -19,11 +19,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pchem_pipeline.errors import PchEmError
-    from pchem_pipeline.model.fit_status import FitStatus
-    from pchem_pipeline.model.pchem import FitResult, fit_histograms
-    from pchem_pipeline.model.settings import FitSettings
-    from pchem_pipeline.stages.notebook import open_run
+    from pchem_pipeline.base.errors import PchEmError
+    from pchem_pipeline.commands.notebook import open_run
+    from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+    from pchem_pipeline.model.fit.settings import FitSettings
+    from pchem_pipeline.model.fit.status import FitStatus
     from pchem_pipeline.store.run_store import RunStore
 
 __all__ = [
@@ -40,13 +40,13 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
-    "FitResult": "model.pchem",
-    "FitSettings": "model.settings",
-    "FitStatus": "model.fit_status",
-    "PchEmError": "errors",
+    "FitResult": "model.fit.pchem",
+    "FitSettings": "model.fit.settings",
+    "FitStatus": "model.fit.status",
+    "PchEmError": "base.errors",
     "RunStore": "store.run_store",
-    "fit_histograms": "model.pchem",
-    "open_run": "stages.notebook",
+    "fit_histograms": "model.fit.pchem",
+    "open_run": "commands.notebook",
 }
 
 

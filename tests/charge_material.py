@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.observe import observe
-from pchem_pipeline.effects.context import EffectContext
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import KeyedStreams

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.model.pcd import pcd_mass
+from pchem_pipeline.model.law.pcd import pcd_mass
 
 
 class Drawn(NamedTuple):

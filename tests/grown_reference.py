@@ -7,7 +7,7 @@ import math
 import mpmath
 import numpy as np
 
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 EVERYTHING = (
     MarginalModel()

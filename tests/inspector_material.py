@@ -10,14 +10,14 @@ from report_material import draw_dn, report_data
 
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.render import report as report_module
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.exhibits import Exhibit
-from pchem_pipeline.render.pictures import Picture
-from pchem_pipeline.render.report import render_report
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.stages.inspector import gather_inspector
-from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.report import render_report
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Picture
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.report.inspector import gather_inspector
 from pchem_pipeline.store.run_store import RunStore
 
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
-from pchem_pipeline.render.captions import case_name
-from pchem_pipeline.render.data import PixelFit, ReportData
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.report.data import PixelFit, ReportData
+from pchem_pipeline.report.pages.captions import case_name
 
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe import observe
-from pchem_pipeline.effects.base import Effect
-from pchem_pipeline.effects.context import EffectContext
-from pchem_pipeline.effects.evidence import Evidence
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import KeyedStreams

@@ -11,10 +11,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, MissingDependencyError, PchEmError
 from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, Stop, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.errors import ConfigError, IncompleteRunError, MissingDependencyError, PchEmError
 
 __all__ = ["DistributedExecutor", "OtherVersionsError", "library_versions"]
 

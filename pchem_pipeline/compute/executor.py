@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, PchEmError
 from pchem_pipeline.compute.environment import available_workers, prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.errors import ConfigError, IncompleteRunError, PchEmError
 
 __all__ = [
     "Executor",

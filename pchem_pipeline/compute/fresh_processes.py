@@ -16,8 +16,8 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
+from pchem_pipeline.base.errors import IncompleteRunError
 from pchem_pipeline.compute.executor import OnResult, Outcome, guarded
-from pchem_pipeline.errors import IncompleteRunError
 
 __all__ = ["FreshProcessExecutor"]
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
 
 __all__ = ["ClusterSettings", "ComputeSettings"]
 

@@ -9,14 +9,14 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.base.settings import Section
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import complaints, yaml_content
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import ConfigError, quoted
-from pchem_pipeline.model.ensemble_settings import MapsSettings
-from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.settings import Section
+from pchem_pipeline.model.ensemble.settings import MapsSettings
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.report.settings import ReportSettings
 
 __all__ = [
     "JointConfig",

@@ -11,8 +11,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import to_jsonable_python
 
+from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import ConfigError, quoted
 
 __all__ = [
     "complaints",

@@ -6,16 +6,16 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from pchem_pipeline.base.settings import Section
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.settings import ModelSettings
+from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.methods.settings import MethodsSettings
-from pchem_pipeline.model.ensemble_settings import EnsembleSettings, MapsSettings
-from pchem_pipeline.model.histogram_settings import HistogramSettings
-from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.settings import Section
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings, MapsSettings
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.histogram.settings import HistogramSettings
+from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.simulate.settings import SimulateSettings
 
 __all__ = ["RunConfig", "RunSettings"]

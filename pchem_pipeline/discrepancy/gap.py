@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
-from pchem_pipeline.discrepancy.null import NullModel, moments
+from pchem_pipeline.discrepancy.by_simulation.null import NullModel, moments
+from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 
 __all__ = ["Gap", "GapMetric"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
 
 __all__ = ["DiscrepancySettings"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.base.errors import InputError
 
 __all__ = ["MINIMUM_FRAMES", "Splits", "block_length", "split_frames"]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
-from pchem_pipeline.effects.evidence import Evidence, TimeSeries
+from pchem_pipeline.discrepancy.by_simulation.null import NullModel, look_elsewhere
+from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
 __all__ = ["Place", "locate"]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.base.errors import InputError
 
 __all__ = ["temporary"]
 

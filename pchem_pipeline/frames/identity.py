@@ -12,7 +12,7 @@ from typing import Any
 
 import xxhash
 
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.base.errors import InputError
 
 __all__ = [
     "FileHasher",

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pchem_pipeline.errors import ConfigError, InputError
-from pchem_pipeline.frames.base import FrameReader
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
+from pchem_pipeline.frames.reader import FrameReader
 from pchem_pipeline.frames.registry import detect_format, reader_class
 from pchem_pipeline.frames.resolve import resolve_files
 from pchem_pipeline.frames.settings import InputSettings

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.frames.base import FrameReader
-from pchem_pipeline.frames.contiguous import ContiguousReader
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.identity import FileHasher, file_size, identity_of_hashes
+from pchem_pipeline.frames.reader import FrameReader
 from pchem_pipeline.frames.sequence import FrameSequence
 
 __all__ = ["ReadOnce"]

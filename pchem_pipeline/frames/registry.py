@@ -11,8 +11,8 @@ import importlib
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from pchem_pipeline.errors import ConfigError, InputError, MissingDependencyError
-from pchem_pipeline.frames.base import FrameReader
+from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError
+from pchem_pipeline.frames.reader import FrameReader
 
 __all__ = ["ENTRY_POINT_GROUP", "detect_format", "frame_suffixes", "reader_class", "reader_names", "require"]
 
@@ -61,7 +61,9 @@ def reader_class(name: str) -> type[FrameReader]:
     """
     if name in _OURS:
         module, cls = _OURS[name]
-        found: type[FrameReader] = getattr(importlib.import_module(f"pchem_pipeline.frames.{module}"), cls)
+        found: type[FrameReader] = getattr(
+            importlib.import_module(f"pchem_pipeline.frames.formats.{module}"), cls
+        )
         return found
     plugins = _plugins()
     if name not in plugins:

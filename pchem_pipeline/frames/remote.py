@@ -12,7 +12,7 @@ import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pchem_pipeline.errors import InputError, MissingDependencyError
+from pchem_pipeline.base.errors import InputError, MissingDependencyError
 from pchem_pipeline.frames.atomic import temporary
 
 __all__ = ["fetch", "is_remote"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pchem_pipeline.errors import ConfigError, InputError
-from pchem_pipeline.frames.raw import RawReader, find_sidecar
+from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.frames.formats.raw import RawReader, find_sidecar
 from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings

@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
-from pchem_pipeline.frames.base import FrameReader, check_window
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.inspect import InputReport
+from pchem_pipeline.frames.reader import FrameReader, check_window
 from pchem_pipeline.frames.settings import InputSettings
 
 __all__ = ["FrameSequence"]

@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
 
 __all__ = ["InputSettings"]
 

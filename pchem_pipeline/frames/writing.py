@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 
 __all__ = ["WRITERS", "write_frames"]
 
@@ -65,7 +65,7 @@ def write_frames(
     if kind.kind != "u" or kind.itemsize not in (1, 2, 4):
         raise ValueError(f"frames are uint8, uint16 or uint32, not {kind.name}")
     module, suffix = WRITERS[format]
-    writer = importlib.import_module(f"pchem_pipeline.frames.{module}").write_frames
+    writer = importlib.import_module(f"pchem_pipeline.frames.formats.{module}").write_frames
     path = path if path.suffix else path.with_suffix(suffix)
     stream = _Stream(blocks, shape)
     facts = {"integration_time": integration_time, "bit_depth": bit_depth}

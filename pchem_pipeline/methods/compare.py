@@ -12,7 +12,7 @@ import numpy as np
 
 from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, Settings
 from pchem_pipeline.methods.registry import methods
-from pchem_pipeline.model.expected_information import (
+from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
     shared_information,

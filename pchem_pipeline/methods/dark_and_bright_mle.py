@@ -15,7 +15,7 @@ from pchem_pipeline.methods.base import (
     register_method,
 )
 from pchem_pipeline.methods.plain_em import first_start, run_em
-from pchem_pipeline.model.pcd import log_pcd
+from pchem_pipeline.model.law.pcd import log_pcd
 
 __all__ = ["DarkAndBrightMle", "log_likelihoods"]
 

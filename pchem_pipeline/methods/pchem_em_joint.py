@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
-from pchem_pipeline.model.fit_status import FAILED, MEANINGS
-from pchem_pipeline.model.joint import fit_joint
+from pchem_pipeline.model.fit.joint import fit_joint
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
 __all__ = ["JointPchEm"]
 
@@ -16,8 +16,8 @@ class JointPchEm(Method):
     """Maximum likelihood of all samples together: one g, mu and sigma, an H for each exposure.
 
     Multi-sample PCH-EM (Hendrickson et al. 2024, arXiv 2403.04498; IEEE Trans. Electron Devices), with the
-    numerical work of :mod:`pchem_pipeline.model.joint`. The darkest sample is taken for bias frames, as by
-    the other methods that need one.
+    numerical work of :mod:`pchem_pipeline.model.fit.joint`. The darkest sample is taken for bias frames,
+    as by the other methods that need one.
     """
 
     name = "pchem_em_joint"

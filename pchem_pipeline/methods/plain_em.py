@@ -15,7 +15,7 @@ from pchem_pipeline.methods.base import (
     Settings,
     register_method,
 )
-from pchem_pipeline.model.start import kernel_counts, starting_points
+from pchem_pipeline.model.fit.start import kernel_counts, starting_points
 
 __all__ = ["PlainEm", "first_start", "run_em"]
 

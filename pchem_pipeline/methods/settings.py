@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
 
 __all__ = ["MethodsSettings"]
 

@@ -15,12 +15,12 @@ from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
 from pchem_pipeline.methods.compare import MethodResult, compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.registry import methods
-from pchem_pipeline.model.drawn_histograms import draw_histograms
-from pchem_pipeline.model.expected_information import (
+from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
     shared_information,
 )
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 __all__ = ["SHARES", "StudyPoint", "study_point"]
 

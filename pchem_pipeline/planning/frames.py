@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.model.expected_information import expected_information, inverse_information
+from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import TARGET_NAMES, Target
 
-__all__ = ["best_exposure", "exposure_grid", "frames_grid", "frames_needed", "precision"]
+__all__ = ["best_exposure", "contour_data", "exposure_grid", "frames_grid", "frames_needed", "precision"]
 
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -113,3 +114,22 @@ def frames_grid(
             for s in read_noises
         ]
     )
+
+
+def contour_data(targets: Sequence[Target], conversion_gain: float, *, fine: int = 28) -> dict[str, Any]:
+    """Return the frames that one sample needs over exposure and read noise, for a figure.
+
+    Args:
+        targets: what is wanted.
+        conversion_gain: g, e-/DN, for targets in DN.
+        fine: points along each axis.
+    """
+    exposures, noises = exposure_grid(0.05, 30.0, fine), np.linspace(0.15, 0.9, fine)
+    noises = noises[noises >= conversion_gain / np.sqrt(12.0)]
+    return {
+        "exposures": exposures,
+        "read_noises": noises,
+        "frames": {
+            str(target): frames_grid(target, exposures, noises, conversion_gain) for target in targets
+        },
+    }

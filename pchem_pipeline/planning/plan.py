@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.planning.frames import best_exposure, exposure_grid, frames_needed, precision
 from pchem_pipeline.planning.likelihood_limits import ambiguity, gain_rival, rounding_shift
 from pchem_pipeline.planning.point import FloatArray, Point

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 
 __all__ = ["FloatArray", "Point"]
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.model.expected_information import shared_information
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.model.errors.expected_information import shared_information
 from pchem_pipeline.planning.frames import exposure_grid
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import Target

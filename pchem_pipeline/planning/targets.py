@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.planning.point import FloatArray, Point
 
 __all__ = ["TARGET_NAMES", "Target", "parse_target"]

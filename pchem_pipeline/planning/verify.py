@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.drawn_histograms import draw_histograms
-from pchem_pipeline.model.fit_status import FAILED, FitStatus
-from pchem_pipeline.model.joint import fit_joint
-from pchem_pipeline.model.pchem import fit_histograms
+from pchem_pipeline.model.fit.joint import fit_joint
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import Target
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.effects.context import EffectContext
-from pchem_pipeline.effects.plane import Plane
-from pchem_pipeline.errors import ConfigError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.plane import Plane
 from pchem_pipeline.simulate.chain_numba import draw_rows, simulate_rows
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.base import Effect
+    from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.simulate.settings import SimulateSettings
     from pchem_pipeline.simulate.truth import TruthMaps
 

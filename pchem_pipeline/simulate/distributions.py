@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
 from pchem_pipeline.simulate.patterns import Pattern
 
 __all__ = [

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
 
 __all__ = ["ColumnPattern", "GradientPattern", "Pattern", "PatternBase", "RadialPattern", "RowPattern"]
 

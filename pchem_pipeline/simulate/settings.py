@@ -8,8 +8,8 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.registry import EffectList
-from pchem_pipeline.settings import Section
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.framework.registry import EffectList
 from pchem_pipeline.simulate.distributions import Distribution, LogNormal, Normal
 from pchem_pipeline.simulate.patterns import ColumnPattern
 

@@ -22,7 +22,7 @@ from pchem_pipeline.simulate.streams_numba import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import Dim
+    from pchem_pipeline.effects.framework.context import Dim
 
 __all__ = [
     "Key",

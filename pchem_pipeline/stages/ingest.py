@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.frames.histograms import is_histogram_input, read_histograms
+from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.stages.base import WHOLE, StageContext, nothing_left, open_store
-from pchem_pipeline.stages.declared import DECLARED
-from pchem_pipeline.stages.input_identity import keep_ingested, known_identity, shortened
-from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import WHOLE, StageContext, nothing_left, open_store
 
 if TYPE_CHECKING:
-    from pchem_pipeline.frames.base import FrameReader
+    from pchem_pipeline.frames.reader import FrameReader
     from pchem_pipeline.frames.sequence import FrameSequence
 
 __all__ = [

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.discovery import false_discovery, poorest
-from pchem_pipeline.model.fisher import covariance_from
-from pchem_pipeline.model.fit_status import FAILED
-from pchem_pipeline.model.maps import derived_maps, quality_map, status_counts, summarise
-from pchem_pipeline.stages.base import StageContext, open_store
-from pchem_pipeline.stages.declared import DECLARED
-from pchem_pipeline.stages.plain import plain
-from pchem_pipeline.variables import INTERVALS, PARAMETERS, interval_names
+from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
+from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
+from pchem_pipeline.model.errors.fisher import covariance_from
+from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.plain import plain
+from pchem_pipeline.run.stage import StageContext, open_store
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile

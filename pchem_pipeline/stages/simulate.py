@@ -20,14 +20,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from pchem_pipeline.errors import ConfigError, StoreError
+from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.frames.writing import WRITERS, write_frames
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
-from pchem_pipeline.stages.base import StageContext, open_store
-from pchem_pipeline.stages.declared import DECLARED
 from pchem_pipeline.store.files import storage_error, write_atomic
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.errors import StoreError
+from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store.remote_path import RemotePath
 
 __all__ = ["canonical_json", "read_json", "storage_error", "write_atomic", "write_json"]

@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PosixPath
 from typing import Any, Self, TypeVar, cast
 
-from pchem_pipeline.errors import MissingDependencyError, StoreError
+from pchem_pipeline.base.errors import MissingDependencyError, StoreError
 
 __all__ = ["RemoteError", "RemotePath", "lock_folder", "place_of", "refused", "zarr_place"]
 

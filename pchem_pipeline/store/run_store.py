@@ -26,11 +26,11 @@ import numpy as np
 from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import LockedError, PchEmError, StoreError, quoted
+from pchem_pipeline.base.errors import LockedError, PchEmError, StoreError, quoted
+from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused, zarr_place
-from pchem_pipeline.variables import VARIABLES
 
 if TYPE_CHECKING:
     import zarr
@@ -125,7 +125,7 @@ class RunStore:
         """Make the array of a registered variable, replacing an older one.
 
         Args:
-            name: path in :data:`pchem_pipeline.variables.VARIABLES`.
+            name: path in :data:`pchem_pipeline.base.variables.VARIABLES`.
             shape: its shape.
             chunks: chunk shape; one task must write whole chunks.
             dtype: only for variables whose type the data decide.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 
 __all__ = ["TILE_SIZES", "Tile", "parse_tiles", "roi_tiles", "tile_grid"]
 

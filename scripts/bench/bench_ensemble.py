@@ -18,20 +18,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.agreement import central_window, counting_variance, noise_floor, rmse
-from pchem_pipeline.model.electrons import cell_probabilities, electron_counts
-from pchem_pipeline.model.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
-from pchem_pipeline.model.ensemble_binned import (
+from pchem_pipeline.model.checks.residuals import central_window, counting_variance, noise_floor, rmse
+from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_counts
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
+from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
     epcd_dependent,
     epcd_independent,
     nuced_dependent,
     nuced_independent,
 )
-from pchem_pipeline.model.ensemble_settings import EnsembleSettings
-from pchem_pipeline.model.pcd import pcd_mass
-from pchem_pipeline.model.pchem import fit_histograms
-from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
-from pchem_pipeline.model.fisher import cramer_rao_stderr
-from pchem_pipeline.model.pcd import log_pcd, pcd_mass
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
-from pchem_pipeline.model.start import starting_points
+from pchem_pipeline.model.errors.fisher import cramer_rao_stderr
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.start import starting_points
+from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
 
 Array = NDArray[np.float64]
 NAMES = ("H", "g", "mu", "sigma")

@@ -69,7 +69,7 @@ def write_stack(path: Path, frames: int, side: int) -> None:
 def measure(folder: Path, frames: int, side: int, workers: int) -> Row:
     """Write a stack, run it as far as the histograms, or the fit if no frame is repeated, and remove it."""
     from pchem_pipeline.config.load import load_config
-    from pchem_pipeline.stages.plan import make_plan, sweep_bytes
+    from pchem_pipeline.stages.histogram.dry_run import make_plan, sweep_bytes
 
     raw, config = folder / "stack.raw", folder / "stack.yaml"
     write_stack(raw, frames, side)

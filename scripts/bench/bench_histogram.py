@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.model.histogram import HistogramAccumulator, RowHistograms, histogram_frames
-from pchem_pipeline.model.histogram_settings import HistogramSettings
-from pchem_pipeline.model.summaries import SummaryAccumulator, line_sums
-from pchem_pipeline.stages.frame_source import read_ahead
-from pchem_pipeline.stages.histogram import histogram_tile
+from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms, histogram_frames
+from pchem_pipeline.model.histogram.settings import HistogramSettings
+from pchem_pipeline.model.histogram.summaries import SummaryAccumulator, line_sums
+from pchem_pipeline.stages.histogram.frame_source import read_ahead
+from pchem_pipeline.stages.histogram.histogram import histogram_tile
 
 Frames = NDArray[np.uint16]
 

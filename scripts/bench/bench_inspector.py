@@ -23,13 +23,13 @@ from pchem_pipeline.compute.environment import prepare_environment
 
 prepare_environment()
 
-from pchem_pipeline.render import report as report_module  # noqa: E402
-from pchem_pipeline.render.data import ReportData  # noqa: E402
-from pchem_pipeline.render.inspector_data import InspectorData, MapEntry, PixelSample  # noqa: E402
-from pchem_pipeline.render.packing import choose_scale, pack_map  # noqa: E402
-from pchem_pipeline.render.pictures import Picture  # noqa: E402
-from pchem_pipeline.render.report import render_report  # noqa: E402
-from pchem_pipeline.render.settings import ReportSettings  # noqa: E402
+from pchem_pipeline.report.data import ReportData  # noqa: E402
+from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample  # noqa: E402
+from pchem_pipeline.report.inspector.packing import choose_scale, pack_map  # noqa: E402
+from pchem_pipeline.report.pages import report as report_module  # noqa: E402
+from pchem_pipeline.report.pages.report import render_report  # noqa: E402
+from pchem_pipeline.report.settings import ReportSettings  # noqa: E402
+from pchem_pipeline.report.style.pictures import Picture  # noqa: E402
 
 #: Median, spread between pixels and standard error of one pixel: as of the paper's sensor.
 MAPS = {

@@ -54,8 +54,8 @@ def make(
 
 
 def _look(case: Case, frames: NDArray[np.uint16], options: dict[str, Any]) -> dict[str, Any]:
+    from pchem_pipeline.discrepancy.by_simulation.workflow import find_discrepancies
     from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-    from pchem_pipeline.discrepancy.workflow import find_discrepancies
 
     settings = DiscrepancySettings(exclude=case.exclude, **options)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -76,9 +76,9 @@ def fit_maps(
     Returns:
         Maps of H, g, mu and s_e, their standard errors (``*_stderr``), and ``good``.
     """
-    from pchem_pipeline.model.fit_status import FAILED
-    from pchem_pipeline.model.histogram import histogram_frames
-    from pchem_pipeline.model.pchem import fit_histograms
+    from pchem_pipeline.model.fit.pchem import fit_histograms
+    from pchem_pipeline.model.fit.status import FAILED
+    from pchem_pipeline.model.histogram.count import histogram_frames
 
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[-1])
@@ -110,9 +110,9 @@ def _grown(
     plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tuple[Any, ...], added: Any
 ) -> Any:
     """Fit again with the law that the effects make of the PCD."""
-    from pchem_pipeline.effects.compose import marginal_model, pixel_maps
-    from pchem_pipeline.model.fit_status import FAILED
-    from pchem_pipeline.model.grown import fit_grown
+    from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+    from pchem_pipeline.model.fit.grown import fit_grown
+    from pchem_pipeline.model.fit.status import FAILED
 
     parameters = [plain.quanta_exposure, plain.conversion_gain, plain.bias, plain.read_noise_dn]
     model = marginal_model(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)

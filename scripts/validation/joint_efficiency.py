@@ -24,11 +24,11 @@ prepare_environment()
 
 import numpy as np  # noqa: E402
 
-from pchem_pipeline.model.fisher import cramer_rao  # noqa: E402
-from pchem_pipeline.model.joint import fit_joint, joint_cramer_rao  # noqa: E402
-from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
-from pchem_pipeline.model.pchem import fit_histograms  # noqa: E402
-from pchem_pipeline.render.style import BLUE, GRAY, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
+from pchem_pipeline.model.errors.fisher import cramer_rao  # noqa: E402
+from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao  # noqa: E402
+from pchem_pipeline.model.fit.pchem import fit_histograms  # noqa: E402
+from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
+from pchem_pipeline.report.style.style import BLUE, GRAY, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
 
 NOISES = (0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 1.0)
 EXPOSURES = (0.5, 3.0, 12.0)

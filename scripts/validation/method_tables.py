@@ -22,7 +22,7 @@ def method_table(exposure: float, options: argparse.Namespace) -> None:
     """Print errors, biases, failures and times at one exposure."""
     from pchem_pipeline.methods.base import Settings
     from pchem_pipeline.methods.study import StudyPoint, study_point
-    from pchem_pipeline.render.method_words import verdict_words
+    from pchem_pipeline.report.pages.method_words import verdict_words
 
     points = [
         study_point(

@@ -20,11 +20,11 @@ prepare_environment()
 
 import numpy as np  # noqa: E402
 
-from pchem_pipeline.model.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias  # noqa: E402
-from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
-from pchem_pipeline.model.pchem import fit_histograms  # noqa: E402
-from pchem_pipeline.model.settings import FitSettings  # noqa: E402
-from pchem_pipeline.render.style import BLUE, GRAY, GREEN, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
+from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias  # noqa: E402
+from pchem_pipeline.model.fit.pchem import fit_histograms  # noqa: E402
+from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
+from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
+from pchem_pipeline.report.style.style import BLUE, GRAY, GREEN, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
 
 STEPS = (0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")

@@ -24,8 +24,8 @@ def results(order: str) -> str:
     prepare_environment()
     import numpy as np
 
-    from pchem_pipeline.model.joint import fit_joint
-    from pchem_pipeline.model.pchem import fit_histograms
+    from pchem_pipeline.model.fit.joint import fit_joint
+    from pchem_pipeline.model.fit.pchem import fit_histograms
 
     rng = np.random.default_rng(5)
     step, bias = rng.uniform(8, 14, N_PIXELS), rng.uniform(95, 105, N_PIXELS)

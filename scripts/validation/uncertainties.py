@@ -33,13 +33,13 @@ from pchem_pipeline.compute.environment import prepare_environment
 
 prepare_environment()
 
-from pchem_pipeline.model.discovery import false_discovery  # noqa: E402
-from pchem_pipeline.model.fisher import sandwich_covariance  # noqa: E402
-from pchem_pipeline.model.intervals import profile_intervals, quantile_of  # noqa: E402
-from pchem_pipeline.model.pcd import pcd_mass  # noqa: E402
-from pchem_pipeline.model.pchem import FitResult, fit_histograms  # noqa: E402
-from pchem_pipeline.model.pooled import judge_together  # noqa: E402
-from pchem_pipeline.model.settings import FitSettings  # noqa: E402
+from pchem_pipeline.model.checks.multiple_testing import false_discovery  # noqa: E402
+from pchem_pipeline.model.checks.shrinkage import judge_together  # noqa: E402
+from pchem_pipeline.model.errors.fisher import sandwich_covariance  # noqa: E402
+from pchem_pipeline.model.fit.intervals import profile_intervals, quantile_of  # noqa: E402
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms  # noqa: E402
+from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
+from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 
 Array = NDArray[np.float64]
 NAMES = ("H", "g", "mu", "sigma", "s_e")

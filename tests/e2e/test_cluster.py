@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from commands import assert_same_results
 
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute import cluster
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.errors import ConfigError, IncompleteRunError
-from pchem_pipeline.stages.interrupt import InterruptedRunError
+from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.store.run_store import RunStore
 
 

@@ -10,9 +10,9 @@ import shutil
 import numpy as np
 import pytest
 
-from pchem_pipeline.errors import ChangedError, ConfigError, StoreError
-from pchem_pipeline.stages.compare import compare_runs, comparison_of
-from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
+from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.run_store import RunStore
 
 

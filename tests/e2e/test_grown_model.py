@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS
+from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.stages.session import Command, find_run, run_stages, run_status
-from pchem_pipeline.stages.view import RunView
+from pchem_pipeline.run.session import Command, find_run, run_stages, run_status
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.variables import FREE_LOBES, PARAMETERS
 
 EFFECTS: list[dict[str, Any]] = [
     {"tag": "signal_dependent_noise", "noise_e": 0.09},

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 from inspector_material import make_run
 
-from pchem_pipeline.model.fit_status import MEANINGS
-from pchem_pipeline.model.maps import display_transform
-from pchem_pipeline.model.pcd import pcd
-from pchem_pipeline.render.packing import unpack_map
-from pchem_pipeline.render.wording import measured, short, symbol
-from pchem_pipeline.stages.inspector import packed_map
-from pchem_pipeline.stages.view import make_server
+from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.commands.view import make_server
+from pchem_pipeline.model.fit.status import MEANINGS
+from pchem_pipeline.model.law.pcd import pcd
+from pchem_pipeline.model.maps.maps import display_transform
+from pchem_pipeline.report.inspector.packing import unpack_map
+from pchem_pipeline.report.style.wording import measured, short, symbol
+from pchem_pipeline.stages.report.inspector import packed_map
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.variables import VARIABLES
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="no Playwright; install it with: pip install playwright"

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from commands import Shell
 
-from pchem_pipeline.errors import ConfigError, PchEmError
-from pchem_pipeline.stages.base import Options
-from pchem_pipeline.stages.joint_session import find_joint, run_joint
-from pchem_pipeline.stages.session import Command
+from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.commands.joint import find_joint, run_joint
+from pchem_pipeline.run.session import Command
+from pchem_pipeline.run.stage import Options
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(Options(), quiet=True, progress="off")

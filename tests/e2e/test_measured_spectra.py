@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import Shell
 
-from pchem_pipeline.model.fit_status import FitStatus
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.store.run_store import RunStore
 
 SPECTRA = sorted((Path(__file__).parents[1] / "data" / "sipm").glob("*.csv"))

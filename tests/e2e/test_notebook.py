@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import pchem_pipeline
-from pchem_pipeline.errors import ConfigError, MissingDependencyError, StoreError
-from pchem_pipeline.render.style import figure_bytes
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
+from pchem_pipeline.report.style.style import figure_bytes
 from pchem_pipeline.store.run_store import RunStore
 
 TUTORIAL = Path(__file__).parents[2] / "notebooks" / "tutorial.ipynb"

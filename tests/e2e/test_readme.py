@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pchem_pipeline.stages.pipeline import STAGES
+from pchem_pipeline.run.runner import STAGES
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -81,7 +81,7 @@ def test_the_shipped_demo_config_runs(shell):
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; sys.argv=['pchem','--help']\n"
-        "from pchem_pipeline.cli import main\n"
+        "from pchem_pipeline.cli.app import main\n"
         "try: main()\nexcept SystemExit: pass\n"
         "heavy={'numpy','zarr','dask','numba','pydantic','scipy','matplotlib'} & set(sys.modules)\n"
         "assert not heavy, heavy"

@@ -7,14 +7,14 @@ import sys
 
 import pytest
 
-from pchem_pipeline.stages.declared import DECLARED
-from pchem_pipeline.stages.pipeline import OPTIONAL_STAGES, STAGES, load_stage
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.runner import OPTIONAL_STAGES, STAGES, load_stage
 
 COMMAND = """
 import sys
-from pchem_pipeline import cli
+from pchem_pipeline.cli.app import app
 try:
-    cli.main(sys.argv[1:])
+    app.main(sys.argv[1:])
 except SystemExit as end:
     assert end.code in (0, None), end.code
 print(' '.join(sorted({name.partition('.')[0] for name in sys.modules})))

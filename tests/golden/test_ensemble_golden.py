@@ -8,10 +8,10 @@ import pytest
 from scipy.special import roots_genlaguerre
 from scipy.stats import nbinom
 
-from pchem_pipeline.model.electrons import cell_probabilities
-from pchem_pipeline.model.ensemble import DnAxis, electron_pmf, epcd_exact
-from pchem_pipeline.model.ensemble_binned import HistogramChoice, epcd_independent
-from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.electrons.electrons import cell_probabilities
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, epcd_exact
+from pchem_pipeline.model.ensemble.ensemble_binned import HistogramChoice, epcd_independent
+from pchem_pipeline.model.maps.pixels import PixelParameters
 
 
 @pytest.mark.parametrize("k", [0, 1, 4, 9])

@@ -10,9 +10,9 @@ from iminuit import Minuit
 from reference_pchem import Theta, log_likelihood
 from scipy.special import gammaln
 
-from pchem_pipeline.model.pcd import log_pcd
-from pchem_pipeline.model.pchem import fit_histograms
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.law.pcd import log_pcd
 
 CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.25), (7.0, 13.0, 0.4), (1.0, 10.0, 0.48)]
 

@@ -8,11 +8,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pchem_pipeline.model.electrons import electron_numbers, thresholds
-from pchem_pipeline.model.ensemble import DnAxis, nuced_axis
-from pchem_pipeline.model.maps import display_transform
-from pchem_pipeline.model.pixels import PixelParameters
-from pchem_pipeline.stages.ensemble_tile import EnsembleAxes, PixelHistograms, ensemble_tile
+from pchem_pipeline.model.electrons.electrons import electron_numbers, thresholds
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, nuced_axis
+from pchem_pipeline.model.maps.maps import display_transform
+from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.stages.ensemble.tile import EnsembleAxes, PixelHistograms, ensemble_tile
 
 RNG = np.random.default_rng(21)
 N = 40

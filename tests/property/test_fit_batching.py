@@ -9,7 +9,7 @@ from drawn_pixels import draw
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
 
 _N = 24
 

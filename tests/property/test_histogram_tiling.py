@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.histogram import HistogramAccumulator, RangeAccumulator, RowHistograms
-from pchem_pipeline.model.summaries import ROW_GROUP, BlockSums, CovarianceMaps, SummaryAccumulator
+from pchem_pipeline.model.histogram.count import HistogramAccumulator, RangeAccumulator, RowHistograms
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, BlockSums, CovarianceMaps, SummaryAccumulator
 
 
 @st.composite

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.agreement import counting_variance, noise_floor, rmse
-from pchem_pipeline.model.components import moment_errors, predicted_moments, sample_moments
-from pchem_pipeline.model.electrons import cell_probabilities, electron_numbers
-from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, ensemble_sums, nuced_axis, tally
-from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.checks.residuals import counting_variance, noise_floor, rmse
+from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_numbers
+from pchem_pipeline.model.ensemble.components import moment_errors, predicted_moments, sample_moments
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, ensemble_sums, nuced_axis, tally
+from pchem_pipeline.model.maps.pixels import PixelParameters
 
 N_PIXELS, N_FRAMES = 600, 40
 DN = DnAxis(40, 360)

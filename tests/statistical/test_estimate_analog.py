@@ -18,8 +18,8 @@ from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
 from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
-from pchem_pipeline.effects.base import Effect
-from pchem_pipeline.effects.evidence import Evidence
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
 
 CLASSES: tuple[type[Effect], ...] = (
     AnalogMemory, FlickerNoise, GainDrift, HeavyTailedNoise, InterpixelCapacitance, NoiseSkew,

@@ -17,8 +17,8 @@ from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
-from pchem_pipeline.effects.charge_sums import block_charge, exposure_course
-from pchem_pipeline.effects.count_scores import count_excess
+from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_course
+from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from drawn_pixels import draw
 
-from pchem_pipeline.model.exact import refine, rounding_bias
-from pchem_pipeline.model.pchem import fit_histograms
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.fit.exact import refine, rounding_bias
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
 
 N = 800
 

@@ -8,10 +8,10 @@ from drawn_pixels import Drawn, draw
 from numpy.typing import NDArray
 from scipy.stats import kstest
 
-from pchem_pipeline.model.fisher import cramer_rao, cramer_rao_stderr, propagate
-from pchem_pipeline.model.pcd import log_pcd
-from pchem_pipeline.model.pchem import FitResult, em_trace, fit_histograms
-from pchem_pipeline.model.start import START_METHODS, starting_points
+from pchem_pipeline.model.errors.fisher import cramer_rao, cramer_rao_stderr, propagate
+from pchem_pipeline.model.fit.pchem import FitResult, em_trace, fit_histograms
+from pchem_pipeline.model.fit.start import START_METHODS, starting_points
+from pchem_pipeline.model.law.pcd import log_pcd
 
 N_PIXELS = 1500
 FIVE = 5.0
@@ -150,7 +150,7 @@ def test_em_never_lowers_the_likelihood(case: tuple[float, float, float]) -> Non
 
 
 def test_plain_em_and_newton_agree() -> None:
-    from pchem_pipeline.model.settings import FitSettings
+    from pchem_pipeline.model.fit.settings import FitSettings
 
     pixels = drawn_in_range(38, 60, (0.2, 8), (0.2, 0.38))
     newton = fit_histograms(pixels.counts, pixels.origin)

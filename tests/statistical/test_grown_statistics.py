@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.grown import fit_grown, log_likelihood
-from pchem_pipeline.model.grown_profile import profile_effects
-from pchem_pipeline.model.marginal import MarginalModel
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.grown import fit_grown, log_likelihood
+from pchem_pipeline.model.fit.grown_profile import profile_effects
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 PIXELS, FRAMES = 120, 4000
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")

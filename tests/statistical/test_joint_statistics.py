@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from joint_material import draw_series
 
-from pchem_pipeline.model.fisher import cramer_rao
-from pchem_pipeline.model.joint import fit_joint, joint_cramer_rao
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.errors.fisher import cramer_rao
+from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao
+from pchem_pipeline.model.fit.settings import FitSettings
 
 EXPOSURES = [0.5, 3.0, 12.0]
 N_PIXELS = 150

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.marginal import find_in_histograms
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.by_likelihood.workflow import find_in_histograms
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.registry import effect_class
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.effects.framework.registry import effect_class
 
 PIXELS, SAMPLES = 24, 9000
 CANDIDATES = (

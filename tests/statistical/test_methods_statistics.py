@@ -10,13 +10,13 @@ from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.methods.study import StudyPoint, study_point
-from pchem_pipeline.model.drawn_histograms import draw_histograms
-from pchem_pipeline.model.expected_information import (
+from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
     shared_information,
 )
-from pchem_pipeline.model.pcd import pcd_mass
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.pcd import pcd_mass
 
 GAIN, N = 1 / 11, 4000
 

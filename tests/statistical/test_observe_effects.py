@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_stacks import small_stack
 
-from pchem_pipeline.discrepancy.observe import observe
+from pchem_pipeline.discrepancy.observe.observe import observe
 
 SHAPE, N_FRAMES, BLOCK, SEED = (32, 32), 1600, 50, 17
 NUMBERS = np.arange(N_FRAMES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.summaries import CovarianceMaps, SummaryAccumulator
+from pchem_pipeline.model.histogram.summaries import CovarianceMaps, SummaryAccumulator
 
 SHAPE = (30, 40)
 FRAMES, BLOCK = 700, 32

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 from scipy.stats import binom, kstest
 
-from pchem_pipeline.model.discovery import false_discovery
-from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, curve_errors, epcd_exact
-from pchem_pipeline.model.fisher import sandwich_covariance
-from pchem_pipeline.model.intervals import profile_intervals, quantile_of
-from pchem_pipeline.model.maps import summarise
-from pchem_pipeline.model.pcd import pcd_mass
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
-from pchem_pipeline.model.pixels import PixelParameters
-from pchem_pipeline.model.pooled import judge_together
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.checks.multiple_testing import false_discovery
+from pchem_pipeline.model.checks.shrinkage import judge_together
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, epcd_exact
+from pchem_pipeline.model.errors.fisher import sandwich_covariance
+from pchem_pipeline.model.fit.intervals import profile_intervals, quantile_of
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.maps.maps import summarise
+from pchem_pipeline.model.maps.pixels import PixelParameters
 
 Array = NDArray[np.float64]
 GUARD_OFF = FitSettings(tail_guard=0)

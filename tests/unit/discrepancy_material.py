@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
-from pchem_pipeline.effects.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
-from pchem_pipeline.render.discrepancy_data import DiscrepancyData
-from pchem_pipeline.stages.discrepancy_arrays import evidence_arrays
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
+from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
+from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 
 VERDICTS = ("named", "ambiguous", "unexplained", "consistent")
 UNTESTABLE = {

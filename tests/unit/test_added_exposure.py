@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pchem_pipeline.effects.added import AddedExposure, added_exposures
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.effects.compose import marginal_model, pixel_maps
-from pchem_pipeline.effects.evidence import PixelMaps
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.persistence import Persistence
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.stages.added_exposure import read_added_exposure, write_added_exposure
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure, added_exposures
+from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.stages.fit.added_exposure import read_added_exposure, write_added_exposure
 from pchem_pipeline.store.run_store import RunStore
 
 MAPS = PixelMaps(*(np.full((6, 8), v) for v in (1.5, 0.1, 100.0, 3.0)), np.ones((6, 8), bool))

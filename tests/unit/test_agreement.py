@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.agreement import (
+from pchem_pipeline.model.checks.residuals import (
     central_window,
     chi_square,
     counting_variance,

@@ -9,13 +9,13 @@ import pytest
 from commands import arrays_of
 from small_stacks import small_stack
 
+from pchem_pipeline.base.errors import InputError, StoreError
+from pchem_pipeline.commands.append import append_frames
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import InputError, StoreError
-from pchem_pipeline.stages.append import append_frames
-from pchem_pipeline.stages.base import open_store
-from pchem_pipeline.stages.fit_start import kept_fit
-from pchem_pipeline.stages.session import Command, Target, find_run, run_stages, run_status
+from pchem_pipeline.run.session import Command, Target, find_run, run_stages, run_status
+from pchem_pipeline.run.stage import open_store
+from pchem_pipeline.stages.fit.start import kept_fit
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(quiet=True)

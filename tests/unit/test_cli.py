@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pchem_pipeline import cli
+from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.cli.app import app
+from pchem_pipeline.commands import new_run
+from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
-from pchem_pipeline.errors import ConfigError, InputError
-from pchem_pipeline.stages import session, start
-from pchem_pipeline.stages.base import Options
-from pchem_pipeline.stages.session import Command, Target
-from pchem_pipeline.stages.start import find_or_start
+from pchem_pipeline.run import session
+from pchem_pipeline.run.session import Command, Target
+from pchem_pipeline.run.stage import Options
 
 CONFIG = "input: {files: [a.tif]}\n"
 
@@ -21,13 +22,13 @@ def calls(monkeypatch):
     seen = []
     target = Target(parse_config(CONFIG), Path("/x"), Path("/x/run.zarr"))
     monkeypatch.setattr(session, "find_run", lambda path: target)
-    monkeypatch.setattr(start, "find_run", lambda path: target)
+    monkeypatch.setattr(new_run, "find_run", lambda path: target)
     monkeypatch.setattr(session, "run_stages", lambda *args: seen.append(args))
     return seen
 
 
 def invoke(*arguments):
-    return CliRunner().invoke(cli.app, list(arguments), catch_exceptions=False)
+    return CliRunner().invoke(app.app, list(arguments), catch_exceptions=False)
 
 
 @pytest.mark.parametrize("name", ["simulate", "histogram", "fit", "maps", "ensemble", "report", "electrons"])
@@ -122,9 +123,9 @@ def test_errors_are_one_line_with_their_exit_code(monkeypatch, capsys):
     def fail(**_):
         raise InputError("frames.tif is truncated;\n copy it again")
 
-    monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(app, "app", fail)
     with pytest.raises(SystemExit) as caught:
-        cli.main([])
+        app.main([])
     assert caught.value.code == 4
     assert capsys.readouterr().err == "pchem: frames.tif is truncated; copy it again\n"
 
@@ -135,8 +136,8 @@ def test_out_of_memory_and_ctrl_c_have_their_codes(monkeypatch, capsys):
         def fail(error=error, **_):
             raise error
 
-        monkeypatch.setattr(cli, "app", fail)
+        monkeypatch.setattr(app, "app", fail)
         with pytest.raises(SystemExit) as caught:
-            cli.main([])
+            app.main([])
         assert caught.value.code == code
         assert capsys.readouterr().err.startswith("pchem: ")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.model.differences import compare_maps
-from pchem_pipeline.render.compare_data import RunFacts
-from pchem_pipeline.render.compare_figures import difference_map, ensembles
-from pchem_pipeline.stages.compare_settings import settings_that_differ
+from pchem_pipeline.model.checks.run_differences import compare_maps
+from pchem_pipeline.report.figures.compare_figures import difference_map, ensembles
+from pchem_pipeline.report.pages.compare_data import RunFacts
 
 
 def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):

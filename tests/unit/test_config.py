@@ -3,9 +3,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.config.load import dump_config, load_config, parse_config, setting_of
 from pchem_pipeline.config.template import commented_config
-from pchem_pipeline.errors import ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 

@@ -11,15 +11,15 @@ import pytest
 from discrepancy_material import result
 from typer.testing import CliRunner
 
-from pchem_pipeline import cli
-from pchem_pipeline.effects.registry import effect_class, effect_classes
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.render.findings import findings
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.cli.app import app
+from pchem_pipeline.commands.demo import hidden
+from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement
+from pchem_pipeline.commands.demo.hidden import RANDOM, SEALED_KEY, hidden_effect, run_hidden_demo
+from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
+from pchem_pipeline.report.pages.findings import findings
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.stages import demo_hidden
-from pchem_pipeline.stages.demo_comparison import COMPARED, compare, judgement
-from pchem_pipeline.stages.demo_hidden import RANDOM, SEALED_KEY, hidden_effect, run_hidden_demo
 
 SETTINGS = SimulateSettings.model_validate({"shape": [12, 12], "n_frames": 60, "seed": 3})
 
@@ -43,7 +43,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
 def test_every_effect_can_be_hidden(tag: str) -> None:
     effect = hidden_effect(tag, SETTINGS, draw_truth(SETTINGS))
     assert effect.tag == tag
-    demo_hidden._check_tag(tag)
+    hidden._check_tag(tag)
 
 
 def test_random_hides_any_that_can_be_seen() -> None:
@@ -66,9 +66,9 @@ def test_a_hidden_limit_cuts_few_samples_but_some() -> None:
 
 
 def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
-    demo_hidden._hide(tmp_path, "row_noise", 12, 60, 5)
+    hidden._hide(tmp_path, "row_noise", 12, 60, 5)
     key = tmp_path / SEALED_KEY
-    content = demo_hidden._unpacked(key)
+    content = hidden._unpacked(key)
     assert json.loads(str(content["effect"]))["tag"] == "row_noise"
     assert set(content) == {*COMPARED, "effect"}
     for path in tmp_path.rglob("*"):
@@ -79,7 +79,7 @@ def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
     assert "simulate:" not in text
     # nor does a random effect show in what lies beside the frames
     other = tmp_path / "other"
-    demo_hidden._hide(other, RANDOM, 12, 60, 5)
+    hidden._hide(other, RANDOM, 12, 60, 5)
     assert (other / "hidden.yaml").read_text() == text
 
 
@@ -160,8 +160,8 @@ def test_the_command_line_passes_on(
         seen.append((output, given))
         return "told"
 
-    monkeypatch.setattr(demo_hidden, "run_hidden_demo", run)
-    outcome = CliRunner().invoke(cli.app, ["demo", "--hidden", "random", "-o", "out", "-q", *options])
+    monkeypatch.setattr(hidden, "run_hidden_demo", run)
+    outcome = CliRunner().invoke(app.app, ["demo", "--hidden", "random", "-o", "out", "-q", *options])
     assert outcome.stdout == "told\n"
     given = {"hidden": "random", "size": 64, "n_frames": 4000, "seed": seed, "quiet": True}
     assert seen == [(Path("out"), given)]
@@ -170,9 +170,9 @@ def test_the_command_line_passes_on(
 def test_a_demonstration_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames, key and the maps of the plain model are made once."""
     calls: list[list[str]] = []
-    monkeypatch.setattr(demo_hidden, "run_stages", lambda target, stages, command: calls.append([*stages]))
-    monkeypatch.setattr(demo_hidden, "_maps", lambda target: {"quality": np.zeros(1)})
-    monkeypatch.setattr(demo_hidden, "_text", lambda output, target: "told")
+    monkeypatch.setattr(hidden, "run_stages", lambda target, stages, command: calls.append([*stages]))
+    monkeypatch.setattr(hidden, "_maps", lambda target: {"quality": np.zeros(1)})
+    monkeypatch.setattr(hidden, "_text", lambda output, target: "told")
     given: dict[str, Any] = {"hidden": RANDOM, "size": 8, "n_frames": 60, "seed": None}
     assert run_hidden_demo(tmp_path / "x", **given) == "told"
     key = (tmp_path / "x" / SEALED_KEY).read_bytes()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.differences import (
+from pchem_pipeline.model.checks.run_differences import (
     BlockDifference,
     compare_blocks,
     compare_maps,

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pchem_pipeline.discrepancy.catalogue import FAMILIES, STATISTICS
-from pchem_pipeline.discrepancy.disagreement import contradicted
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.by_simulation.disagreement import contradicted
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.by_simulation.naming import choose, score_set
+from pchem_pipeline.discrepancy.by_simulation.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.by_simulation.refit import expected_codes
 from pchem_pipeline.discrepancy.gap import GapMetric
-from pchem_pipeline.discrepancy.naming import choose, score_set
-from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
-from pchem_pipeline.discrepancy.refit import expected_codes
+from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.effects.evidence import PixelMaps
-from pchem_pipeline.effects.registry import effect_class
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.registry import effect_class
 
 NAMES = tuple(STATISTICS)[:40]
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.disagreement import Measured
-from pchem_pipeline.discrepancy.fingerprints import Hypothesis, Noise, SetFit
-from pchem_pipeline.discrepancy.naming import seen_beside
+from pchem_pipeline.discrepancy.by_simulation.disagreement import Measured
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit
+from pchem_pipeline.discrepancy.by_simulation.naming import seen_beside
+from pchem_pipeline.discrepancy.by_simulation.workflow import _Search
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.workflow import _Search
-from pchem_pipeline.effects.registry import effect_class
+from pchem_pipeline.effects.framework.registry import effect_class
 
 M = 6
 NOISE = Noise(np.eye(M), 0.05)

@@ -14,29 +14,29 @@ import pytest
 from discrepancy_material import UNTESTABLE, VERDICTS, discrepancy_data, evidence, result
 from report_material import report_data
 
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
-from pchem_pipeline.effects.registry import effect_class
-from pchem_pipeline.render import discrepancy_gap, discrepancy_series
-from pchem_pipeline.render import report as report_module
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.discrepancy_data import DiscrepancyData
-from pchem_pipeline.render.discrepancy_exhibits import (
+from pchem_pipeline.base.variables import variables_of
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.framework.registry import effect_class
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_series
+from pchem_pipeline.report.figures.discrepancy_exhibits import (
     DISCREPANCY_NAMES,
     discrepancy_exhibits,
     telling_pulls,
 )
-from pchem_pipeline.render.discrepancy_maps import telling_maps
-from pchem_pipeline.render.discrepancy_tables import discrepancy_tables
-from pchem_pipeline.render.discrepancy_text import remarks
-from pchem_pipeline.render.exhibits import Exhibit
-from pchem_pipeline.render.findings import findings, headline
-from pchem_pipeline.render.pictures import Picture
-from pchem_pipeline.render.report import RenderedReport, render_report
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.render.style import COLUMN_MM
-from pchem_pipeline.render.verdict import flags
-from pchem_pipeline.stages.discrepancy_arrays import evidence_arrays, path_arrays
-from pchem_pipeline.variables import variables_of
+from pchem_pipeline.report.figures.discrepancy_maps import telling_maps
+from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
+from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables
+from pchem_pipeline.report.pages.discrepancy_text import remarks
+from pchem_pipeline.report.pages.findings import findings, headline
+from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.pages.verdict import flags
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Picture
+from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
 
 QUICK = ReportSettings(figure_formats=(), dpi=72)
 HOSTILE = '<script>alert("x")</script>$x^{ \'{{ 7*7 }}'
@@ -367,8 +367,8 @@ def test_the_report_says_what_was_found_among_its_flags() -> None:
 
 def test_the_page_of_a_run(tmp_path: Path) -> None:
     """From the files of a run: JSON and arrays written, read back, and the same."""
-    from pchem_pipeline.errors import StoreError
-    from pchem_pipeline.stages.discrepancy_result import discrepancy_state, read_discrepancy
+    from pchem_pipeline.base.errors import StoreError
+    from pchem_pipeline.stages.discrepancy.result import discrepancy_state, read_discrepancy
     from pchem_pipeline.store.run_store import RunStore
 
     store = RunStore.create(tmp_path / "run.zarr")

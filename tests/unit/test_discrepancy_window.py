@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.config.grow import with_model_effects
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.stages.discrepancy import choose_window, read_window
+from pchem_pipeline.stages.discrepancy.discrepancy import choose_window, read_window
 
 TEXT = """# mine
 input: {files: [a.npy]}  # here

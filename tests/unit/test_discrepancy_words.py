@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from discrepancy_material import VERDICTS, result
 
-from pchem_pipeline.stages.discrepancy_words import verdict_text
+from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.effects import registry
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.base import Effect, Plane, register_effect, registered_effects, tag_of
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.effects.framework import registry
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect, registered_effects, tag_of
 from pchem_pipeline.simulate.settings import SimulateSettings
 
 

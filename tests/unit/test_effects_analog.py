@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
 from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
 from pchem_pipeline.effects.analog.gain_drift import GainDrift
@@ -20,13 +20,13 @@ from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
 from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
-from pchem_pipeline.effects.base import Effect
-from pchem_pipeline.effects.context import EffectContext
-from pchem_pipeline.effects.evidence import PixelMaps
-from pchem_pipeline.effects.plane import Plane
-from pchem_pipeline.effects.registry import effect_classes
-from pchem_pipeline.model.grown import marginal_mass
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.plane import Plane
+from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
 from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings

@@ -11,7 +11,7 @@ from charge_material import a_sensor, electrons, exposures, simulated
 from pydantic import ValidationError
 from scipy import stats
 
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
 from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
 from pchem_pipeline.effects.charge.charge_lag import ChargeLag
@@ -19,14 +19,14 @@ from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
-from pchem_pipeline.effects.charge_sums import exposure_nodes
-from pchem_pipeline.effects.electrons import binomial_upper, further_uniform
+from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
+from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.persistence import Persistence
-from pchem_pipeline.effects.registry import effect_classes
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 CLASSES = (
     ExposureDrift,

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from drawn_pixels import draw
 
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_of
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.base import Effect, Plane
-from pchem_pipeline.effects.compose import marginal_model, model_words, pixel_maps
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.model.grown_electrons import nearest_pcd
-from pchem_pipeline.model.marginal import MarginalModel
-from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.stages.fit import fit_tile
-from pchem_pipeline.stages.fitted_model import deciding_maps
-from pchem_pipeline.variables import INTERVALS, interval_names, variables_of
+from pchem_pipeline.effects.framework.compose import marginal_model, model_words, pixel_maps
+from pchem_pipeline.effects.framework.effect import Effect, Plane
+from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.fitted_model import deciding_maps
 
 
 class Broken(Effect):

@@ -10,7 +10,8 @@ import pytest
 from pydantic import ValidationError
 from sensor_of_modes import context_of, drawn_truth, offsets
 
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
 from pchem_pipeline.effects.adc.clipping import Clipping
@@ -21,11 +22,10 @@ from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.effects.base import Effect
-from pchem_pipeline.effects.plane import Plane
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.plane import Plane
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
-from pchem_pipeline.effects.registry import effect_classes
-from pchem_pipeline.errors import ConfigError
 from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings

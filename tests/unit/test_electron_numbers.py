@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model import electrons_numba
-from pchem_pipeline.model.electrons import (
+from pchem_pipeline.model.electrons.electrons import (
     LARGEST_NUMBER,
     NO_NUMBER,
     cell_probabilities,
     compare_electron_numbers,
     electron_counts,
     electron_numbers,
+    electrons_numba,
     nuc,
     thresholds,
 )
-from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.maps.pixels import PixelParameters
 
 CASES = [
     (0.05, 0.1, 100.0, 3.0),

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.ensemble import DnAxis, NucedAxis, epcd_exact
-from pchem_pipeline.model.ensemble_binned import (
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, epcd_exact
+from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
     electron_pmf_binned,
     epcd_dependent,
@@ -18,7 +18,7 @@ from pchem_pipeline.model.ensemble_binned import (
     nuced_dependent,
     nuced_independent,
 )
-from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.maps.pixels import PixelParameters
 
 K = np.arange(150)
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from pchem_pipeline.model.components import (
+from pchem_pipeline.model.ensemble.components import (
     COMPONENT_CASES,
     component_widths,
     moment_errors,
     predicted_moments,
     sample_moments,
 )
-from pchem_pipeline.model.pixels import PixelParameters
+from pchem_pipeline.model.maps.pixels import PixelParameters
 
 
 def make_pixels(n: int, seed: int = 2) -> PixelParameters:

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model import ensemble_numba
-from pchem_pipeline.model.ensemble import (
+from pchem_pipeline.model.ensemble.ensemble import (
     DnAxis,
     NucedAxis,
     electron_pmf,
+    ensemble_numba,
     ensemble_sums,
     epcd_exact,
     nuced_axis,
     tally,
 )
-from pchem_pipeline.model.pixels import PixelParameters, usable_pixels
+from pchem_pipeline.model.maps.pixels import PixelParameters, usable_pixels
 
 
 def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> PixelParameters:

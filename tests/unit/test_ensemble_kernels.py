@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.model import electrons_numba, ensemble_numba
+from pchem_pipeline.model.electrons import electrons_numba
+from pchem_pipeline.model.ensemble import ensemble_numba
 
 H = np.array([0.0, 0.7, 2.4])
 G = np.array([0.1, 0.12, 0.6])

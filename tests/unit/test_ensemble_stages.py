@@ -10,23 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
+from pchem_pipeline.base.variables import PARAMETERS, variables_of
+from pchem_pipeline.commands.export import export_run
 from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import ConfigError, InputError, StoreError
-from pchem_pipeline.model.components import COMPONENT_CASES
-from pchem_pipeline.model.electrons import NO_NUMBER, electron_numbers
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.stages import ensemble as ensemble_stage
-from pchem_pipeline.stages.base import Options, StageContext
-from pchem_pipeline.stages.export import export_run
-from pchem_pipeline.stages.interrupt import StopRequest
-from pchem_pipeline.stages.pipeline import execute
-from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.model.electrons.electrons import NO_NUMBER, electron_numbers
+from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.signals import StopRequest
+from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.stages.ensemble.ensemble import ensemble as ensemble_stage
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.variables import PARAMETERS, variables_of
 
 NY, NX, FRAMES = 40, 48, 400
 FAILED_PIXEL = (3, 5)

@@ -5,14 +5,14 @@ import pytest
 from drawn_pixels import draw
 from scipy.optimize import minimize
 
-from pchem_pipeline.model import rounding_numba
-from pchem_pipeline.model.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias
-from pchem_pipeline.model.fisher import cramer_rao
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.model.pcd import log_pcd, pcd_mass
-from pchem_pipeline.model.pchem import fit_histograms
-from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.stages.session import Command, find_run, run_stages
+from pchem_pipeline.model.errors.fisher import cramer_rao
+from pchem_pipeline.model.fit import rounding_numba
+from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
+from pchem_pipeline.run.session import Command, find_run, run_stages
 from pchem_pipeline.store.run_store import RunStore
 
 EXACT, AUTO = FitSettings(likelihood="exact"), FitSettings(likelihood="auto")

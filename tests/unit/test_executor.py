@@ -5,10 +5,10 @@ import threading
 
 import pytest
 
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
 from pchem_pipeline.compute.executor import Stop, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.errors import ConfigError, IncompleteRunError
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
 

@@ -8,12 +8,12 @@ from scipy.integrate import quad
 from scipy.stats import norm, poisson
 
 from pchem_pipeline.methods.photon_transfer import gain_variance
-from pchem_pipeline.model.expected_information import (
+from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
     shared_information,
 )
-from pchem_pipeline.model.fisher import cramer_rao
+from pchem_pipeline.model.errors.fisher import cramer_rao
 
 POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
 

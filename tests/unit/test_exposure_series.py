@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.exposure_series import exposure_line
+from pchem_pipeline.model.maps.exposure_series import exposure_line
 
 TIMES = np.array([0.5, 1.0, 2.0, 4.0])
 

@@ -15,15 +15,15 @@ from matplotlib.patches import StepPatch
 from PIL import Image
 from report_material import report_data
 
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.drawn_data import drawn_tables
-from pchem_pipeline.render.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
-from pchem_pipeline.render.figure_data import DataTable, csv_text, figure_tables
-from pchem_pipeline.render.paper import PaperFigure, draw_paper_figure, read_style_sheet
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.render.style import BLUE, VERMILION, style_sheet
-from pchem_pipeline.stages.figures import millimetres
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.commands.figures import millimetres
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.drawn_data import drawn_tables
+from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
+from pchem_pipeline.report.figures.figure_data import DataTable, csv_text, figure_tables
+from pchem_pipeline.report.figures.paper import PaperFigure, draw_paper_figure, read_style_sheet
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import BLUE, VERMILION, style_sheet
 
 SETTINGS = ReportSettings()
 

@@ -11,18 +11,20 @@ from drawn_pixels import draw, samples
 from numpy.typing import NDArray
 from reference_pchem import Theta, e_step, em, log_likelihood
 
-from pchem_pipeline.model import (
-    estep_numba,
-    fisher_numba,
-    goodness_numba,
-    lanes_math_numba,
-    polish_numba,
-    start_numba,
-    workspace_numba,
+from pchem_pipeline.model.errors import fisher_numba
+from pchem_pipeline.model.fit import goodness_numba, polish_numba, start_numba
+from pchem_pipeline.model.fit.pchem import em_trace
+from pchem_pipeline.model.law import estep_numba, simd_math_numba, workspace_numba
+from pchem_pipeline.model.law.simd_numba import counting, least, load_lanes, most, store_lanes
+from pchem_pipeline.model.law.workspace_numba import (
+    SUM_E,
+    SUM_EE,
+    SUM_K,
+    SUM_KE,
+    SUM_KK,
+    Histogram,
+    Workspace,
 )
-from pchem_pipeline.model.lanes_numba import counting, least, load_lanes, most, store_lanes
-from pchem_pipeline.model.pchem import em_trace
-from pchem_pipeline.model.workspace_numba import SUM_E, SUM_EE, SUM_K, SUM_KE, SUM_KK, Histogram, Workspace
 
 # (H, 1/g, s_e) from needles to unresolved peaks, and a hot pixel
 CASES = [
@@ -131,8 +133,8 @@ def test_compiled_evaluation_equals_plain() -> None:
 def take_plain_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     """From here on loops in plain Python take their lanes from numpy; nothing can be compiled."""
     for name in ("artanh_series", "lanes_exp", "lanes_log"):
-        plain = getattr(lanes_math_numba, name).py_func
-        for module in (lanes_math_numba, estep_numba):
+        plain = getattr(simd_math_numba, name).py_func
+        for module in (simd_math_numba, estep_numba):
             monkeypatch.setattr(module, name, plain)
 
 
@@ -185,8 +187,8 @@ def test_lanes_are_the_functions_that_they_are_named_after(monkeypatch: pytest.M
     def fill(table: NDArray[np.float64]) -> None:
         for i in range(0, table.shape[1], 8):
             x = load_lanes(table, 0, i)
-            store_lanes(table, 1, i, lanes_math_numba.lanes_exp(x))
-            store_lanes(table, 2, i, lanes_math_numba.lanes_log(load_lanes(table, 1, i)))
+            store_lanes(table, 1, i, simd_math_numba.lanes_exp(x))
+            store_lanes(table, 2, i, simd_math_numba.lanes_log(load_lanes(table, 1, i)))
             store_lanes(table, 3, i, most(least(x, 1.0), -2.0) - counting())
 
     table[0] = rng.uniform(-690, 690, 2000)

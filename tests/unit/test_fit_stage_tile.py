@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from drawn_pixels import draw
 
-from pchem_pipeline.model.pchem import fit_histograms
-from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.stages.fit import fit_tile
-from pchem_pipeline.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.stages.fit.fit import fit_tile
 
 
 def test_tile_has_every_array_in_its_place() -> None:

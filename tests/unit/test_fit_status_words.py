@@ -7,10 +7,10 @@ import pytest
 from drawn_pixels import draw
 from numpy.typing import NDArray
 
-from pchem_pipeline.model import pchem_numba
-from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus, describe
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.fit import pchem_numba
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, describe
 
 
 def fit_one(counts: NDArray[np.generic], origin: int = 100, **options: object) -> FitResult:

@@ -13,9 +13,9 @@ import pytest
 import zarr
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
-from pchem_pipeline.frames.hdf5 import Hdf5Reader
-from pchem_pipeline.frames.omezarr import ZarrReader
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.hdf5 import Hdf5Reader
+from pchem_pipeline.frames.formats.omezarr import ZarrReader
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 

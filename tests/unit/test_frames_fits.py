@@ -12,8 +12,8 @@ import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
-from pchem_pipeline.frames.fits import FitsReader
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.fits import FitsReader
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.errors import ConfigError, InputError
-from pchem_pipeline.frames.histograms import HistogramInput, is_histogram_input, read_histograms
+from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.frames.histogram_files import HistogramInput, is_histogram_input, read_histograms
 from pchem_pipeline.frames.settings import InputSettings
 
 SIPM = Path(__file__).parent.parent / "data" / "sipm"

@@ -17,7 +17,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pchem_pipeline.errors import ConfigError, ExitCode, InputError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError
 from pchem_pipeline.frames.identity import hash_file
 from pchem_pipeline.frames.open import inspect_files, open_frames
 from pchem_pipeline.frames.resolve import natural_key, resolve_files

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.raw import RawReader
+from pchem_pipeline.frames.formats.ser import SerReader
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.frames.raw import RawReader
-from pchem_pipeline.frames.ser import SerReader
 from pchem_pipeline.frames.settings import InputSettings
 
 STACK = np.random.default_rng(14).integers(0, 65536, (5, 11, 13)).astype(np.uint16)

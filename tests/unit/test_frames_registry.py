@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import ConfigError, MissingDependencyError
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError
 from pchem_pipeline.frames import registry
-from pchem_pipeline.frames.base import FrameReader, check_window
 from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.reader import FrameReader, check_window
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import write_frames
 

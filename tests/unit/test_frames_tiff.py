@@ -12,10 +12,10 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.tiff import TiffReader
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.frames.tiff import TiffReader
 
 STACK = np.random.default_rng(11).integers(0, 4096, (6, 21, 34)).astype(np.uint16)
 

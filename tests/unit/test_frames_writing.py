@@ -15,7 +15,7 @@ import zarr
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import WRITERS, write_frames

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from report_material import report_data
 
+from pchem_pipeline.base.errors import IncompleteRunError
 from pchem_pipeline.compute import fresh_processes
 from pchem_pipeline.compute.executor import SerialExecutor, Stop
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
-from pchem_pipeline.errors import IncompleteRunError
-from pchem_pipeline.render.exhibits import EXHIBIT_NAMES, exhibits
-from pchem_pipeline.render.pictures import Drawn, draw_exhibit, longest_first
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.stages.drawing import draw_by_workers, drawing_executor
-from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, exhibits
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Drawn, draw_exhibit, longest_first
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_executor
 
 QUICK = ReportSettings(figure_formats=("png",), dpi=72)
 

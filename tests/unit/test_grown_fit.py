@@ -10,12 +10,12 @@ from grown_reference import LAWS
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.model.grown import GrownFit, fit_grown, log_likelihood, marginal_mass
-from pchem_pipeline.model.grown_electrons import nearest_pcd
-from pchem_pipeline.model.marginal import MarginalModel
-from pchem_pipeline.model.pcd import pcd_mass
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.model.fit.grown import GrownFit, fit_grown, log_likelihood, marginal_mass
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 FIRST, N_CODES, FRAMES = 40, 330, 4000

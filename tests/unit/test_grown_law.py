@@ -10,10 +10,9 @@ import pytest
 from grown_reference import EVERYTHING, LAWS, reference_mass
 from scipy.stats import norm
 
-from pchem_pipeline.model.grown import lobe_threshold, log_likelihood, marginal_mass
-from pchem_pipeline.model.grown_cells_numba import evaluate
-from pchem_pipeline.model.grown_inputs import pack
-from pchem_pipeline.model.grown_laws_numba import (
+from pchem_pipeline.model.fit.grown import lobe_threshold, log_likelihood, marginal_mass
+from pchem_pipeline.model.fit.grown_numba import make_cells, make_lobes
+from pchem_pipeline.model.law.electron_laws_numba import (
     FARTHEST,
     STEPS,
     _one_law,
@@ -21,10 +20,11 @@ from pchem_pipeline.model.grown_laws_numba import (
     fill_normal_table,
     normal_tail,
 )
-from pchem_pipeline.model.grown_numba import make_cells, make_lobes
-from pchem_pipeline.model.grown_types_numba import make_room
-from pchem_pipeline.model.marginal import MarginalModel
-from pchem_pipeline.model.pcd import pcd_mass
+from pchem_pipeline.model.law.grown_cells_numba import evaluate
+from pchem_pipeline.model.law.grown_inputs import pack
+from pchem_pipeline.model.law.grown_types_numba import make_room
+from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 PIXELS = [(2.0, 1 / 12, 100.0, 3.0), (0.4, 0.1, 99.3, 2.0), (9.0, 1 / 5.5, 97.7, 1.1)]
 CODES = range(70, 220)

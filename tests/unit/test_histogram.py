@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.errors import InputError
-from pchem_pipeline.model import histogram, histogram_numba
-from pchem_pipeline.model.histogram import (
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.model.histogram.count import (
     HistogramAccumulator,
     RangeAccumulator,
     RowHistograms,
     choose_bins,
+    count,
+    count_numba,
     counts_dtype,
     histogram_frames,
 )
@@ -127,7 +128,7 @@ def test_under_and_over_are_exact_for_noise_of_full_range():
 
 def test_densest_origin_holds_most_of_the_values():
     values = np.array([5, 200, 201, 210, 400, 402, 403, 404, 4095], np.uint16)
-    origin = histogram_numba.densest_origin(values, 32)
+    origin = count_numba.densest_origin(values, 32)
     assert origin <= 400
     assert origin + 32 > 404
 
@@ -224,9 +225,9 @@ class TestCompiledEqualsPlain:
         frames[30:, 1, 2] += 20
         compiled = histogram_frames(frames, bins=64, window_frames=20)
         for name in ("count_frames", "place_windows", "recentre", "update_extremes", "update_range"):
-            monkeypatch.setattr(histogram, name, getattr(histogram_numba, name).py_func)
+            monkeypatch.setattr(count, name, getattr(count_numba, name).py_func)
         for name in ("shift_counts", "densest_origin", "_centred"):
-            monkeypatch.setattr(histogram_numba, name, getattr(histogram_numba, name).py_func)
+            monkeypatch.setattr(count_numba, name, getattr(count_numba, name).py_func)
         plain = histogram_frames(frames, bins=64, window_frames=20)
         assert (compiled.over + compiled.under).any()
         for name, expected in vars(compiled).items():
@@ -239,7 +240,7 @@ class TestCompiledEqualsPlain:
             ranges = RangeAccumulator((2, 3), frames.dtype, 300)
             ranges.add(frames)
             results.append(ranges.finish(1024))
-            monkeypatch.setattr(histogram, "update_extremes", histogram_numba.update_extremes.py_func)
+            monkeypatch.setattr(count, "update_extremes", count_numba.update_extremes.py_func)
         np.testing.assert_array_equal(*results)
 
     @pytest.mark.parametrize("shift", [-40, -32, -5, 0, 1, 31, 32, 40])
@@ -249,7 +250,7 @@ class TestCompiledEqualsPlain:
         for k in range(32):
             if 0 <= k + shift < 32:
                 expected[k] = counts[k + shift]
-        for function in (histogram_numba.shift_counts, histogram_numba.shift_counts.py_func):
+        for function in (count_numba.shift_counts, count_numba.shift_counts.py_func):
             moved = counts.copy()
             function(moved, shift)
             np.testing.assert_array_equal(moved, expected)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pchem_pipeline.model.histogram_settings import HistogramSettings
-from pchem_pipeline.model.summaries import ROW_GROUP
-from pchem_pipeline.stages.bands import bytes_per_row, plan_bands, row_frames
-from pchem_pipeline.stages.frame_source import read_ahead
+from pchem_pipeline.model.histogram.settings import HistogramSettings
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.stages.histogram.bands import bytes_per_row, plan_bands, row_frames
+from pchem_pipeline.stages.histogram.frame_source import read_ahead
 from pchem_pipeline.store.tiles import TILE_SIZES, tile_grid
 
 

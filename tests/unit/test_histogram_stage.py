@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import InputError, StoreError
 from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import InputError, StoreError
-from pchem_pipeline.model.histogram import histogram_frames
-from pchem_pipeline.model.summaries import SummaryAccumulator
-from pchem_pipeline.stages import histogram
-from pchem_pipeline.stages.base import Options, StageContext, open_store
-from pchem_pipeline.stages.interrupt import StopRequest
-from pchem_pipeline.stages.pipeline import execute
-from pchem_pipeline.stages.reporting import Reporter
-from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.histogram.summaries import SummaryAccumulator
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import StopRequest
+from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.stages.histogram import histogram
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
@@ -193,7 +193,7 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
 
 
 def _single_bands(context: StageContext) -> list[histogram.Band]:
-    from pchem_pipeline.stages.bands import plan_bands
+    from pchem_pipeline.stages.histogram.bands import plan_bands
 
     return plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
 

@@ -13,16 +13,17 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import InputError
-from pchem_pipeline.stages import ingest, input_identity
-from pchem_pipeline.stages.base import Options, StageContext, open_store
-from pchem_pipeline.stages.interrupt import InterruptedRunError, StopRequest
-from pchem_pipeline.stages.pipeline import StageState, execute, status
-from pchem_pipeline.stages.reporting import Reporter
-from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.run import input_identity
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import StageState, execute, status
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
+from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.stages import ingest
 from pchem_pipeline.store.run_store import RunStore
 
 STACK = np.random.default_rng(16).integers(0, 4096, (40, 30, 26)).astype(np.uint16)

@@ -10,19 +10,19 @@ import pytest
 from inspector_material import page_without_pictures, write_run
 from report_material import report_data
 
-from pchem_pipeline import variables
-from pchem_pipeline.model.fit_status import FAILED, MEANINGS, FitStatus
-from pchem_pipeline.render import sections
-from pchem_pipeline.render.answers import answers
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.inspector import embedded
-from pchem_pipeline.render.sections import Section
-from pchem_pipeline.stages import inspector
-from pchem_pipeline.stages.inspected_pixels import choose_inspected
-from pchem_pipeline.stages.inspector import gather_inspector, listed_maps, map_entry
-from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.base import variables
+from pchem_pipeline.base.variables import Variable
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.inspector.inspector import embedded
+from pchem_pipeline.report.pages import sections
+from pchem_pipeline.report.pages.answers import answers
+from pchem_pipeline.report.pages.sections import Section
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.report.inspected_pixels import choose_inspected
+from pchem_pipeline.stages.report.inspector import gather_inspector, listed_maps, map_entry
+from pchem_pipeline.stages.report.report import inspector
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.variables import Variable
 
 SHAPE = (12, 16)
 

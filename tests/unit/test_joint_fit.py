@@ -9,15 +9,15 @@ from iminuit import Minuit
 from joint_material import draw_series
 from reference_pchem import Theta, memberships
 
-from pchem_pipeline.model import joint_climb_numba, joint_likelihood_numba, joint_types_numba
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.model.grown_inputs import pack
-from pchem_pipeline.model.grown_types_numba import N_LOBE_ROWS
-from pchem_pipeline.model.joint import fit_joint, joint_cramer_rao
-from pchem_pipeline.model.marginal import MarginalModel
-from pchem_pipeline.model.pcd import pcd, pcd_mass
-from pchem_pipeline.model.pchem import fit_histograms
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.fit import joint_climb_numba, joint_likelihood_numba, joint_types_numba
+from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.grown_inputs import pack
+from pchem_pipeline.model.law.grown_types_numba import N_LOBE_ROWS
+from pchem_pipeline.model.law.pcd import pcd, pcd_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 EXACT = FitSettings(likelihood="exact")
 
@@ -251,7 +251,7 @@ def test_what_does_not_fit_together_is_refused():
 
 
 def test_the_bound_of_one_sample_is_the_single_one_and_more_samples_only_help():
-    from pchem_pipeline.model.fisher import cramer_rao
+    from pchem_pipeline.model.errors.fisher import cramer_rao
 
     one = joint_cramer_rao([2.0], 0.1, 5.0, 1000)
     np.testing.assert_allclose(one, cramer_rao(2.0, 0.1, 5.0, 1000), rtol=1e-6)

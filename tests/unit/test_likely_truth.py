@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.likely_truth import likely_truth
-from pchem_pipeline.discrepancy.replicate import Acquisition, Replicate, simulate_frames, truth_of
-from pchem_pipeline.effects.evidence import PixelMaps
+from pchem_pipeline.discrepancy.by_simulation.equivalent_sensor import likely_truth
+from pchem_pipeline.discrepancy.by_simulation.replicate import (
+    Acquisition,
+    Replicate,
+    simulate_frames,
+    truth_of,
+)
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 SHAPE = (50, 60)
 N = SHAPE[0] * SHAPE[1]

@@ -17,10 +17,10 @@ from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.effects.evidence import PixelMaps
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
-from pchem_pipeline.model.grown import marginal_mass
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
 from pchem_pipeline.simulate.truth import TruthMaps
 
 H, STEP, MU, NOISE_E = 1.4, 12.0, 100.3, 0.25

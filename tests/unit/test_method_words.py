@@ -4,17 +4,17 @@ import json
 
 import pytest
 
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.figure_data import csv_text, figure_tables
-from pchem_pipeline.render.method_exhibits import METHOD_FIGURE, method_exhibits, method_tables
-from pchem_pipeline.render.method_words import (
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.figure_data import csv_text, figure_tables
+from pchem_pipeline.report.figures.method_exhibits import METHOD_FIGURE, method_exhibits, method_tables
+from pchem_pipeline.report.pages.method_words import (
     bound_crossing,
     measured_crossing,
     method_rows,
     methods_text,
     verdict_words,
 )
-from pchem_pipeline.render.settings import ReportSettings
+from pchem_pipeline.report.settings import ReportSettings
 
 
 def errors(rmse):

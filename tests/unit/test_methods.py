@@ -12,9 +12,9 @@ from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, sum
 from pchem_pipeline.methods.moments import sample_moments
 from pchem_pipeline.methods.peak_valley import LARGEST_READ_NOISE, read_noise_of_valley
 from pchem_pipeline.methods.registry import methods
-from pchem_pipeline.model.drawn_histograms import draw_histograms
-from pchem_pipeline.model.expected_information import expected_information, inverse_information
-from pchem_pipeline.model.pcd import pcd_moments
+from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.pcd import pcd_moments
 
 
 def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):

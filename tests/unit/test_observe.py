@@ -9,14 +9,20 @@ import pytest
 from scipy import special, stats
 from small_stacks import small_stack
 
-from pchem_pipeline.discrepancy import law_numba, scores_numba, sums_numba, tables_numba
-from pchem_pipeline.discrepancy.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe import observe, observe_histograms
-from pchem_pipeline.discrepancy.sums import blocks_of
-from pchem_pipeline.effects.evidence import SCORES, Evidence
-from pchem_pipeline.errors import InputError, PchEmError
-from pchem_pipeline.model.histogram import histogram_frames
-from pchem_pipeline.model.pcd import pcd_mass
+from pchem_pipeline.base.errors import InputError, PchEmError
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.observe import (
+    law_numba,
+    observe,
+    observe_histograms,
+    scores_numba,
+    sums_numba,
+    tables_numba,
+)
+from pchem_pipeline.discrepancy.observe.sums import blocks_of
+from pchem_pipeline.effects.framework.evidence import SCORES, Evidence
+from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.pcd import pcd_mass
 
 H, STEP, BIAS, WIDTH = 1.7, 9.0, 40.3, 2.4
 

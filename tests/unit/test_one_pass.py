@@ -15,15 +15,16 @@ from astropy.io import fits
 from commands import arrays_of
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import InputError
-from pchem_pipeline.stages import onepass, plan
-from pchem_pipeline.stages.base import StageContext, open_store
-from pchem_pipeline.stages.interrupt import InterruptedRunError, StopRequest
-from pchem_pipeline.stages.pipeline import execute
-from pchem_pipeline.stages.reporting import Reporter
-from pchem_pipeline.stages.sweep import Sweep, cut_rows
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
+from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.histogram import dry_run
+from pchem_pipeline.stages.histogram.histogram import single_pass
+from pchem_pipeline.stages.histogram.stream import Sweep, cut_rows
 from pchem_pipeline.store.run_store import RunStore
 
 FRAMES, NY, NX = 300, 150, 40
@@ -107,7 +108,7 @@ def compare(folder: Path, **sections: dict[str, Any]) -> tuple[StageContext, Sta
     """Run both ways and compare everything that they leave."""
     apart = run_both(make_context(folder, "apart.zarr", **sections))
     once = make_context(folder, "once.zarr", **sections)
-    onepass.sweep_input(once)
+    single_pass.sweep_input(once)
     assert once.swept is not None
     run_both(once)
     expected, found = contents(apart), contents(once)
@@ -159,7 +160,7 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
     context = make_context(tmp_path, "run.zarr")
     before = _bytes_read()
-    onepass.sweep_input(context)
+    single_pass.sweep_input(context)
     assert context.swept is not None
     tags = 900 * 8192 if name == "tiff" else 0  # looking for the pages of frames as small as these
     assert size <= _bytes_read() - before < 1.1 * size + tags
@@ -173,12 +174,12 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
 def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
     _npy(tmp_path, frames)
     context = make_context(tmp_path, "run.zarr", compute={"max_memory": 64})
-    onepass.sweep_input(context)
+    single_pass.sweep_input(context)
     assert context.swept is None
     # what the first block shows can be too much, too
-    room = plan.sweep_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
-    monkeypatch.setattr(onepass, "allowed_bytes", lambda config, workers: room)
-    onepass.sweep_input(context)
+    room = dry_run.sweep_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
+    monkeypatch.setattr(single_pass, "allowed_bytes", lambda config, workers: room)
+    single_pass.sweep_input(context)
     assert context.swept is None
     run_both(context)
     np.testing.assert_array_equal(context.store.read("histogram/maximum"), frames.max(axis=0))
@@ -199,12 +200,12 @@ def test_a_stopped_or_killed_pass_leaves_nothing_half_done(tmp_path, frames, nam
 
     context.stop = Soon()
     with pytest.raises(InterruptedRunError):
-        onepass.sweep_input(context)
+        single_pass.sweep_input(context)
     assert context.swept is None
     assert context.store.has("histogram/counts")
     assert all(context.store.records.read(stage) is None for stage in ("ingest", "histogram"))
     again = make_context(tmp_path, "run.zarr")
-    onepass.sweep_input(again)
+    single_pass.sweep_input(again)
     assert again.swept is not None
     run_both(again)
     np.testing.assert_array_equal(again.store.read("histogram/counts").sum(axis=2).max(), FRAMES)
@@ -214,15 +215,15 @@ def test_a_file_that_shrinks_meanwhile_is_said(tmp_path, frames, monkeypatch):
     _npy(tmp_path, frames)
     context = make_context(tmp_path, "run.zarr")
     whole = (tmp_path / "a.npy").read_bytes()
-    real = onepass._create
+    real = single_pass._create
 
     def shrink(*arguments):
         (tmp_path / "a.npy").write_bytes(whole[:-1000])
         real(*arguments)
 
-    monkeypatch.setattr(onepass, "_create", shrink)
+    monkeypatch.setattr(single_pass, "_create", shrink)
     with pytest.raises(InputError, match="became shorter"):
-        onepass.sweep_input(context)
+        single_pass.sweep_input(context)
     assert context.swept is None
 
 
@@ -231,7 +232,7 @@ def test_a_known_input_is_left_to_the_stages(tmp_path, frames):
     context = make_context(tmp_path, "run.zarr")
     run_both(context)
     context.store.records.forget("histogram")
-    onepass.sweep_input(context)
+    single_pass.sweep_input(context)
     assert context.swept is None
 
 

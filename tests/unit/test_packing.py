@@ -7,7 +7,14 @@ import gzip
 import numpy as np
 import pytest
 
-from pchem_pipeline.render.packing import Scale, choose_scale, pack_counts, pack_map, unpack_map, varints
+from pchem_pipeline.report.inspector.packing import (
+    Scale,
+    choose_scale,
+    pack_counts,
+    pack_map,
+    unpack_map,
+    varints,
+)
 
 
 def read_varints(data: bytes) -> list[int]:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
-from pchem_pipeline.model.ensemble_settings import EnsembleSettings, MapsSettings
-from pchem_pipeline.model.fit_status import FAILED, FitStatus
-from pchem_pipeline.model.maps import (
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings, MapsSettings
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.maps.maps import (
     CAUTION,
     GOOD,
     NO_VALUE,

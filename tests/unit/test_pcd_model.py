@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pchem_pipeline.model import pcd_numba
-from pchem_pipeline.model.pcd import (
+from pchem_pipeline.model.law import pcd_numba
+from pchem_pipeline.model.law.pcd import (
     analog_read_noise,
     draw_pcd,
     log_pcd,

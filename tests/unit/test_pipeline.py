@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.errors import ConfigError, InputError, StoreError
-from pchem_pipeline.stages import pipeline
-from pchem_pipeline.stages.base import WHOLE, Options, StageContext, open_store
-from pchem_pipeline.stages.interrupt import InterruptedRunError, StopRequest, stop_on_signals
-from pchem_pipeline.stages.pipeline import differences, execute, status
-from pchem_pipeline.stages.reporting import Reporter
-from pchem_pipeline.stages.sensor import SensorInfo
+from pchem_pipeline.run import runner
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import differences, execute, status
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import InterruptedRunError, StopRequest, stop_on_signals
+from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
 from pchem_pipeline.store.run_store import RunStore
 
 CALLS: list[str] = []
@@ -66,7 +66,7 @@ FAKES = {
 
 @pytest.fixture
 def make(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "load_stage", FAKES.__getitem__)
+    monkeypatch.setattr(runner, "load_stage", FAKES.__getitem__)
     CALLS.clear()
     BROKEN.clear()
     open_store.cache_clear()

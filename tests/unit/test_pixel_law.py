@@ -8,11 +8,11 @@ from sensor_of_modes import drawn_truth, seen, taken
 
 from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
-from pchem_pipeline.effects.evidence import SCORES, PixelMaps
-from pchem_pipeline.effects.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.effects.response import strength_of
-from pchem_pipeline.model.grown import marginal_mass
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
+from pchem_pipeline.effects.estimators.response import strength_of
+from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
+from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 N_FRAMES = 1200
 FRAMES = taken(drawn_truth((6, 6)), n_frames=N_FRAMES)

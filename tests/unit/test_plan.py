@@ -11,8 +11,14 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.stages.bands import bytes_per_row
-from pchem_pipeline.stages.plan import BASE_BYTES, allowed_bytes, band_bytes, make_plan, sweep_bytes
+from pchem_pipeline.stages.histogram.bands import bytes_per_row
+from pchem_pipeline.stages.histogram.dry_run import (
+    BASE_BYTES,
+    allowed_bytes,
+    band_bytes,
+    make_plan,
+    sweep_bytes,
+)
 
 #: counts a run in a process of its own, and prints the memory that it took
 PROGRAM = """
@@ -20,7 +26,7 @@ import json, sys
 from pchem_pipeline.compute.environment import peak_rss_bytes, prepare_environment
 prepare_environment()
 from pathlib import Path
-from pchem_pipeline.stages.session import Command, find_run, run_stages
+from pchem_pipeline.run.session import Command, find_run, run_stages
 target = find_run(Path(sys.argv[1]))
 states = run_stages(target, ["ingest", "histogram"], Command(quiet=True))
 print(json.dumps([peak_rss_bytes(), *[state.state for state in states]]))

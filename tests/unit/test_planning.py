@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.model.expected_information import inverse_information, shared_information
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.commands.plan import PlanRequest, make_plan
+from pchem_pipeline.model.errors.expected_information import inverse_information, shared_information
 from pchem_pipeline.planning.frames import best_exposure, frames_grid, frames_needed, precision
 from pchem_pipeline.planning.likelihood_limits import Ambiguity, ambiguity, gain_rival, rounding_shift
 from pchem_pipeline.planning.plan import plan_one_sample, plan_samples
@@ -16,12 +17,11 @@ from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import verify, verify_samples
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.figure_data import csv_text, figure_tables
-from pchem_pipeline.render.plan_exhibits import plan_exhibits, plan_tables
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.stages.plan_section import plan_section
-from pchem_pipeline.stages.planning import PlanRequest, make_plan
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.figure_data import csv_text, figure_tables
+from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits, plan_tables
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.stages.report.plan_section import plan_section
 
 GAIN = 1 / 11
 ONE_PERCENT = parse_target("conversion_gain=1%")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.fit_status import FAILED, FitStatus
-from pchem_pipeline.model.pooled import LOOSEST, Judged, NoisePool, noise_of
-from pchem_pipeline.model.settings import FitSettings
+from pchem_pipeline.model.checks.shrinkage import LOOSEST, Judged, NoisePool, noise_of
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
 
 SETTINGS = FitSettings()
 

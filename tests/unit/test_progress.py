@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from pchem_pipeline.stages.reporting import Reporter, paced
-from pchem_pipeline.store.beacon import Beacon, read_beacon
+from pchem_pipeline.run.progress import Reporter, paced
+from pchem_pipeline.store.progress_file import Beacon, read_beacon
 
 
 def test_rate_and_remaining_time_are_means_of_this_run() -> None:

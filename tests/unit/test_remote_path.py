@@ -6,7 +6,7 @@ import fsspec
 import numpy as np
 import pytest
 
-from pchem_pipeline.errors import MissingDependencyError, StoreError
+from pchem_pipeline.base.errors import MissingDependencyError, StoreError
 from pchem_pipeline.store.remote_path import RemoteError, RemotePath, place_of, refused
 from pchem_pipeline.store.run_store import RunStore
 

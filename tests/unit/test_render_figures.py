@@ -11,17 +11,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 from report_material import CASES, PARAMETERS, pixel_fit, report_data, true_maps
 
-from pchem_pipeline.model.fit_status import MEANINGS, FitStatus
-from pchem_pipeline.render.data import PixelFit
-from pchem_pipeline.render.ensemble_figures import component_widths, electron_numbers, ensemble
-from pchem_pipeline.render.map_figures import (
+from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
+from pchem_pipeline.report.data import PixelFit
+from pchem_pipeline.report.figures.ensemble_figures import component_widths, electron_numbers, ensemble
+from pchem_pipeline.report.figures.map_figures import (
     fit_status_map,
     map_and_histogram,
     read_noise_histogram,
     status_counts,
 )
-from pchem_pipeline.render.pixel_figures import PAPER_EXAMPLE, cluster_edges, pixel_fits, shown_bins
-from pchem_pipeline.render.style import COLUMN_MM, PAGE_MM, figure_bytes, small_png
+from pchem_pipeline.report.figures.pixel_figures import PAPER_EXAMPLE, cluster_edges, pixel_fits, shown_bins
+from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, figure_bytes, small_png
 
 WORDS = {int(bit): text for bit, text in MEANINGS.items()}
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.render.ranges import histogram_edges, robust_range
-from pchem_pipeline.render.stretch import stretch_map
+from pchem_pipeline.report.style.ranges import histogram_edges, robust_range
+from pchem_pipeline.report.style.stretch import stretch_map
 
 
 def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:

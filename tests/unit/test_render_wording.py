@@ -2,7 +2,8 @@
 
 import pytest
 
-from pchem_pipeline.render.wording import (
+from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.report.style.wording import (
     count,
     measured,
     percent,
@@ -12,7 +13,6 @@ from pchem_pipeline.render.wording import (
     symbol,
     unit_text,
 )
-from pchem_pipeline.variables import VARIABLES
 
 
 @pytest.mark.parametrize(

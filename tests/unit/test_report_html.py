@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from report_material import pixel_fit, report_data, true_maps
 
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.render import report as report_module
-from pchem_pipeline.render.data import MAP_NAMES, ReportData
-from pchem_pipeline.render.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
-from pchem_pipeline.render.inspector import script
-from pchem_pipeline.render.pictures import Picture
-from pchem_pipeline.render.report import RenderedReport, render_report
-from pchem_pipeline.render.settings import ReportSettings
-from pchem_pipeline.render.verdict import flags, sentence
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
+from pchem_pipeline.report.inspector.inspector import script
+from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.pages.verdict import flags, sentence
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Picture
 
 #: Fast drawings: no files, coarse maps.
 QUICK = ReportSettings(figure_formats=(), dpi=72)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from report_material import report_data
 
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.render.data import ReportData
-from pchem_pipeline.render.report_json import report_json
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.report_json import report_json
 
 
 @pytest.fixture(scope="module")

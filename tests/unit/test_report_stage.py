@@ -9,24 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.render.exhibits import EXHIBIT_NAMES
-from pchem_pipeline.render.plan_exhibits import PLAN_FIGURE
-from pchem_pipeline.render.report import RenderedReport
-from pchem_pipeline.render.report_json import report_numbers
-from pchem_pipeline.render.verdict import flags
-from pchem_pipeline.stages import report
-from pchem_pipeline.stages.base import StageContext
-from pchem_pipeline.stages.interrupt import StopRequest
-from pchem_pipeline.stages.pipeline import execute, status
-from pchem_pipeline.stages.report import choose_pixels, gather
-from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES
+from pchem_pipeline.report.figures.plan_exhibits import PLAN_FIGURE
+from pchem_pipeline.report.pages.report import RenderedReport
+from pchem_pipeline.report.pages.report_json import report_numbers
+from pchem_pipeline.report.pages.verdict import flags
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute, status
+from pchem_pipeline.run.signals import StopRequest
+from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.stages.report.report import choose_pixels, gather, report
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.variables import PARAMETERS
 
 NY, NX, FRAMES = 16, 24, 200
 
@@ -184,7 +183,7 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     def fail(exhibit: object, settings: object) -> None:
         raise MemoryError("no room to draw")
 
-    monkeypatch.setattr("pchem_pipeline.stages.drawing.draw_exhibit", fail)
+    monkeypatch.setattr("pchem_pipeline.stages.report.drawing.draw_exhibit", fail)
     state = execute("report", make_context(folder))
     assert state.state == "failed"
     assert state.why.startswith("1 of 1 units failed, first all: out of memory (no room to draw); use fewer")

@@ -7,10 +7,10 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from pchem_pipeline import cli
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.cli.app import app
+from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import dump_config, load_config
-from pchem_pipeline.errors import ConfigError
-from pchem_pipeline.stages.start import find_or_start
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
@@ -45,7 +45,7 @@ def test_the_region_is_written_into_the_yaml(tmp_path, file):
 def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
     tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(cli.app, ["run", str(file), "--dry-run"], catch_exceptions=False)
+    result = CliRunner().invoke(app.app, ["run", str(file), "--dry-run"], catch_exceptions=False)
     assert result.exit_code == 0
     assert "ingest: missing -> would run" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == [file.name]

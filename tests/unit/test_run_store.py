@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pchem_pipeline.errors import LockedError, StoreError
+from pchem_pipeline.base.errors import LockedError, StoreError
+from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.store.files import is_fatal, read_json, storage_error, write_atomic, write_json
 from pchem_pipeline.store.records import Records, StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.variables import VARIABLES
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ import pytest
 
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.model.fit_status import FitStatus
-from pchem_pipeline.stages import fit_together
-from pchem_pipeline.stages.base import Options, StageContext
-from pchem_pipeline.stages.interrupt import StopRequest
-from pchem_pipeline.stages.pipeline import execute
-from pchem_pipeline.stages.reporting import Reporter
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.signals import StopRequest
+from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.stages.fit.fit import together
 from pchem_pipeline.store.run_store import RunStore
 
 WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
@@ -52,15 +52,15 @@ def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: 
     assert np.count_nonzero((words[0] & ~WEAK) == 0) > 5  # clear one by one
     # given again it is the same, and a pool of some pixels says the same of all
     context = contexts[0]
-    assert fit_together.judge_sensor(context) == words[0].size
-    monkeypatch.setattr(fit_together, "_LARGEST_POOL", 60)
-    assert fit_together.judge_sensor(context) == words[0].size
+    assert together.judge_sensor(context) == words[0].size
+    monkeypatch.setattr(together, "_LARGEST_POOL", 60)
+    assert together.judge_sensor(context) == words[0].size
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0])
-    monkeypatch.setattr(fit_together, "_LARGEST_KEPT", 0)
-    assert fit_together.judge_sensor(context) == words[0].size
+    monkeypatch.setattr(together, "_LARGEST_KEPT", 0)
+    assert together.judge_sensor(context) == words[0].size
     # fewer pixels than make a pool take the words back
-    monkeypatch.setattr(fit_together, "_LARGEST_POOL", 10)
-    assert fit_together.judge_sensor(context) == 0
+    monkeypatch.setattr(together, "_LARGEST_POOL", 10)
+    assert together.judge_sensor(context) == 0
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0] & ~WEAK)
 
 

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
-from pchem_pipeline.effects.base import Effect, Plane
-from pchem_pipeline.effects.context import EffectContext
-from pchem_pipeline.errors import ConfigError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.simulate import chain_numba
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.simulate.distributions import Constant, Gamma, LogNormal, LogUniform, Normal, Uniform
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.quantiles import truncated_quantile

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.model import summaries, summaries_numba
-from pchem_pipeline.model.summaries import (
+from pchem_pipeline.model.histogram.count import summaries, summaries_numba
+from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
     BlockSums,
     CovarianceMaps,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.effects.evidence import PixelMaps
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
-from pchem_pipeline.model import telegraph_numba
-from pchem_pipeline.model.telegraph import added_of, find_telegraph
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.law import telegraph_numba
+from pchem_pipeline.model.law.telegraph import added_of, find_telegraph
 
 PIXEL = np.array([1.4, 1 / 12, 100.0, 3.6])
 STEP, SHARE, TAU = 0.9, 0.4, 60.0

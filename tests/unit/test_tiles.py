@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pchem_pipeline.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.store.tiles import parse_tiles, roi_tiles, tile_grid
 
 

@@ -9,16 +9,17 @@ from iminuit import Minuit
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
+from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.model import information_numba, profile_numba
-from pchem_pipeline.model.discovery import false_discovery, misfit, poorest
-from pchem_pipeline.model.fisher import correlations, covariance_from, sandwich_covariance
-from pchem_pipeline.model.intervals import INTERVAL_NAMES, profile_intervals, quantile_of
-from pchem_pipeline.model.pcd import log_pcd
-from pchem_pipeline.model.pchem import FitResult, fit_histograms
-from pchem_pipeline.model.settings import FitSettings
-from pchem_pipeline.stages.fit import fit_tile
-from pchem_pipeline.variables import INTERVALS, interval_names
+from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
+from pchem_pipeline.model.errors import information_numba
+from pchem_pipeline.model.errors.fisher import correlations, covariance_from, sandwich_covariance
+from pchem_pipeline.model.fit import profile_numba
+from pchem_pipeline.model.fit.intervals import INTERVAL_NAMES, profile_intervals, quantile_of
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.stages.fit.fit import fit_tile
 
 Array = NDArray[np.float64]
 CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.2), (1.5, 12.0, 0.46)]

@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pchem_pipeline import cli
-from pchem_pipeline.errors import ConfigError, StoreError
-from pchem_pipeline.stages import compare, figures
-from pchem_pipeline.stages.figures import Wanted, figures_of_run
+from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.cli.app import app
+from pchem_pipeline.commands import figures
+from pchem_pipeline.commands.compare import compare
+from pchem_pipeline.commands.figures import Wanted, figures_of_run
 
 
 def invoke(*arguments: str) -> str:
-    return CliRunner().invoke(cli.app, list(arguments), catch_exceptions=False).stdout
+    return CliRunner().invoke(app.app, list(arguments), catch_exceptions=False).stdout
 
 
 def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None:

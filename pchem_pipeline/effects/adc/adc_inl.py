@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.bends import best_bend
-from pchem_pipeline.effects.codes import code_range
-from pchem_pipeline.effects.edges import merged_edges
+from pchem_pipeline.effects.estimators.bends import best_bend
+from pchem_pipeline.effects.estimators.codes import code_range
+from pchem_pipeline.effects.estimators.edges import merged_edges
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.marginal import MarginalModel
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = ["AdcInl"]
 

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import CodeResiduals, Evidence, PixelMaps
-    from pchem_pipeline.model.marginal import MarginalModel
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import CodeResiduals, Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = ["Clipping"]
 

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.change_points import Steps, find_steps, noise_variance
-from pchem_pipeline.effects.common_modes import quantile_means, responsivity, with_offsets
+from pchem_pipeline.effects.estimators.change_points import Steps, find_steps, noise_variance
+from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.marginal import MarginalModel
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
+    from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = ["BiasJumps"]
 

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.long_memory import between_grid_points, frame_key
+from pchem_pipeline.effects.estimators.long_memory import between_grid_points, frame_key
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext, RandomSource
-    from pchem_pipeline.effects.evidence import Evidence, TimeSeries
+    from pchem_pipeline.effects.framework.context import EffectContext, RandomSource
+    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
 __all__ = ["FlickerNoise"]
 

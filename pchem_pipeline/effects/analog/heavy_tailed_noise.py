@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.response import first_order
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.response import first_order
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 __all__ = ["HeavyTailedNoise"]
 

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.long_memory import frame_key, two_states
-from pchem_pipeline.effects.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.model.marginal import MarginalModel
+from pchem_pipeline.effects.estimators.long_memory import frame_key, two_states
+from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.model.law.sample_law import MarginalModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext, RandomSource
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.context import EffectContext, RandomSource
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 __all__ = ["RtsNoise"]
 

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.electrons import binomial_upper
+from pchem_pipeline.effects.estimators.electrons import binomial_upper
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence
 
 __all__ = ["ChargeLag"]
 

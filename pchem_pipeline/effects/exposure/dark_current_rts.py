@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.added import AddedExposure
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.charge_sums import BlockCharge, block_charge
+from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, block_charge
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.telegraph import Telegraph
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.telegraph import Telegraph
 
 __all__ = ["DarkCurrentRts"]
 
@@ -117,7 +117,7 @@ class DarkCurrentRts(Effect):
 
         Each is fitted by itself, whatever the mean step of all: with up to two defects and their own steps.
         """
-        from pchem_pipeline.model.telegraph import find_telegraph
+        from pchem_pipeline.model.law.telegraph import find_telegraph
 
         if self.fraction == 0 or self.step_e == 0:
             return None

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.added import AddedExposure
-from pchem_pipeline.effects.base import Effect, Plane, register_effect
-from pchem_pipeline.effects.charge_sums import block_charge, exposure_nodes
-from pchem_pipeline.effects.fading_images import FadingCells, fading_of
+from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_nodes
+from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_of
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.context import EffectContext
-    from pchem_pipeline.effects.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 __all__ = ["Persistence"]
 

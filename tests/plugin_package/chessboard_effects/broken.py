@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from pchem_pipeline.effects.base import Effect, Plane
+from pchem_pipeline.effects.framework.effect import Effect, Plane
 
 
 class HastyOffset(Effect):

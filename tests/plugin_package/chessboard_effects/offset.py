@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.base import Effect, Plane
+from pchem_pipeline.effects.framework.effect import Effect, Plane
 
 
 class ChessboardOffset(Effect):

@@ -1,0 +1,372 @@
+"""The ``pchem`` command: it translates the command line and calls the library once.
+
+Heavy libraries are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+import typer
+
+from pchem_pipeline import __version__
+from pchem_pipeline.base.errors import ExitCode, PchEmError
+from pchem_pipeline.cli.methods import methods
+from pchem_pipeline.cli.options import Progress, Quiet, Target, Workers, region_of, takes_command
+from pchem_pipeline.cli.plan import plan
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.session import Command
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="pchem",
+    help="Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _stage_command(name: str, summary: str) -> None:
+    """Add the command of one stage; all stages take the same options."""
+
+    @takes_command()
+    def stage(target: Target, *, command: Command) -> None:
+        from pchem_pipeline.run.session import find_run, run_stages
+
+        run_stages(find_run(target), [name], command)
+
+    stage.__doc__ = summary
+    app.command(name)(stage)
+
+
+@app.command()
+def init(
+    path: Annotated[Path, typer.Argument(help="YAML file to write")] = Path("config.yaml"),
+    files: Annotated[list[str] | None, typer.Argument(help="camera files, globs or folders")] = None,
+    simulated: Annotated[bool, typer.Option("--simulated", help="include a simulated camera")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
+) -> None:
+    """Write a YAML file with every setting explained."""
+    from pchem_pipeline.commands.new_run import write_template
+
+    write_template(path, files or [], simulated=simulated, force=force)
+    typer.echo(path)
+
+
+@app.command()
+@takes_command()
+def ingest(
+    target: Target,
+    append: Annotated[
+        bool,
+        typer.Option(
+            "--append", help="take the files that came behind those of a finished run; reads only them"
+        ),
+    ] = False,
+    *,
+    command: Command,
+) -> None:
+    """Check the camera files; copy or reference their frames."""
+    from pchem_pipeline.run.session import cropped, find_run, run_stages
+
+    run = find_run(target)
+    if append:
+        from pchem_pipeline.commands.append import append_frames
+
+        append_frames(run, command)
+    else:
+        run, command = cropped(run, command)
+        run_stages(run, ["ingest"], command)
+
+
+for _name, _summary in {
+    "simulate": "Write a simulated camera's frames, and its truth.",
+    "histogram": "Count every pixel's DN; keep summaries in time and space.",
+    "fit": "Fit H, g, mu and sigma of every pixel by PCH-EM.",
+    "maps": "Make the maps, with units, standard errors and quality.",
+    "ensemble": "Predict the ensemble from the maps; compare with the data.",
+    "report": "Write report.html, report.json and the figures.",
+    "electrons": "Write the stack of electron numbers into the store.",
+}.items():
+    _stage_command(_name, _summary)
+
+
+@app.command()
+@takes_command()
+def run(
+    targets: Annotated[
+        list[Path], typer.Argument(help="a config.yaml, a store, or camera files and folders")
+    ],
+    store: Annotated[
+        Path | None, typer.Option(help="camera files: store of the run [default: run.zarr]")
+    ] = None,
+    integration_time: Annotated[
+        float | None, typer.Option(help="camera files: integration time of a frame, s")
+    ] = None,
+    bit_depth: Annotated[int | None, typer.Option(help="camera files: bits of the ADC")] = None,
+    mode: Annotated[
+        Literal["copy", "reference"] | None,
+        typer.Option(help="camera files: copy them into the store, or leave them where they are"),
+    ] = None,
+    until: Annotated[
+        Literal["simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"],
+        typer.Option(help="last stage to be done"),
+    ] = "report",
+    *,
+    command: Command,
+) -> None:
+    """Do every stage, from camera files to the report.
+
+    What is up to date is not done again.
+    """
+    from pchem_pipeline.commands.new_run import find_or_start
+    from pchem_pipeline.run.session import cropped, run_stages, up_to
+
+    given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
+    known = {name: value for name, value in given.items() if value is not None}
+    wanted = command.options
+    target, is_new = find_or_start(targets, store, known, wanted.roi, write=not wanted.dry_run)
+    if is_new:
+        target, command = cropped(target, command)
+    stages = up_to(until, target.stages)
+    run_stages(target, stages, command)
+    if not wanted.dry_run:
+        typer.echo(target.store / "report.html" if "report" in stages else target.store)
+
+
+@app.command()
+@takes_command(without=("tiles", "roi", "max_memory"))
+def discrepancy(
+    target: Target,
+    refit: Annotated[
+        bool,
+        typer.Option(
+            "--refit/--no-refit", help="fit, maps, ensemble and report with the grown model at once"
+        ),
+    ] = True,
+    roi: Annotated[
+        str | None, typer.Option(help="look at the pixels y0:y1,x0:x1 only [default: all, or a window]")
+    ] = None,
+    *,
+    command: Command,
+) -> None:
+    """Find what the model is missing, name it, and add it to the model.
+
+    Simulates the fitted model many times and compares. What is named goes into model.effects of the YAML.
+    """
+    from pchem_pipeline.commands.discrepancy import find_and_grow
+    from pchem_pipeline.run.session import find_run
+
+    command = replace(command, options=replace(command.options, roi=region_of(roi)))
+    text = find_and_grow(find_run(target), command, refit=refit)
+    if text:
+        typer.echo(text)
+
+
+@app.command()
+@takes_command(without=("roi", "max_memory"))
+def joint(
+    targets: Annotated[
+        list[Path], typer.Argument(help="a joint.yaml, or the runs (YAML or store) in order of exposure")
+    ],
+    bias: Annotated[
+        list[Path] | None, typer.Option(help="runs: one whose frames hold no electrons (repeatable)")
+    ] = None,
+    store: Annotated[Path | None, typer.Option(help="runs: store of the fit [default: joint.zarr]")] = None,
+    *,
+    command: Command,
+) -> None:
+    """Fit several exposures of a sensor together.
+
+    One gain, bias and read noise for each pixel; dark current as the slope of H. Runs get their histograms.
+    """
+    from pchem_pipeline.commands.joint import find_joint, run_joint
+
+    fit = find_joint(targets, bias or [], store, write=not command.options.dry_run)
+    run_joint(fit, command)
+    if not command.options.dry_run:
+        typer.echo(fit.store / "report.html")
+
+
+app.command()(methods)
+app.command()(plan)
+
+
+@app.command()
+def status(
+    target: Target,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="go on until the command that works on the run ends")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object per line, for machines")] = False,
+) -> None:
+    """Print how far each stage is, and why one is stale."""
+    from pchem_pipeline.commands.watch import watch as follow
+    from pchem_pipeline.run.session import find_run
+
+    terminal = sys.stdout.isatty()
+    follow(find_run(target), typer.echo, follow=watch, as_json=as_json, terminal=terminal)
+
+
+@app.command()
+def export(
+    target: Target,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("export"),
+    formats: Annotated[
+        str, typer.Option("--format", help="fits, tiff, npz and csv (summary), separated by commas")
+    ] = "fits,csv",
+) -> None:
+    """Write maps as FITS, TIFF or npz, and a CSV summary."""
+    from pchem_pipeline.commands.export import export_run
+
+    for path in export_run(target, output, tuple(part.strip() for part in formats.split(","))):
+        typer.echo(path)
+
+
+@app.command()
+def figures(
+    target: Target,
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("figures"),
+    formats: Annotated[str, typer.Option("--format", help="pdf, svg and png, separated by commas")] = "pdf",
+    width: Annotated[
+        str | None, typer.Option(help="width such as 88mm, 18cm or 3.5in [default: each figure's own]")
+    ] = None,
+    style: Annotated[
+        str | None, typer.Option(help="matplotlib style sheet, a file or a name, over the style of pchem")
+    ] = None,
+    only: Annotated[str, typer.Option(help="names of figures, separated by commas [default: all]")] = "",
+    dpi: Annotated[
+        int, typer.Option(min=72, max=1200, help="resolution of PNG and of maps, dots per inch")
+    ] = 600,
+    workers: Workers = None,
+    progress: Progress = "auto",
+) -> None:
+    """Write every figure for a paper, its numbers beside it as CSV."""
+    from pchem_pipeline.commands.figures import Wanted, figures_of_run
+
+    wanted = Wanted(_listed(formats), width, style, _listed(only), dpi, workers, progress)
+    for path in figures_of_run(target, output, wanted):
+        typer.echo(path)
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+@app.command()
+def view(
+    target: Target,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = 0,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="open the browser")] = False,
+) -> None:
+    """Show the report with every pixel in the browser, from a server on this computer.
+
+    It reads the run and changes nothing. Ends with Ctrl-C.
+    """
+    from pchem_pipeline.commands.view import serve
+
+    def ready(address: str) -> None:
+        typer.echo(address)
+        if show:
+            typer.launch(address)
+
+    serve(target, port, ready)
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("compare"),
+    tolerance: Annotated[
+        float, typer.Option(help="same frames: relative difference that counts as rounding")
+    ] = 1e-12,
+    workers: Workers = None,
+    progress: Progress = "auto",
+) -> None:
+    """Compare runs; exit code 3 if something changed.
+
+    Runs on the same frames are compared value by value, others in standard errors.
+    """
+    from pchem_pipeline.commands.compare.compare import compare_runs
+
+    for path in compare_runs(runs, output, tolerance=tolerance, workers=workers, progress=progress):
+        typer.echo(path)
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
+    size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
+    frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="root of the random numbers [default: 1; --hidden random: a new one]"),
+    ] = None,
+    hidden: Annotated[
+        str | None,
+        typer.Option(help="hide this effect (a tag, or random: not told before the end) and search for it"),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run everything on a small simulated sensor.
+
+    Prints the estimated parameters beside the true ones, and the path of the report.
+    """
+    if hidden is not None:
+        from pchem_pipeline.commands.demo.hidden import run_hidden_demo
+
+        text = run_hidden_demo(output, hidden=hidden, size=size, n_frames=frames, seed=seed, quiet=quiet)
+    else:
+        from pchem_pipeline.commands.demo.demo import run_demo
+
+        text = run_demo(output, size=size, n_frames=frames, seed=1 if seed is None else seed, quiet=quiet)
+    typer.echo(text)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"pchem {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
+    ] = False,
+) -> None:
+    """Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM."""
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    typer.echo(f"pchem: {' '.join(message.split())}", err=True)
+    sys.exit(code)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
+    from pchem_pipeline.compute.environment import prepare_environment
+
+    prepare_environment()
+    call: Any = app
+    try:
+        call(args=arguments, prog_name="pchem")
+    except PchEmError as error:
+        _fail(str(error), error.exit_code)
+    except MemoryError:
+        _fail("out of memory; use fewer --workers or --max-memory", ExitCode.INTERNAL)
+    except KeyboardInterrupt:
+        _fail(
+            "stopped by SIGINT; finished tiles are kept, run the same command again to go on", ExitCode.SIGINT
+        )
+
+
+if __name__ == "__main__":
+    main()

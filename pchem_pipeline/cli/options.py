@@ -1,0 +1,133 @@
+"""The options that the commands of a run have in common."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from pchem_pipeline.base.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.session import Command
+
+__all__ = ["Progress", "Quiet", "Target", "Workers", "region_of", "takes_command"]
+
+Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
+Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
+Progress = Annotated[
+    Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
+
+#: Name, type with help, and default of each, in the order of ``--help``.
+_COMMON: tuple[tuple[str, Any, Any], ...] = (
+    ("force", Annotated[bool, typer.Option("--force", help="do it again even if it is up to date")], False),
+    (
+        "dry_run",
+        Annotated[bool, typer.Option("--dry-run", help="say what would be done and why; write nothing")],
+        False,
+    ),
+    (
+        "tiles",
+        Annotated[str | None, typer.Option(help="only these tiles, iy.ix: 0.3,2.1 or ranges 0:2.0:4")],
+        None,
+    ),
+    (
+        "roi",
+        Annotated[
+            str | None,
+            typer.Option(
+                help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, others do its tiles"
+            ),
+        ],
+        None,
+    ),
+    ("workers", Workers, None),
+    (
+        "backend",
+        Annotated[
+            Literal["serial", "threads", "processes", "distributed"] | None,
+            typer.Option(help="who does the work [default: compute.backend]"),
+        ],
+        None,
+    ),
+    (
+        "max_memory",
+        Annotated[
+            int | None,
+            typer.Option(min=64, help="memory that it may take, MiB [default: compute.max_memory]"),
+        ],
+        None,
+    ),
+    (
+        "log_json",
+        Annotated[Path | None, typer.Option(help="append JSON lines about the run to this file")],
+        None,
+    ),
+    ("progress", Progress, "auto"),
+    ("quiet", Quiet, False),
+)
+
+
+def takes_command(*, without: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command of a run: it takes the common options too, as one argument ``command``.
+
+    Args:
+        without: names of common options that the command does not have, or has in a wording of its own.
+    """
+    common = [each for each in _COMMON if each[0] not in without]
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(function)
+        def wrapper(**given: Any) -> None:
+            options = {name: given.pop(name) for name, _, _ in common}
+            function(**given, command=_command(**options))
+
+        hints = typing.get_type_hints(function, localns={"Command": object}, include_extras=True)
+        kind = inspect.Parameter.KEYWORD_ONLY
+        own = [
+            parameter.replace(annotation=hints[name], kind=kind)
+            for name, parameter in inspect.signature(function).parameters.items()
+            if name != "command"
+        ]
+        added = [
+            inspect.Parameter(name, kind, default=default, annotation=hint) for name, hint, default in common
+        ]
+        signature: Any = wrapper
+        signature.__signature__ = inspect.Signature([*own, *added])
+        wrapper.__annotations__ = {each.name: each.annotation for each in [*own, *added]}
+        del signature.__wrapped__  # or the signature of the function itself would be read
+        return wrapper
+
+    return decorate
+
+
+def region_of(text: str | None) -> tuple[int, int, int, int] | None:
+    """Return the region that ``--roi`` names.
+
+    Raises:
+        ConfigError: it is not written as y0:y1,x0:x1.
+    """
+    if text is None:
+        return None
+    try:
+        (y0, y1), (x0, x1) = (map(int, part.split(":")) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--roi {text!r}: write y0:y1,x0:x1 in pixels, such as 0:128,64:192") from None
+    return y0, y1, x0, x1
+
+
+def _command(
+    *, force: bool, dry_run: bool, tiles: str | None = None, roi: str | None = None, **rest: Any
+) -> Command:
+    """Return what the common options ask for."""
+    from pchem_pipeline.run.session import Command
+    from pchem_pipeline.run.stage import Options
+
+    return Command(Options(force=force, dry_run=dry_run, tiles=tiles, roi=region_of(roi)), **rest)

@@ -1,0 +1,53 @@
+"""The command ``pchem plan``, apart from those that work on a run; it takes no option of theirs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["plan"]
+
+
+def plan(
+    run: Annotated[
+        Path | None, typer.Argument(help="a run: its median pixel is planned for where options say nothing")
+    ] = None,
+    read_noise: Annotated[float | None, typer.Option(help="read noise, e-, quantisation included")] = None,
+    exposure: Annotated[
+        float | None, typer.Option(help="quanta exposure of a frame, e- [default: the best]")
+    ] = None,
+    gain: Annotated[float | None, typer.Option(help="conversion gain, e-/DN [default: 0.09]")] = None,
+    target: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="precision of a pixel to reach: conversion_gain=1%, bias=0.02e-, read_noise_e=2%, …"
+        ),
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="frames there are: what do they tell?")] = None,
+    samples: Annotated[
+        str | None, typer.Option(help="divide the frames over samples: exposures 0,2,8 in e-, or best")
+    ] = None,
+    max_exposure: Annotated[float, typer.Option(min=0.01, help="largest exposure to choose, e-")] = 10.0,
+    max_frames: Annotated[float, typer.Option(min=1, help="more frames than these count as never")] = 1e7,
+    verify: Annotated[bool, typer.Option("--verify", help="simulate the plan and fit it")] = False,
+    pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="root of the random numbers of --verify")] = 1,
+    figure: Annotated[
+        Path | None, typer.Option(help="draw frames over exposure and read noise: .svg, .png or .pdf")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="write the numbers to this file")] = None,
+) -> None:
+    """Tell how many frames are enough.
+
+    From the Cramer-Rao bound, at once; --verify simulates pixels and fits them.
+    """
+    from pchem_pipeline.commands.plan import PlanRequest, make_plan
+
+    request = PlanRequest(
+        run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,
+        targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
+        max_frames=max_frames, verify=verify, pixels=pixels, seed=seed, figure=figure, json=json,
+    )  # fmt: skip
+    typer.echo(make_plan(request))

@@ -1,0 +1,1 @@
+"""What the command line does beyond stages: new runs, append, compare, export, figures, view, plan."""

@@ -1,0 +1,196 @@
+"""``pchem ingest --append``: further frames of a finished run, without reading the old ones again.
+
+Histograms and summaries go on where they ended, and are in the end those of all frames together, to the bit.
+What depends on them becomes stale; the next fit starts from the old answer. The pass changes the arrays in
+place: one that is stopped leaves the run without histograms, and ``pchem run`` then counts all frames.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from pchem_pipeline.base.errors import InputError, StoreError, quoted
+from pchem_pipeline.frames.identity import digest_of, quick_identity
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.read_once import ReadOnce
+from pchem_pipeline.frames.resolve import input_paths
+from pchem_pipeline.model.histogram.count import counts_dtype
+from pchem_pipeline.model.histogram.summaries import block_starts
+from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
+from pchem_pipeline.run.runner import cpu_seconds, execute, setting_values
+from pchem_pipeline.run.session import Command, Target, working_run
+from pchem_pipeline.run.stage import StageContext, Swept, open_store
+from pchem_pipeline.stages.fit.start import keep_fit
+from pchem_pipeline.stages.histogram.counting import BandCounter
+from pchem_pipeline.stages.histogram.dry_run import allowed_bytes, sweep_bytes, sweep_rows
+from pchem_pipeline.stages.histogram.single_pass import block_tasks, do_all, whole_mebibytes
+from pchem_pipeline.stages.histogram.stream import Sweep, cut_rows
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pchem_pipeline.frames.sequence import FrameSequence
+    from pchem_pipeline.run.runner import StageState
+
+__all__ = ["append_frames"]
+
+_STAGES = ("ingest", "histogram")
+
+
+def append_frames(target: Target, command: Command) -> list[StageState]:
+    """Take the frames of the files that came after those of a finished run.
+
+    Args:
+        target: the run; its ``input.files`` name the old files and, behind them, the new ones.
+        command: what the command line asked for.
+
+    Returns:
+        The states of ``ingest`` and ``histogram``.
+
+    Raises:
+        InputError: the old files are not those of the run, or the new frames do not fit them.
+        StoreError: the run is not finished as far as its histograms, or was made with other settings.
+    """
+    with working_run(target, command) as context:
+        clock = time.perf_counter(), cpu_seconds()
+        _check_run(context)
+        paths = input_paths(context.config.input, context.base_dir)
+        quick = quick_identity(paths)
+        added, kept = _added(context, paths, quick)
+        if not added:
+            context.reporter.info("ingest: there are no further files")
+            return []
+        frames = open_frames(context.config.input, context.base_dir)
+        _check_frames(context, frames, added)
+        keep_fit(context)
+        files = kept["files"] + _go_on(context, frames, added)["files"]
+        keep_identity(context, quick, {"files": files, "digest": digest_of(files)})
+        context.swept = Swept(frozenset(_STAGES), frames, clock)
+        return [execute(name, context) for name in _STAGES]
+
+
+def _check_run(context: StageContext) -> None:
+    """Refuse a run that has no whole histograms, or that was made with other settings."""
+    store = context.store
+    for name in _STAGES:
+        record = store.records.read(name)
+        finished = record is not None and record.finished
+        if record is None or not finished or len(context.tiles_done(name)) < record.keys:
+            raise StoreError(f"{store.path}: {name} is not complete; run: pchem run {quoted(store.path)}")
+        if record.content.get("settings") != setting_values(name, context):
+            raise StoreError(
+                f"{store.path}: {name} was done with other settings; to do all frames again: "
+                f"pchem run {quoted(store.path)}"
+            )
+    lacks = context.config.histogram.summaries and not store.has("summary/open_sums")
+    lacks |= ingested_identity(context) is None
+    if context.sensor.kind != "frames" or lacks:
+        raise StoreError(
+            f"{store.path}: nothing can be appended to ready-made histograms or runs of earlier versions; "
+            f"do all again: pchem run {quoted(store.path)} --force"
+        )
+
+
+def _added(
+    context: StageContext, paths: list[Path], quick: dict[str, Any]
+) -> tuple[list[Path], dict[str, Any]]:
+    """Return the files that the run does not know, and the identity of those that it knows."""
+    known = ingested_identity(context) or {}
+    before = known["quick"]["files"]
+    now = quick["files"][: len(before)]
+    same = now == before
+    if not same and [_fact(file) for file in now] == [_fact(file) for file in before]:
+        # touched, or copied elsewhere: their content counts
+        same = known_identity(context)["files"][: len(before)] == known["identity"]["files"]
+    if not same:
+        raise InputError(
+            f"the first {len(before)} files of input.files are not those of the run, or were changed; new "
+            "files must come behind them in the order of their names; to do all again: "
+            f"pchem run {quoted(context.store.path)}"
+        )
+    return paths[len(before) :], known["identity"]
+
+
+def _fact(file: dict[str, Any]) -> tuple[str, int]:
+    return file["name"], file["size"]
+
+
+def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path]) -> None:
+    """Refuse frames of another kind, or too few old ones, or too little memory."""
+    sensor, place = context.sensor, context.store.path
+    if frames.shape[1:] != sensor.shape or frames.dtype.name != sensor.dtype:
+        raise InputError(
+            f"{added[0]}: the frames do not fit those of the run; all are {frames.shape[1:]} {frames.dtype}, "
+            f"the run has {sensor.shape} {sensor.dtype}"
+        )
+    if frames.shape[0] <= sensor.n_frames:
+        raise InputError(f"{added[0]}: input.frame_range leaves out the new frames; correct it")
+    reader, first, _, _ = next(frames.pieces(sensor.n_frames, sensor.n_frames + 1))
+    if first != 0 or reader.paths[0] not in added:
+        raise InputError(f"{added[0]}: is not what follows the frames of the run; correct input.files")
+    window = context.config.histogram.window_frames
+    if sensor.n_frames < window:
+        raise StoreError(
+            f"{place}: {sensor.n_frames} frames are fewer than histogram.window_frames ({window}), which "
+            f"decide the bins; do all again: pchem run {quoted(place)}"
+        )
+    bins = context.store.array("histogram/counts").shape[2]
+    need = sweep_bytes(context.config, frames.shape, frames.dtype, bins)
+    if need > allowed_bytes(context.config, context.executor.workers):
+        raise StoreError(
+            f"{place}: appending needs {need >> 20} MiB; allow them (--max-memory), or do all again: "
+            f"pchem run {quoted(place)}"
+        )
+
+
+def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> dict[str, Any]:
+    """Count the new frames; return the identity of their files."""
+    config, store, workers = context.config, context.store, context.executor.workers
+    done, shape = context.sensor.n_frames, frames.shape
+    bins = store.array("histogram/counts").shape[2]
+    bands = cut_rows(shape[1], sweep_rows(config, shape, frames.dtype), workers)
+    counters = [BandCounter(store.path, rows, shape, bins, config.histogram) for rows in bands]
+    step = config.histogram.window_frames
+    if config.input.mode == "copy":
+        step = math.lcm(step, store.array("frames/dn").chunks[0])
+    total = sum(path.stat().st_size for path in added if path.is_file()) >> 20
+    with (
+        context.reporter.progress("ingest and histogram", total, "MiB") as advance,
+        ThreadPoolExecutor(workers, thread_name_prefix="count") as pool,
+    ):
+        do_all(pool, [functools.partial(counter.resume, done) for counter in counters])
+        for name in _STAGES:
+            store.records.forget(name)
+        _make_room(context, shape, bins)
+        once = ReadOnce(frames, added, workers, whole_mebibytes(advance))
+        with Sweep(once.read, shape, frames.dtype, bands, step, done).blocks() as blocks:
+            for t0, parts in blocks:
+                context.stop.check()
+                do_all(pool, block_tasks(context, counters, bands, t0, parts))
+        do_all(pool, [counter.finish for counter in counters])
+    return once.identity()
+
+
+def _make_room(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
+    """Make the arrays along time longer, and the counts wide enough."""
+    store, n_frames = context.store, shape[0]
+    tile, length = context.config.run.tile, context.config.histogram.block_frames
+    open_store.cache_clear()
+    if store.array("histogram/counts").dtype != counts_dtype(n_frames):
+        counts = (*shape[1:], bins)
+        store.create_array(
+            "histogram/counts", counts, chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
+        )
+    if context.config.input.mode == "copy":
+        store.resize("frames/dn", n_frames)
+    if context.config.histogram.summaries:
+        starts = block_starts(n_frames, length)
+        for name in ("row_sum", "row_sum_square", "column_sum"):
+            store.resize(f"summary/{name}", n_frames)
+        for name in ("block_sum", "block_sum_square"):
+            store.resize(f"summary/{name}", starts.size)
+        store.write_array("summary/block_start", starts, {"frames": n_frames})

@@ -1,0 +1,1 @@
+"""``pchem compare``: what differs between runs."""

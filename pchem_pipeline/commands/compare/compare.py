@@ -1,0 +1,225 @@
+"""``pchem compare``: what differs between runs, value by value and in standard errors."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.commands.compare.arrays import compare_arrays
+from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
+from pchem_pipeline.commands.figures import warn_if_old
+from pchem_pipeline.model.checks.run_differences import LIMIT, compare_maps, reasons_of_change
+from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
+from pchem_pipeline.report.pages.compare_data import ArrayRow, Comparison, Pair, RunFacts
+from pchem_pipeline.report.pages.compare_page import (
+    COMPARE_JSON,
+    COMPARE_PAGE,
+    render_comparison,
+    sentence_of,
+)
+from pchem_pipeline.report.style.wording import count, short, symbol
+from pchem_pipeline.run.progress import ProgressMode, Reporter
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.session import Target, find_run
+from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
+from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["MAPS", "compare_runs", "comparison_of"]
+
+#: The maps that are compared.
+MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")
+
+_ENSEMBLE = (
+    "dn",
+    "counts",
+    "density",
+    "epcd_exact",
+    "electrons",
+    "nuced_counts",
+    "nuced_density",
+    "nuced_exact",
+)
+
+
+def compare_runs(
+    paths: Sequence[Path],
+    folder: Path,
+    *,
+    tolerance: float = 1e-12,
+    workers: int | None = None,
+    progress: ProgressMode = "auto",
+) -> list[Path]:
+    """Compare runs with the first of them and write ``compare.html`` and ``compare.json``.
+
+    Args:
+        paths: stores, or the YAML files that made them; two or more.
+        folder: where to write; made if needed.
+        tolerance: relative difference that counts as rounding, where the frames are the same.
+        workers: processes that draw; None: as the first run's section ``compute`` says.
+        progress: auto | on | off.
+
+    Returns:
+        The files written, where nothing changed.
+
+    Raises:
+        ChangedError: something changed; the files are written all the same.
+        ConfigError: fewer than two runs.
+        StoreError: a run has no maps, or the folder cannot be written.
+    """
+    reporter = Reporter(progress)
+    found = comparison_of(paths, tolerance, reporter)
+    draw = draw_by_workers(drawing_workers(workers, find_run(paths[0]).config.compute), reporter, "figures")
+    page, numbers = render_comparison(found, draw)
+    files = {COMPARE_PAGE: page, COMPARE_JSON: numbers}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(error, folder) from error
+    for name, text in files.items():
+        write_atomic(folder / name, text.encode())
+    if found.changed:
+        raise ChangedError(f"{sentence_of(found)} See {folder / COMPARE_PAGE}")
+    reporter.info(sentence_of(found))
+    return [folder / name for name in files]
+
+
+def comparison_of(paths: Sequence[Path], tolerance: float, reporter: Reporter) -> Comparison:
+    """Return how the runs differ from the first of them; see :func:`compare_runs`."""
+    if not 2 <= len(paths) <= len(string.ascii_uppercase):
+        raise ConfigError(f"compare: {len(paths)} runs given; give two or more, up to 26")
+    if not 0 <= tolerance < 1:
+        raise ConfigError(f"--tolerance {tolerance:g}: a relative difference from 0 to below 1 is meant")
+    targets = [find_run(path) for path in paths]
+    stores = [RunStore.open(target.store) for target in targets]
+    for target, store in zip(targets, stores, strict=True):
+        if not store.has("maps/conversion_gain"):
+            raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+        warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared as it is")
+    names = _told_apart([store.path for store in stores])
+    runs = [
+        _facts(label, name, store)
+        for label, name, store in zip(string.ascii_uppercase, names, stores, strict=False)
+    ]
+    pairs = [
+        _pair((runs[0], targets[0], stores[0]), (run, target, store), tolerance, reporter)
+        for run, target, store in zip(runs[1:], targets[1:], stores[1:], strict=True)
+    ]
+    return Comparison(runs, pairs, tolerance)
+
+
+_Side = tuple[RunFacts, Target, RunStore]
+
+
+def _told_apart(paths: Sequence[Path]) -> list[str]:
+    """Return the names of the stores, with as many of their folders as tell them apart."""
+    parts = [path.resolve().parts for path in paths]
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [path.name for path in paths]
+
+
+def _facts(label: str, name: str, store: RunStore) -> RunFacts:
+    sensor = SensorInfo.read(store)
+    quality = store.read("maps/quality")
+    good, caution, none = (int((quality == grade).sum()) for grade in (GOOD, CAUTION, NO_VALUE))
+    return RunFacts(
+        label,
+        name,
+        sensor.shape,
+        sensor.n_frames if sensor.kind == "frames" else None,
+        _data_digest(store, sensor),
+        {each: _median(content) for each, content in store.attributes("maps").get("summary", {}).items()},
+        {each: store.read(f"ensemble/{each}") for each in _ENSEMBLE if store.has(f"ensemble/{each}")},
+        dict(store.attributes("ensemble").get("rmse", {})),
+        (good, caution, none),
+    )
+
+
+def _median(content: dict[str, Any]) -> tuple[float, float, float]:
+    """Return the median of a map, its standard error and the scatter of the pixels; NaN where unknown."""
+    median, error, scatter = (
+        float("nan") if content[key] is None else float(content[key])
+        for key in ("median", "median_stderr", "robust_sd")
+    )
+    return median, error, scatter
+
+
+def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
+    """Return what tells the frames of a run: content of the files, and what was taken of them."""
+    record = store.records.read("ingest")
+    settings = {} if record is None else record.content.get("settings", {})
+    taken = [settings.get(f"input.{name}") for name in ("roi", "frame_range", "bit_shift")]
+    return f"{sensor.identity.get('digest', '')} {taken} {sensor.n_frames} {sensor.shape}"
+
+
+def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> Pair:
+    (one, one_target, one_store), (other, other_target, other_store) = first, second
+    same_data = one.digest == other.digest
+    maps: dict[str, Any] = {}
+    transitions: list[list[int]] = []
+    if one.shape == other.shape:
+        grades = one_store.read("maps/quality"), other_store.read("maps/quality")
+        transitions = (
+            np.histogram2d(grades[0].ravel(), grades[1].ravel(), bins=np.arange(4) - 0.5)[0]
+            .astype(int)
+            .tolist()
+        )
+        good = (grades[0] == GOOD) & (grades[1] == GOOD)
+        for name in MAPS:
+            if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"):
+                both = [
+                    (store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr"))
+                    for store in (one_store, other_store)
+                ]
+                maps[name] = compare_maps(both[0], both[1], good, same_data=same_data)
+    arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
+    reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
+    words = _words(one, other, arrays, maps, reasons)
+    return Pair(
+        one, other, same_data, arrays, maps, reasons, transitions,
+        settings_that_differ(one_target.config, other_target.config),
+        versions_that_differ(one_store, other_store),
+        bool(words), words,
+    )  # fmt: skip
+
+
+def _words(
+    one: RunFacts, other: RunFacts, arrays: Sequence[ArrayRow], maps: dict[str, Any], reasons: dict[str, Any]
+) -> list[str]:
+    """Say what changed, one sentence each; nothing where nothing did."""
+    found = []
+    if one.shape != other.shape:
+        sizes = " and ".join(f"{ny} x {nx}" for ny, nx in (one.shape, other.shape))
+        found.append(f"The sensors have {sizes} pixels.")
+    counted = [row for row in arrays if row.counts and row.state in ("changed", "lost")]
+    found += [f"{row.name}: {_array_words(row)}." for row in counted]
+    for name, why in reasons.items():
+        text = []
+        if why.shifted:
+            text.append(f"their median is {maps[name].median_z:+.3g} standard errors of a pixel")
+        if why.spread:
+            text.append(f"they scatter by {maps[name].spread_z:.3g} standard errors")
+        if why.pixels:
+            text.append(f"{count(maps[name].n_far, 'pixel')} moved by more than {LIMIT:g}")
+        if text:
+            sign = f"{symbol(name)[1]}{' (DN)' if name == 'read_noise_dn' else ''}"
+            found.append(f"{sign[0].upper()}{sign[1:]}, differences: {', '.join(text)}.")
+    return found
+
+
+def _array_words(row: ArrayRow) -> str:
+    if row.state == "lost":
+        return "is not there any more"
+    if row.why:
+        return row.why
+    share = f"{count(row.n_beyond, 'value')} of {row.n_values:,} changed"
+    return f"{share}, by up to {short(row.largest)}"

@@ -1,0 +1,1 @@
+"""``pchem demo``: simulated sensors through the whole pipeline, beside their truth."""

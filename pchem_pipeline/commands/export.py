@@ -1,0 +1,131 @@
+"""``pchem export``: the maps as FITS, TIFF or npz for other programs, and their summary as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.base.variables import Variable, variables_of
+from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
+from pchem_pipeline.model.fit.status import MEANINGS
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.session import Target, find_run, run_status
+from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["FORMATS", "export_run"]
+
+#: Formats that maps can be exported to, and their CSV summary.
+FORMATS = ("fits", "tiff", "npz", "csv")
+
+_FROM_FIT = ("fit_status", "likelihood_gap", "goodness_p")
+_COLUMNS = (
+    "n_valid",
+    "n_missing",
+    "median",
+    "median_stderr",
+    "robust_sd",
+    "minimum",
+    "maximum",
+    "n_low",
+    "n_high",
+)
+
+
+def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Write the maps of a run to files.
+
+    Args:
+        path: the run's store, or the YAML that made it.
+        folder: where to write; made if needed.
+        formats: any of ``FORMATS``.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ConfigError: an unknown format, or none.
+        StoreError: the run has no maps, or the folder cannot be written.
+    """
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        raise ConfigError(
+            f"--format: {', '.join(unknown) or 'nothing'} cannot be written; choose from {', '.join(FORMATS)}"
+        )
+    target = find_run(path)
+    store = RunStore.open(target.store)
+    if "summary" not in store.attributes("maps"):
+        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+    _say_if_old(target)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(error, folder) from error
+    written: list[Path] = []
+    images = _images(store) if set(formats) - {"csv"} else []
+    for name in dict.fromkeys(formats):
+        if name == "fits":
+            written += write_fits(folder / "maps.fits", images, _header(target, store))
+        elif name == "tiff":
+            written += write_tiff(folder, images)
+        elif name == "npz":
+            written += write_npz(folder / "maps.npz", images)
+        else:
+            written += _write_csv(folder, store)
+    return written
+
+
+def _say_if_old(target: Target) -> None:
+    """Warn where the maps are not those of the present settings and input."""
+    state = next(state for state in run_status(target) if state.stage in ("maps", "joint"))
+    if state.state != "complete":
+        Reporter("off").warning(f"maps: {state.words()}; they are written as they are")
+
+
+def _images(store: RunStore) -> list[MapImage]:
+    chosen: list[Variable] = [v for v in variables_of("maps") if store.has(v.path)]
+    both = (*variables_of("fit"), *variables_of("joint"))
+    chosen += [v for v in both if v.name in _FROM_FIT and store.has(v.path)]
+    return [MapImage(v.name, store.read(v.path), v.unit, v.long_name) for v in chosen]
+
+
+def _header(target: Target, store: RunStore) -> dict[str, Any]:
+    """Return the keywords of a FITS file."""
+    sensor = SensorInfo.read(store)
+    time = target.config.input.integration_time or sensor.integration_time
+    frames = sensor.n_frames if sensor.kind == "frames" else None
+    return {"CREATOR": "pchem-pipeline", "RUN": store.path.name, "NFRAMES": frames, "EXPTIME": time}
+
+
+def _write_csv(folder: Path, store: RunStore) -> list[Path]:
+    """Write the summaries of the maps, and how many pixels bear each word of the status."""
+    attributes = store.attributes("maps")
+    units = {v.name: v.unit for v in variables_of("maps")}
+    summary: dict[str, dict[str, Any]] = attributes["summary"]
+    percentiles = list(next(iter(summary.values()))["percentiles"])
+    rows: list[list[Any]] = [["map", "unit", *_COLUMNS, *(f"percentile_{p}" for p in percentiles)]]
+    for name, content in summary.items():
+        rows.append(
+            [
+                name,
+                units[name],
+                *(content[c] for c in _COLUMNS),
+                *(content["percentiles"][p] for p in percentiles),
+            ]
+        )
+    meanings = {"ok": "good fit", **{str(bit.name).lower(): text for bit, text in MEANINGS.items()}}
+    reasons = [["fit_status", "pixels", "meaning"]]
+    reasons += [[name, n, meanings.get(name, "")] for name, n in attributes["fit_status"].items()]
+    return [_table(folder / "summary.csv", rows), _table(folder / "fit_status.csv", reasons)]
+
+
+def _table(path: Path, rows: list[list[Any]]) -> Path:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_atomic(path, text.getvalue().encode())
+    return path

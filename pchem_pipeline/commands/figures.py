@@ -1,0 +1,165 @@
+"""``pchem figures``: each figure of a run as a file for papers, with its numbers beside it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.compute.executor import Outcome
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.discrepancy_exhibits import discrepancy_exhibits
+from pchem_pipeline.report.figures.exhibits import Exhibit, exhibits
+from pchem_pipeline.report.figures.figure_data import figure_tables
+from pchem_pipeline.report.figures.method_exhibits import method_exhibits
+from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
+from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.run.progress import ProgressMode, Reporter
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.session import Target, find_run, run_status
+from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
+from pchem_pipeline.stages.report.report import gather
+from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["Wanted", "exhibits_of", "figures_of_run", "gather_run", "millimetres", "warn_if_old"]
+
+#: Narrowest and widest figure, mm.
+_WIDTHS = (40.0, 400.0)
+_UNITS = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72.0, "": 1.0}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """How the figures are wanted.
+
+    Attributes:
+        formats: pdf, svg, png.
+        width: such as ``88mm`` or ``3.5in``; None: each figure's own.
+        style: path or name of a matplotlib style sheet.
+        only: names of figures; empty: all.
+        dpi: resolution of PNG and of maps, dots per inch.
+        workers: processes that draw; None: as the run's section ``compute`` says.
+        progress: auto | on | off.
+    """
+
+    formats: Sequence[str] = ("pdf",)
+    width: str | None = None
+    style: str | None = None
+    only: Sequence[str] = ()
+    dpi: int = 600
+    workers: int | None = None
+    progress: ProgressMode = "auto"
+
+
+def millimetres(text: str) -> float:
+    """Return the length that a text such as ``88mm``, ``8.8 cm``, ``3.5in`` or ``88`` (mm) says, mm.
+
+    Raises:
+        ConfigError: it is none, or none that a figure can have.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|in|pt)?\s*", text)
+    if match is None:
+        raise ConfigError(f"--width {text!r}: write a length such as 88mm, 8.8cm or 3.5in")
+    length = float(match[1]) * _UNITS[match[2] or ""]
+    if not _WIDTHS[0] <= length <= _WIDTHS[1]:
+        raise ConfigError(f"--width {text}: figures can be {_WIDTHS[0]:g} to {_WIDTHS[1]:g} mm wide")
+    return length
+
+
+def gather_run(target: Target) -> ReportData:
+    """Return all that the report of a run shows.
+
+    Raises:
+        StoreError: the run lacks maps or histograms.
+    """
+    store = RunStore.open(target.store)
+    if not store.has("maps/conversion_gain"):
+        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+    time = target.config.input.integration_time or SensorInfo.read(store).integration_time
+    return gather(store, target.config, time, [])
+
+
+def exhibits_of(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
+    """Return the figures of the report and of the discrepancy page."""
+    others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
+    return [*exhibits(data, settings), *method_exhibits(data), *plan_exhibits(data), *others]
+
+
+def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
+    """Write the figures of a run and their numbers.
+
+    Args:
+        path: the run's store, or the YAML that made it.
+        folder: where to write; made if needed.
+        wanted: which, and how.
+
+    Returns:
+        The files written, figure by figure.
+
+    Raises:
+        ConfigError: an unknown format, width, style or figure.
+        StoreError: the run has no maps, or the folder cannot be written.
+    """
+    unknown = [name for name in wanted.formats if name not in FORMATS]
+    if unknown or not wanted.formats:
+        raise ConfigError(
+            f"--format: {', '.join(unknown) or 'nothing'} cannot be drawn; choose from {', '.join(FORMATS)}"
+        )
+    width = None if wanted.width is None else millimetres(wanted.width)
+    sheet = {} if wanted.style is None else read_style_sheet(wanted.style)
+    target = find_run(path)
+    data = gather_run(target)
+    warn_if_old(target, ("maps", "ensemble"), "they are drawn as they are")
+    settings = target.config.report
+    kinds = tuple(dict.fromkeys(wanted.formats))
+    jobs = [
+        PaperFigure(each, figure_tables(each, data, settings), kinds, width, wanted.dpi, sheet)
+        for each in _chosen(exhibits_of(data, settings), wanted.only)
+    ]
+    workers = drawing_workers(wanted.workers, target.config.compute)
+    return _drawn(jobs, folder, workers, Reporter(wanted.progress))
+
+
+def _chosen(found: list[Exhibit], only: Sequence[str]) -> list[Exhibit]:
+    names = [exhibit.name for exhibit in found]
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        raise ConfigError(f"--only: this run has no figure {unknown[0]}; it has {', '.join(names)}")
+    return [exhibit for exhibit in found if not only or exhibit.name in only]
+
+
+def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Reporter) -> list[Path]:
+    """Draw with several processes and write each figure when it is there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(error, folder) from error
+    written: dict[str, list[Path]] = {}
+    errors: list[BaseException] = []
+    with reporter.progress("figures", len(jobs), "figure") as advance:
+
+        def on_result(job: PaperFigure, outcome: Outcome) -> None:
+            advance()
+            if outcome.error is not None:
+                errors.append(outcome.error)
+                return
+            written[job.exhibit.name] = [folder / name for name in outcome.value]
+            for name, content in outcome.value.items():
+                write_atomic(folder / name, content)
+
+        executor = drawing_executor(workers, len(jobs))
+        executor.map(draw_paper_figure, jobs, on_result)
+    if errors:
+        raise errors[0]
+    return [path for job in jobs for path in written[job.exhibit.name]]
+
+
+def warn_if_old(target: Target, stages: Sequence[str], words: str) -> None:
+    """Warn where results of these stages are not those of the present settings and input."""
+    for state in run_status(target):
+        if state.stage in stages and state.state != "complete":
+            Reporter("off").warning(f"{state.stage}: {state.words()}; {words}")

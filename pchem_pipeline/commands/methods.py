@@ -1,0 +1,59 @@
+"""``pchem methods``: compare, refresh the report where there is one, and read the result again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pchem_pipeline.base.errors import StoreError, quoted
+from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
+from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.session import Command, Target
+
+__all__ = ["compare_methods"]
+
+
+def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) -> str:
+    """Run the stage, refresh the report where there is one, and return the table in words.
+
+    Args:
+        target: the run.
+        command: from the command line.
+        given: settings of the section ``methods`` from the command line; paths refer to the present folder.
+
+    Raises:
+        PchEmError: the comparison cannot be made.
+    """
+    from pchem_pipeline.run.other_runs import open_other_runs
+    from pchem_pipeline.run.session import run_stages, run_status
+
+    values = dict(given)
+    if "with_runs" in values:
+        values["with_runs"] = tuple(str(Path(path).resolve()) for path in values["with_runs"])
+    if values:
+        target = target.changed("methods", **values)
+    if not (target.store / "zarr.json").exists():
+        raise StoreError(
+            f"{target.store} does not exist; run: pchem run {quoted(target.config_path or target.store)}"
+        )
+    store = RunStore.open(target.store)
+    # before anything of an earlier comparison is given up
+    if store.has("histogram/counts"):
+        open_other_runs(store, target.base_dir, target.config.methods.with_runs)
+    run_stages(target, ["methods"], command)
+    if command.options.dry_run:
+        return ""
+    reported = {state.stage: state.state for state in run_status(target)}["report"] != "missing"
+    if reported:
+        run_stages(target, ["report"], replace(command, options=replace(command.options, force=False)))
+    result = read_methods(RunStore.open(target.store))
+    if result is None:
+        return ""
+    from pchem_pipeline.report.pages.method_words import methods_text
+
+    files = [target.store / METHODS_FILE, *([target.store / "report.html"] if reported else [])]
+    return "\n".join([methods_text(result), "", *map(str, files)])

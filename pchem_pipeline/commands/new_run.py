@@ -1,0 +1,109 @@
+"""How a run begins: from a template, or straight from camera files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.config.load import dump_config, make_config, parse_config
+from pchem_pipeline.config.template import commented_config
+from pchem_pipeline.run.runner import STAGES
+from pchem_pipeline.run.session import Target, find_run
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.remote_path import RemotePath, place_of
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["find_or_start", "write_template"]
+
+_YAML = (".yaml", ".yml")
+
+
+def write_template(path: Path, files: Sequence[str], *, simulated: bool, force: bool) -> None:
+    """Write the commented YAML of a new run.
+
+    Raises:
+        ConfigError: the file exists, and ``force`` is not given.
+    """
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists; choose another name, or replace it with --force")
+    given = list(files) or ([] if simulated else ["frames/*.tif"])
+    text = commented_config(path.name, files=given, simulated=simulated)
+    parse_config(text, str(path))
+    write_atomic(path, text.encode())
+
+
+def find_or_start(
+    targets: Sequence[Path],
+    store: Path | None,
+    given: Mapping[str, Any],
+    roi: tuple[int, int, int, int] | None = None,
+    *,
+    write: bool = True,
+) -> tuple[Target, bool]:
+    """Return the run that ``targets`` name, and whether it was made from camera files.
+
+    One YAML file or one store is an existing run. Anything else is camera files: a YAML with the
+    settings in ``given`` and the region ``roi`` is written beside the store (unless
+    ``write`` is off), and used.
+
+    Raises:
+        ConfigError: options do not fit the target, or the YAML exists with other settings.
+    """
+    first = place_of(targets[0])
+    if len(targets) == 1 and (first.suffix.lower() in _YAML or (first / ".pchem").is_dir()):
+        if store is not None or given:
+            names = [*(["store"] if store is not None else []), *given]
+            options = ", ".join("--" + name.replace("_", "-") for name in names)
+            raise ConfigError(
+                f"{options}: only for camera files; {first} has its own settings, change them there"
+            )
+        return find_run(first), False
+    missing = [path for path in targets if not path.exists() and not set("*?[") & set(str(path))]
+    if missing:
+        raise ConfigError(
+            f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
+        )
+    place = place_of(store or Path("run.zarr")).resolve()
+    remote = isinstance(place, RemotePath)  # there the YAML would be out of reach: it is written here
+    path = Path(place.with_suffix(".yaml").name).resolve() if remote else place.with_suffix(".yaml")
+    config = make_config(
+        {
+            "run": {"store": str(place) if remote else place.name},
+            "input": {"files": _file_list(targets, path.parent), "roi": roi, **given},
+        },
+        "the command line",
+    )
+    text = dump_config(config)
+    if path.exists() and path.read_text(encoding="utf-8") != text and not _came_to_nothing(place, path):
+        raise ConfigError(
+            f"{path} exists with other settings; use them with: pchem run {quoted(path)}, "
+            "or choose another --store"
+        )
+    if write:
+        write_atomic(path, text.encode())
+    return Target(config, path.parent, place, path), True
+
+
+def _came_to_nothing(place: Path, path: Path) -> bool:
+    """Tell whether a run was tried, finished no stage, and nobody edited its YAML since."""
+    if not (place / ".pchem").is_dir():
+        return False
+    store = RunStore.open(place)
+    records = [store.records.read(name) for name in STAGES]
+    untouched = store.config_text() == path.read_text(encoding="utf-8")
+    return untouched and not any(record is not None and record.finished for record in records)
+
+
+def _file_list(targets: Sequence[Path], base_dir: Path) -> list[str]:
+    """Return the files relative to ``base_dir``; a whole folder that the shell spelled out as one glob."""
+    files = [Path(os.path.relpath(path, base_dir)) for path in targets]
+    folders, suffixes = {path.parent for path in files}, {path.suffix for path in files}
+    if len(files) > 8 and len(folders) == 1 and len(suffixes) == 1:
+        pattern = f"*{suffixes.pop()}"
+        folder = folders.pop()
+        if len(list((base_dir / folder).glob(pattern))) == len(files):
+            return [str(folder / pattern)]
+    return [str(path) for path in files]

@@ -1,0 +1,308 @@
+"""A finished run for notebooks: its arrays as xarray datasets, its pixels, and the figures of its report.
+
+>>> from pchem_pipeline import open_run
+>>> run = open_run("run.zarr")                      # doctest: +SKIP
+>>> run.maps.read_noise_e.where(run.good).median()  # doctest: +SKIP
+>>> run.pixel(3, 5).plot()                          # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, quoted
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.commands.figures import gather_run
+from pchem_pipeline.commands.notebook_plots import Plots, width_of
+from pchem_pipeline.model.law.pcd import pcd
+from pchem_pipeline.model.maps.maps import CAUTION, GOOD
+from pchem_pipeline.report.data import PixelFit, ReportData
+from pchem_pipeline.report.figures.pixel_figures import cluster_edges, has_fit, pixel_fits
+from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.report.style.wording import measured, symbol
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.session import Target, find_run, run_status
+from pchem_pipeline.stages.report.report import read_pixels
+from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.report.style.style import Figure
+
+__all__ = ["Pixel", "Run", "open_run"]
+
+
+def open_run(path: str | os.PathLike[str]) -> Run:
+    """Open a run for reading.
+
+    Args:
+        path: its store, or the YAML file that made it.
+
+    Raises:
+        MissingDependencyError: xarray is not installed.
+        ConfigError: the path is neither a YAML file nor a store.
+        StoreError: there is no run, or it is damaged.
+    """
+    try:
+        import xarray as _  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            'open_run needs another library: pip install "pchem-pipeline[notebook]"'
+        ) from error
+    return Run(find_run(Path(path)))
+
+
+class Run:
+    """A run on disk, read only; arrays are read when they are used. Made by :func:`open_run`.
+
+    Attributes:
+        path: its store.
+        config: its configuration.
+        shape: rows and columns of the sensor (for ready-made histograms: one row of channels).
+        n_frames: frames of each pixel.
+        plot: the figures of the report; ``run.plot.maps()``, ``run.plot.ensemble()``, ...
+    """
+
+    def __init__(self, target: Target) -> None:
+        self._target = target
+        self._store = RunStore.open(target.store)
+        self._sensor = SensorInfo.read(self._store)
+        self._groups: dict[str, xr.Dataset] = {}
+        self.path: Path = target.store
+        self.config: RunConfig = target.config
+        self.shape: tuple[int, int] = self._sensor.shape
+        self.n_frames: int = self._sensor.n_frames
+        self.plot = Plots(lambda: self._data, target.config.report)
+
+    def __repr__(self) -> str:
+        states = ", ".join(f"{state.stage} {state.state}" for state in run_status(self._target))
+        return f"<Run {self.path.name}: {self._size()}; {states}>"
+
+    def _size(self) -> str:
+        ny, nx = self.shape
+        if self._sensor.kind == "histograms":
+            return f"{nx} channels of up to {self.n_frames:,} samples"
+        return f"{ny} x {nx} pixels, {self.n_frames:,} frames"
+
+    def status(self) -> dict[str, str]:
+        """Return how far each stage is, as ``pchem status`` says it."""
+        return {state.stage: state.words() for state in run_status(self._target)}
+
+    # -- arrays -------------------------------------------------------------------------------
+
+    def group(self, name: str) -> xr.Dataset:
+        """Return a group of the store as a dataset, lazily, with units and sentences as attributes.
+
+        Arrays over the sensor have coordinates ``y`` and ``x`` (pixel), those over DN or electrons theirs.
+
+        Args:
+            name: such as ``"maps"``; see the table of the store in the README.
+
+        Raises:
+            StoreError: the run does not have it.
+        """
+        if name not in self._groups:
+            self._groups[name] = self._opened(name)
+        return self._groups[name]
+
+    def _opened(self, name: str) -> xr.Dataset:
+        import xarray as xr
+
+        if not self._store.has(name):
+            raise StoreError(
+                f"{self.path} has no {name} yet; see what is missing with: pchem status {quoted(self.path)}"
+            )
+        found: xr.Dataset = xr.open_zarr(str(self.path), group=name, consolidated=False, chunks=None)
+        for axis, length in zip(("y", "x"), self.shape, strict=True):
+            if found.sizes.get(axis) == length:
+                found = found.assign_coords({axis: (axis, np.arange(length), {"units": "pixel"})})
+        return found.set_coords([each for each in found.data_vars if found[each].dims == (each,)])
+
+    @property
+    def maps(self) -> xr.Dataset:
+        """The maps with their standard errors; ``quality`` and ``fit_status`` are coordinates.
+
+        What the store keeps with them beside the arrays is in ``run.group("maps").attrs``.
+        """
+        found = self.group("maps").copy(deep=False)
+        found.attrs = {}
+        if self._store.has("fit/fit_status"):
+            found = found.assign_coords(fit_status=self.group("fit").fit_status)
+        return found.set_coords("quality")
+
+    @property
+    def good(self) -> xr.DataArray:
+        """Mask of the pixels with a good fit; ``run.maps.where(run.good)`` leaves the others out."""
+        return self._mask(GOOD)
+
+    @property
+    def usable(self) -> xr.DataArray:
+        """Mask of the pixels with a value, those to be used with caution included."""
+        return self._mask(CAUTION)
+
+    def _mask(self, worst: int) -> xr.DataArray:
+        mask: xr.DataArray = self.group("maps").quality <= worst
+        mask.attrs = {"long_name": "pixels with a good fit" if worst == GOOD else "pixels with a value"}
+        return mask
+
+    @property
+    def fit(self) -> xr.Dataset:
+        """What the fit found for each pixel."""
+        return self.group("fit")
+
+    @property
+    def histogram(self) -> xr.Dataset:
+        """Counts of every pixel: ``counts`` (y, x, bin), the DN of bin 0 is ``origin``."""
+        return self.group("histogram")
+
+    @property
+    def summary(self) -> xr.Dataset:
+        """Sums in time and space."""
+        return self.group("summary")
+
+    @property
+    def ensemble(self) -> xr.Dataset:
+        """Ensemble histograms and predictions; coordinates ``dn``, ``electrons`` and ``k``."""
+        return self.group("ensemble")
+
+    @property
+    def truth(self) -> xr.Dataset:
+        """The true parameters of a simulated camera."""
+        return self.group("truth")
+
+    # -- pixels -------------------------------------------------------------------------------
+
+    def pixel(self, y: int, x: int) -> Pixel:
+        """Return one pixel with its histogram and its fit.
+
+        Args:
+            y: row, from 0.
+            x: column, from 0; for ready-made histograms the channel.
+
+        Raises:
+            ConfigError: the sensor has no such pixel.
+            StoreError: the run has no maps yet.
+        """
+        return self.pixels([(y, x)])[0]
+
+    def pixels(self, places: Sequence[tuple[int, int]]) -> list[Pixel]:
+        """Return several pixels, each given as (y, x); see :meth:`pixel`."""
+        ny, nx = self.shape
+        for y, x in places:
+            if not (0 <= y < ny and 0 <= x < nx):
+                raise ConfigError(f"pixel y = {y}, x = {x} lies outside the sensor of {ny} x {nx} pixels")
+        maps = self._arrays(
+            "maps", [f"{n}{end}" for n in (*PARAMETERS, "read_noise_e") for end in ("", "_stderr")]
+        )
+        fit = self._arrays("fit", ["fit_status", "goodness_p"])
+        chosen = [("", int(y), int(x)) for y, x in places]
+        return [Pixel(each) for each in read_pixels(self._store, chosen, self._sensor, maps, fit)]
+
+    def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
+        """Return arrays of the store that read the pixels asked for alone."""
+        return {name: self._store.array(f"{group}/{name}") for name in names}
+
+    @cached_property
+    def _data(self) -> ReportData:
+        return gather_run(self._target)
+
+
+@dataclass(frozen=True, repr=False)
+class Pixel:
+    """One pixel: its histogram, its parameters with standard errors, and what is drawn of it.
+
+    Attributes:
+        found: what the report knows of it.
+    """
+
+    found: PixelFit
+
+    def __repr__(self) -> str:
+        words = []
+        for name, value in self.parameters.items():
+            words.append(f"{name} = {measured(value, self.stderr.get(name, float('nan')), symbol(name)[2])}")
+        return f"<Pixel y = {self.y}, x = {self.x}: {', '.join(words)}; {self.status or 'good fit'}>"
+
+    @property
+    def y(self) -> int:
+        """Row."""
+        return self.found.y
+
+    @property
+    def x(self) -> int:
+        """Column."""
+        return self.found.x
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """The parameters by name, in the units of the store; NaN where the fit failed."""
+        return self.found.parameters
+
+    @property
+    def stderr(self) -> Mapping[str, float]:
+        """Their standard errors."""
+        return self.found.stderr
+
+    @property
+    def status(self) -> str:
+        """Words of ``fit_status``; empty for a good fit."""
+        return self.found.status
+
+    @property
+    def goodness_p(self) -> float:
+        """Probability of a larger chi-square if the model holds."""
+        return self.found.goodness_p
+
+    @cached_property
+    def histogram(self) -> xr.DataArray:
+        """Number of frames at each DN, over the DN that occur."""
+        return self._over_dn(self.found.counts, "frames at each DN")
+
+    @cached_property
+    def expected(self) -> xr.DataArray:
+        """Number of frames expected at each DN from the fit; NaN where there is none."""
+        values = np.full(self.found.counts.size, np.nan)
+        if has_fit(self.parameters):
+            theta = (self.parameters[name] for name in PARAMETERS)
+            dn = self.found.origin + np.arange(self.found.counts.size, dtype=np.float64)
+            density = pcd(dn, *theta) if self.found.mass is None else self.found.mass
+            values = self.found.counts.sum() * density
+        return self._over_dn(values, "frames expected at each DN")
+
+    def _over_dn(self, values: NDArray[Any], words: str) -> xr.DataArray:
+        import xarray as xr
+
+        dn = self.found.origin + np.arange(values.size)
+        seen = np.flatnonzero(self.found.counts)
+        part = slice(seen[0], seen[-1] + 1) if seen.size else slice(0)
+        return xr.DataArray(
+            values[part],
+            dims="dn",
+            coords={"dn": ("dn", dn[part], {"units": "DN"})},
+            attrs={"units": "1", "long_name": words},
+        )
+
+    def plot(self, width: float | str = COLUMN_MM) -> Figure:
+        """Draw the histogram with its fit and the residuals, as the report does.
+
+        Args:
+            width: of the figure, mm, or a text such as ``"3.5in"``.
+        """
+        return pixel_fits([self.found], width_mm=width_of(width))
+
+    def plot_cells(self, width: float | str = COLUMN_MM) -> Figure:
+        """Draw the density with the edges between electron numbers, as the report does."""
+        found = self.found
+        return cluster_edges(
+            found.parameters, counts=found.counts, origin=found.origin, width_mm=width_of(width)
+        )

@@ -1,0 +1,174 @@
+"""The figures of a run for notebooks: the drawings of the report, one or several at a time."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.commands.figures import exhibits_of, millimetres
+from pchem_pipeline.report.figures.map_figures import map_and_histogram
+from pchem_pipeline.report.figures.paper import FORMATS
+from pchem_pipeline.report.style.style import COLUMN_MM, figure_bytes
+from pchem_pipeline.store.files import write_atomic
+
+if TYPE_CHECKING:
+    from pchem_pipeline.report.data import ReportData
+    from pchem_pipeline.report.settings import ReportSettings
+    from pchem_pipeline.report.style.style import Figure
+
+__all__ = ["Figures", "Plots", "width_of"]
+
+#: The maps that ``Plots.maps`` draws where none is named.
+_MAPS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+
+
+def width_of(width: float | str) -> float:
+    """Return a width in mm, given as a number of mm or as a text such as ``"3.5in"``.
+
+    Raises:
+        ConfigError: no figure can be so wide.
+    """
+    return millimetres(width if isinstance(width, str) else f"{width:f}".rstrip("0"))
+
+
+class Figures(Mapping[str, "Figure"]):
+    """Several figures by name; a notebook shows them one after the other."""
+
+    def __init__(self, figures: Mapping[str, Figure]) -> None:
+        self._figures = dict(figures)
+
+    def __getitem__(self, name: str) -> Figure:
+        return self._figures[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._figures)
+
+    def __len__(self) -> int:
+        return len(self._figures)
+
+    def __repr__(self) -> str:
+        return f"<Figures {', '.join(self._figures)}>"
+
+    def _repr_html_(self) -> str:
+        """Return the figures as a notebook shows them."""
+        return "".join(
+            f'<img alt="{name}" style="display: inline-block; background: white" src="data:image/png;base64,'
+            f'{base64.b64encode(figure_bytes(figure, "png", dpi=110)).decode("ascii")}">'
+            for name, figure in self._figures.items()
+        )
+
+    def save(self, folder: str | Path, formats: tuple[str, ...] = ("pdf",), *, dpi: int = 300) -> list[Path]:
+        """Write each figure to a folder, fonts embedded.
+
+        Args:
+            folder: made if needed.
+            formats: pdf, svg, png.
+            dpi: resolution of PNG and of maps, dots per inch.
+
+        Returns:
+            The files written.
+
+        Raises:
+            ConfigError: an unknown format.
+            StoreError: the folder cannot be written.
+        """
+        unknown = [kind for kind in formats if kind not in FORMATS]
+        if unknown:
+            raise ConfigError(f"{unknown[0]} cannot be drawn; choose from {', '.join(FORMATS)}")
+        written = []
+        for name, figure in self._figures.items():
+            for kind in formats:
+                written.append(Path(folder) / f"{name}.{kind}")
+                write_atomic(written[-1], figure_bytes(figure, kind, dpi=dpi, title=name))
+        return written
+
+
+class Plots:
+    """Draws the figures of a run, with the code that draws the report. Found as ``run.plot``."""
+
+    def __init__(self, data: Callable[[], ReportData], settings: ReportSettings) -> None:
+        self._data = data
+        self._settings = settings
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all figures of the run, for :meth:`figure`."""
+        return tuple(exhibit.name for exhibit in exhibits_of(self._data(), self._settings))
+
+    def figure(self, name: str, width: float | str | None = None) -> Figure:
+        """Draw a figure of the report or of the discrepancy page.
+
+        Args:
+            name: one of :attr:`names`.
+            width: mm, or a text such as ``"3.5in"``; None: the figure's own.
+
+        Raises:
+            ConfigError: the run has no such figure.
+        """
+        found = {exhibit.name: exhibit for exhibit in exhibits_of(self._data(), self._settings)}
+        if name not in found:
+            raise ConfigError(f"this run has no figure {name}; it has {', '.join(found)}")
+        exhibit = found[name]
+        return exhibit.draw(exhibit.width_mm if width is None else width_of(width))
+
+    def map(
+        self, name: str, width: float | str = COLUMN_MM, *, stretch: Literal["beta", "linear"] | None = None
+    ) -> Figure:
+        """Draw a map below its histogram.
+
+        Args:
+            name: of a map, such as ``"bias"``.
+            width: mm, or a text such as ``"3.5in"``.
+            stretch: colours by rank (``beta``) or by value (``linear``); None: as in the report.
+
+        Raises:
+            StoreError: the run has no such map.
+        """
+        maps = self._data().maps
+        if name not in maps or name.endswith("_stderr"):
+            known = ", ".join(each for each in maps if not each.endswith("_stderr"))
+            raise StoreError(f"this run has no map {name}; it has {known}")
+        return map_and_histogram(
+            maps[name],
+            name,
+            stderr=maps.get(f"{name}_stderr"),
+            stretch=stretch or self._settings.map_stretch,
+            bins=self._settings.histogram_bins,
+            width_mm=width_of(width),
+        )
+
+    def maps(self, *names: str, width: float | str = COLUMN_MM) -> Figures:
+        """Draw several maps; without names the four parameters."""
+        return Figures({name: self.map(name, width) for name in names or _MAPS})
+
+    def pixels(self, width: float | str | None = None) -> Figure:
+        """Draw the histograms of the pixels of the report with their fits."""
+        return self.figure("pixel_fits", width)
+
+    def read_noise(self, width: float | str | None = None) -> Figure:
+        """Draw the histogram of the read noise."""
+        return self.figure("read_noise_histogram", width)
+
+    def ensemble(self, width: float | str | None = None) -> Figure:
+        """Draw the ensemble histograms with their predictions."""
+        return self.figure("ensemble", width)
+
+    def electrons(self, width: float | str | None = None) -> Figure:
+        """Draw the estimated electron numbers against the prediction."""
+        return self.figure("electron_numbers", width)
+
+    def components(self, width: float | str | None = None) -> Figure:
+        """Draw the widths of the components of the ensemble."""
+        return self.figure("component_widths", width)
+
+    def status(self, width: float | str | None = None) -> Figure:
+        """Draw where fits failed or deserve caution."""
+        return self.figure("fit_status", width)
+
+    def discrepancy(self) -> Figures:
+        """Draw the figures of the discrepancy verdict; none where nobody looked for one."""
+        chosen = [name for name in self.names if name.startswith("discrepancy_")]
+        return Figures({name: self.figure(name) for name in chosen})

@@ -1,0 +1,362 @@
+"""``pchem plan``: the frames for a target, at once from the Cramer-Rao bound, and by simulation if asked."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.planning.frames import contour_data
+from pchem_pipeline.planning.plan import LEAST_SHARE, Plan, SamplesPlan, plan_one_sample, plan_samples
+from pchem_pipeline.planning.point import Point
+from pchem_pipeline.planning.targets import Target, parse_target
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.planning.verify import Verification
+
+__all__ = ["PlanRequest", "make_plan"]
+
+_DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
+_ROUNDS = 4
+_LARGEST_STEP = 3.0  # wrong maxima make errors that more frames end at once
+_FIGURES = (".svg", ".png", ".pdf")
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """What the command line asked for; None where nothing was said.
+
+    Attributes:
+        run: a run whose median pixel is planned for where numbers are not given.
+        read_noise_e: s_e, e-, quantisation included.
+        quanta_exposure: H, e-.
+        conversion_gain: g, e-/DN.
+        targets: as ``name=value``.
+        frames: frames there are.
+        samples: exposures separated by commas, or ``best``.
+        max_exposure: largest exposure to choose, e-.
+        max_frames: more are as good as never.
+        verify: simulate the plan.
+        pixels: simulated pixels.
+        seed: of the simulation.
+        figure: file for the contours.
+        json: file for the numbers.
+    """
+
+    run: Path | None = None
+    read_noise_e: float | None = None
+    quanta_exposure: float | None = None
+    conversion_gain: float | None = None
+    targets: tuple[str, ...] = ()
+    frames: int | None = None
+    samples: str | None = None
+    max_exposure: float = 10.0
+    max_frames: float = 1e7
+    verify: bool = False
+    pixels: int = 1000
+    seed: int = 1
+    figure: Path | None = None
+    json: Path | None = None
+
+
+def make_plan(request: PlanRequest) -> str:
+    """Return the plan in words; write its figure and its JSON where asked.
+
+    Args:
+        request: from the command line.
+
+    Raises:
+        ConfigError: a number is missing or wrong, or no number of frames reaches a target.
+        StoreError: the run has no maps, or a file cannot be written.
+    """
+    known = _median_pixel(request.run) if request.run is not None else {}
+    noise = known.get("read_noise_e") if request.read_noise_e is None else request.read_noise_e
+    if noise is None:
+        raise ConfigError(
+            "--read-noise is missing: give it in e-, quantisation included, or a run that has it"
+        )
+    if not request.targets and request.frames is None:
+        raise ConfigError(
+            "--target is missing: say what to reach, such as conversion_gain=1%, or give --frames"
+        )
+    if request.figure is not None and request.figure.suffix not in _FIGURES:
+        raise ConfigError(f"--figure {request.figure}: cannot be drawn; end it in {', '.join(_FIGURES)}")
+    exposure = known.get("quanta_exposure") if request.quanta_exposure is None else request.quanta_exposure
+    gain = known.get("conversion_gain", _DEFAULT_GAIN)
+    if request.conversion_gain is not None:
+        gain = request.conversion_gain
+    point = Point(1.0 if exposure is None else exposure, noise, gain)
+    targets = [parse_target(text) for text in request.targets]
+    lines, content = (
+        _one(request, targets, point, exposure is not None)
+        if request.samples is None
+        else (_several(request, targets, point))
+    )
+    if request.figure is not None:
+        _draw(request.figure, targets or [Target("conversion_gain", 1.0, "%")], content, gain)
+        lines += ["", str(request.figure)]
+    if request.json is not None:
+        write_atomic(request.json, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+        lines += [str(request.json)]
+    return "\n".join(lines)
+
+
+def _median_pixel(run: Path) -> dict[str, float]:
+    """Return the medians of a run's maps."""
+    from pchem_pipeline.run.session import find_run
+
+    store = RunStore.open(find_run(run).store)
+    summary = store.attributes("maps").get("summary")
+    if summary is None:
+        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+    names = ("read_noise_e", "quanta_exposure", "conversion_gain")
+    found = {name: summary[name]["median"] for name in names}
+    if None in found.values():
+        raise StoreError(f"{store.path}: no pixel has a value; give --read-noise and --exposure")
+    return {name: float(value) for name, value in found.items()}
+
+
+def _one(
+    request: PlanRequest, targets: Sequence[Target], point: Point, exposure_given: bool
+) -> tuple[list[str], dict[str, Any]]:
+    """Plan one sample."""
+    plan = plan_one_sample(
+        targets,
+        point,
+        exposure_given=exposure_given,
+        budget=request.frames,
+        max_exposure=request.max_exposure,
+        max_frames=request.max_frames,
+    )
+    content = _plan_json(plan)
+    lines = _plan_lines(plan, request, exposure_given)
+    if request.verify:
+        from pchem_pipeline.planning.verify import verify
+
+        wanted = targets or [Target("conversion_gain", 1.0, "%")]
+        checks = _verified(
+            request, plan.frames, lambda n, seed: verify(wanted, plan.point, n, request.pixels, seed)
+        )
+        lines += ["", *(_check_line(check) for check in checks)]
+        content["verified"] = [_verification_json(check) for check in checks]
+    return lines, content
+
+
+def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[str]:
+    point = plan.point
+    at = f"exposure {point.quanta_exposure:.3g} e-{'' if exposure_given else ' (the best)'}"
+    lines = [
+        f"one sample, read noise {point.read_noise_e:.4g} e-, {at}, {point.conversion_gain:.3g} e-/DN",
+        "",
+    ]
+    for need in plan.needs:
+        words = f"{need.target!s:<34}{need.bound:>14,.0f} frames"
+        if need.seen > max(need.bound, need.certain):
+            words += f"; {need.seen:,.0f} until no other gain is as likely by chance"
+        elif need.certain > need.bound:
+            words += f"; {need.certain:,.0f} until electron numbers are not off by one"
+        lines.append(words)
+    if plan.needs and request.frames is not None:
+        enough = max(need.frames for need in plan.needs) <= request.frames
+        lines.append(f"{request.frames:,} frames are {'enough' if enough else 'too few'}")
+    lines += ["", f"with {plan.frames:,.0f} frames, one standard deviation of a pixel (Cramer-Rao bound):"]
+    for name, value in plan.precision.items():
+        unit, size = ("e-", value) if name == "bias" else ("%", 100 * value)
+        lines.append(f"  {name:<20}{size:>10.3g} {unit}")
+    if exposure_given and np.isfinite(plan.best_exposure):
+        limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
+        lines += ["", f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"]
+    return lines
+
+
+def _plan_json(plan: Plan) -> dict[str, Any]:
+    return {
+        "samples": 1,
+        "read_noise_e": plan.point.read_noise_e,
+        "quanta_exposure": plan.point.quanta_exposure,
+        "conversion_gain": plan.point.conversion_gain,
+        "frames": plan.frames,
+        "targets": [
+            {
+                "target": str(need.target),
+                "frames_bound": need.bound,
+                "frames_certain": need.certain,
+                "frames_seen": need.seen,
+                "rounding_shift": need.shift,
+            }
+            for need in plan.needs
+        ],
+        "precision": plan.precision,
+        "best_exposure": _finite(plan.best_exposure),
+        "best_frames": _finite(plan.best_frames),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _verified(
+    request: PlanRequest, frames: float, simulate: Callable[[int, int], Verification]
+) -> list[Verification]:
+    """Simulate; where the real fit falls short of the bound, again with the frames that it asks for.
+
+    Args:
+        request: from the command line.
+        frames: to begin with.
+        simulate: takes a number of frames and a seed.
+    """
+    number, found = int(frames), []
+    for round_ in range(_ROUNDS):
+        result = simulate(number, request.seed + round_)
+        found.append(result)
+        short = max((check.rmse / check.wanted) ** 2 for check in result.checks)
+        reached = all(check.reached for check in result.checks)
+        if (
+            reached
+            or request.frames is not None
+            or not np.isfinite(short)
+            or number * short > request.max_frames
+        ):
+            break
+        number = int(np.ceil(number * min(short, _LARGEST_STEP)))
+    return found
+
+
+def _check_line(result: Verification) -> str:
+    parts = []
+    for check in result.checks:
+        unit, scale = ("e-", 1.0) if check.target.name == "bias" else ("%", 100.0)
+        parts.append(
+            f"{check.target.name} {scale * check.rmse:.3g} +- {scale * check.rmse_stderr:.1g} {unit}, "
+            f"{'reached' if check.reached else 'not reached'}"
+        )
+    caution = f", {result.n_ambiguous} ambiguous in the bias" if result.n_ambiguous else ""
+    return (
+        f"simulated, {result.n_frames:,} frames, {result.n_pixels:,} pixels fitted "
+        f"({result.n_failed} without a value{caution}): rms error of {'; '.join(parts)}"
+    )
+
+
+def _verification_json(result: Verification) -> dict[str, Any]:
+    return {
+        "frames": result.n_frames,
+        "pixels": result.n_pixels,
+        "failed": result.n_failed,
+        "ambiguous": result.n_ambiguous,
+        "checks": [
+            {
+                "target": str(check.target),
+                "wanted": check.wanted,
+                "rmse": _finite(check.rmse),
+                "rmse_stderr": _finite(check.rmse_stderr),
+                "robust_sd": _finite(check.robust_sd),
+                "reached": bool(check.reached),
+            }
+            for check in result.checks
+        ],
+    }
+
+
+def _several(
+    request: PlanRequest, targets: Sequence[Target], point: Point
+) -> tuple[list[str], dict[str, Any]]:
+    """Plan several samples."""
+    if not targets:
+        raise ConfigError("--target is missing: say what the samples shall reach, such as conversion_gain=1%")
+    plan = plan_samples(
+        targets,
+        _exposures(str(request.samples)),
+        point,
+        budget=request.frames,
+        max_exposure=request.max_exposure,
+        max_frames=request.max_frames,
+    )
+    lines, content = _split_lines(plan, targets), _split_json(plan, targets)
+    if request.verify:
+        checks = _verified(request, plan.frames, functools.partial(_verify_split, request, targets, plan))
+        lines += [*([""] if lines[-1] else []), *(_check_line(check) for check in checks)]
+        content["verified"] = [_verification_json(check) for check in checks]
+    return lines, content
+
+
+def _verify_split(
+    request: PlanRequest, targets: Sequence[Target], plan: SamplesPlan, frames: int, seed: int
+) -> Verification:
+    from pchem_pipeline.planning.verify import verify_samples
+
+    used = [(h, p) for h, p in zip(plan.split.exposures, plan.split.shares, strict=True) if p > LEAST_SHARE]
+    total = sum(p for _, p in used)
+    per_sample = [max(int(np.ceil(frames * p / total)), 2) for _, p in used]
+    return verify_samples(targets, plan.point, [h for h, _ in used], per_sample, request.pixels, seed)
+
+
+def _exposures(text: str) -> list[float] | None:
+    if text.strip() == "best":
+        return None
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) < 2:
+        raise ConfigError(
+            f"--samples {text}: give two or more exposures in e-, such as 0,2,8, or the word best"
+        )
+    return found
+
+
+def _split_lines(plan: SamplesPlan, targets: Sequence[Target]) -> list[str]:
+    point = plan.point
+    lines = [
+        f"{len(plan.split.exposures)} samples, read noise {point.read_noise_e:.4g} e-, "
+        f"{' and '.join(map(str, targets))}: {plan.frames:,.0f} frames in total",
+        "",
+        f"{'exposure, e-':>14}{'share':>10}{'frames':>14}",
+    ]
+    for exposure, share, frames in zip(plan.split.exposures, plan.split.shares, plan.per_sample, strict=True):
+        lines.append(f"{exposure:>14.3g}{100 * share:>8.1f} %{frames:>14,}")
+    lines.append("")
+    if plan.certain > plan.split.frames:
+        lines.append(
+            f"the bound asks for {plan.split.frames:,.0f}; more are needed until electron numbers are certain"
+        )
+    if len(plan.split.exposures) > 1 and np.isfinite(plan.even):
+        lines.append(
+            f"evenly divided, the bound asks for {plan.even:,.0f} frames instead of {plan.split.frames:,.0f}"
+        )
+    return lines
+
+
+def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
+    return {
+        "samples": len(plan.split.exposures),
+        "read_noise_e": plan.point.read_noise_e,
+        "quanta_exposure": list(plan.split.exposures),
+        "conversion_gain": plan.point.conversion_gain,
+        "shares": list(plan.split.shares),
+        "frames": plan.frames,
+        "frames_per_sample": list(plan.per_sample),
+        "frames_bound": _finite(plan.split.frames),
+        "frames_evenly": _finite(plan.even),
+        "frames_certain": plan.certain,
+        "targets": [{"target": str(target)} for target in targets],
+    }
+
+
+def _draw(path: Path, targets: Sequence[Target], content: dict[str, Any], gain: float) -> None:
+    from pchem_pipeline.report.figures.plan_figures import frames_contours
+    from pchem_pipeline.report.style.style import figure_bytes
+
+    mark = None
+    if content["samples"] == 1:
+        mark = (content["quanta_exposure"], content["read_noise_e"])
+    figure = frames_contours(contour_data(targets, gain), mark)
+    write_atomic(path, figure_bytes(figure, path.suffix[1:], title="Frames needed"))

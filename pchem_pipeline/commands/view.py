@@ -1,0 +1,268 @@
+"""``pchem view``: the report of one run in the browser, with every pixel, from a server on this computer.
+
+The server listens on 127.0.0.1, reads one run and writes nothing. It answers GET and HEAD for a fixed list
+of paths, to requests that name this computer as their host, so that neither another computer nor a page of
+another site can read the run through the user's browser.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, ClassVar
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
+from pchem_pipeline.report.inspector.inspector import served_page
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.session import find_run
+from pchem_pipeline.stages.report.inspected_pixels import ChosenPixels
+from pchem_pipeline.stages.report.inspector import Listed, listed_maps, packed_map, read_sample
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["Answer", "RunView", "make_server", "serve"]
+
+ADDRESS = "127.0.0.1"
+_FILES = {
+    "/report.json": "application/json",
+    "/discrepancy.json": "application/json",
+    "/discrepancy.html": "text/html; charset=utf-8",
+}
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+_NUMBER = re.compile(r"[0-9]{1,9}")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the server answers to a request."""
+
+    status: HTTPStatus
+    content: bytes
+    kind: str = "text/plain; charset=utf-8"
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+class RunView:
+    """Answers requests about one run; reads only."""
+
+    def __init__(self, store: RunStore) -> None:
+        self.store = store
+
+    @cached_property
+    def _shape(self) -> tuple[int, int]:
+        return SensorInfo.read(self.store).shape
+
+    @cached_property
+    def _maps(self) -> dict[str, Listed]:
+        return {each.variable.path: each for each in listed_maps(self.store, self._shape)}
+
+    def check(self) -> None:
+        """Make sure that there is something to show.
+
+        Raises:
+            StoreError: the run has no report, or one without an inspector.
+        """
+        page = self.store.path / "report.html"
+        cure = f"run: pchem report {quoted(self.store.path)}"
+        if not page.is_file():
+            raise StoreError(f"{self.store.path} has no report yet; {cure}")
+        if served_page(page.read_text(encoding="utf-8")) is None:
+            raise StoreError(f"{page} is of an earlier version and has no inspector; {cure}")
+
+    def answer(self, method: str, target: str, headers: Mapping[str, str], port: int) -> Answer:
+        """Answer one request.
+
+        Args:
+            method: of HTTP.
+            target: path and query, as sent.
+            headers: by lower-case name.
+            port: on which the server listens.
+        """
+        refusal = _refusal(method, target, headers, port)
+        if refusal is not None:
+            return refusal
+        url = urlsplit(target)
+        try:
+            if url.path in ("/", "/report.html"):
+                return self._page()
+            if url.path in _FILES:
+                return self._file(url.path)
+            if url.path == "/api/pixel":
+                return self._pixel(parse_qs(url.query))
+            if url.path == "/api/map":
+                return self._map(parse_qs(url.query))
+        except PchEmError as error:
+            return _text(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        return _text(HTTPStatus.NOT_FOUND, "there is nothing at this path")
+
+    def _page(self) -> Answer:
+        self.check()
+        page = served_page((self.store.path / "report.html").read_text(encoding="utf-8"))
+        return Answer(HTTPStatus.OK, (page or "").encode(), "text/html; charset=utf-8")
+
+    def _file(self, path: str) -> Answer:
+        try:
+            return Answer(HTTPStatus.OK, (self.store.path / path[1:]).read_bytes(), _FILES[path])
+        except FileNotFoundError:
+            return _text(HTTPStatus.NOT_FOUND, "this run has no such file")
+
+    def _pixel(self, query: Mapping[str, list[str]]) -> Answer:
+        """Return all that is known of a pixel."""
+        ny, nx = self._shape
+        place = [query.get(name, [""]) for name in ("y", "x")]
+        if len(query) != 2 or any(len(each) != 1 or not _NUMBER.fullmatch(each[0]) for each in place):
+            return _text(HTTPStatus.BAD_REQUEST, "ask for a pixel as y=12&x=34")
+        y, x = (int(each[0]) for each in place)
+        if y >= ny or x >= nx:
+            return _text(HTTPStatus.NOT_FOUND, f"there is no such pixel; the sensor has {ny} x {nx}")
+        region = (slice(y, y + 1), slice(x, x + 1))
+        chosen = ChosenPixels(np.array([y * nx + x]), ())
+        sample = read_sample(self.store, chosen, (), self._shape)
+        counts, mass = sample.counts[0], sample.masses[0] if sample.masses else None
+        occupied = np.flatnonzero(counts)
+        kept = slice(occupied[0], occupied[-1] + 1) if occupied.size else slice(0, 0)
+        content = {
+            "origin": int(sample.origin[0]) + int(kept.start),
+            "counts": counts[kept].tolist(),
+            "deciding": None if sample.deciding is None else _floats(sample.deciding[:, 0]),
+            "mass": None if mass is None or not np.isfinite(mass).all() else _floats(mass[kept]),
+            "values": {path: _floats(self.store.read(path, region))[0] for path in self._maps},
+        }
+        return _json(content)
+
+    def _map(self, query: Mapping[str, list[str]]) -> Answer:
+        """Return a whole map, packed as in the page."""
+        asked = query.get("path", [])
+        if len(query) != 1 or len(asked) != 1 or asked[0] not in self._maps:
+            return _text(HTTPStatus.NOT_FOUND, "this run has no such map")
+        packed = packed_map(self.store, self._maps[asked[0]].variable)
+        scale = packed.scale
+        content = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
+        return _json({**content, "data": base64.b64encode(packed.data).decode("ascii")})
+
+
+def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) -> Answer | None:
+    """Return why a request is not answered: another method, another host, or a page of another site."""
+    if method not in ("GET", "HEAD"):
+        allowed = {"Allow": "GET, HEAD"}
+        text = b"this server only shows; GET and HEAD are all it knows"
+        return Answer(HTTPStatus.METHOD_NOT_ALLOWED, text, headers=allowed)
+    hosts = {f"{name}:{port}" for name in (ADDRESS, "localhost")}
+    if headers.get("host") not in hosts:
+        return _text(HTTPStatus.FORBIDDEN, "this server answers to its own address only")
+    origin = headers.get("origin")
+    if origin is not None and origin not in {f"http://{host}" for host in hosts}:
+        return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
+    foreign = headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
+    if foreign and target.startswith("/api/"):
+        return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
+    return None
+
+
+def _text(status: HTTPStatus, text: str) -> Answer:
+    return Answer(status, f"{text}\n".encode())
+
+
+def _json(content: Any) -> Answer:
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    return Answer(HTTPStatus.OK, text.encode(), "application/json")
+
+
+def _floats(values: Any) -> list[float | None]:
+    """Return numbers as JSON has them: null where there is no value."""
+    flat = np.asarray(values, dtype=np.float64).ravel().tolist()
+    return [value if math.isfinite(value) else None for value in flat]
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Hands requests to a view and sends its answers."""
+
+    server_version = "pchem"
+    sys_version = ""
+    timeout = 30
+    run_view: ClassVar[RunView]
+
+    def _respond(self) -> None:
+        headers = {name.lower(): value for name, value in self.headers.items()}
+        assert isinstance(self.server, _Server)
+        answer = self.run_view.answer(self.command, self.path, headers, self.server.server_port)
+        self.send_response(answer.status)
+        for name, value in {**_HEADERS, **answer.headers}.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", answer.kind)
+        self.send_header("Content-Length", str(len(answer.content)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(answer.content)
+
+    do_GET = do_HEAD = do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = do_CONNECT = _respond
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing: the terminal is the user's."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of browsers that hang up."""
+
+
+def make_server(path: Path, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
+    """Return a server for one run, listening already, and the address to open.
+
+    Args:
+        path: the run's store, or the YAML that made it.
+        port: on which to listen; 0 for any that is free.
+
+    Raises:
+        ConfigError: the port is taken.
+        StoreError: there is no run, or none with a report that can be inspected.
+    """
+    view = RunView(RunStore.open(find_run(path).store))
+    view.check()
+    handler = type("_RunHandler", (_Handler,), {"run_view": view})
+    try:
+        server = _Server((ADDRESS, port), handler)
+    except OSError as error:
+        raise ConfigError(
+            f"--port {port}: cannot listen there ({error.strerror}); choose another, or 0 for a free one"
+        ) from error
+    return server, f"http://{ADDRESS}:{server.server_port}/"
+
+
+def serve(path: Path, port: int, ready: Callable[[str], None]) -> None:
+    """Serve one run until the user stops it with Ctrl-C.
+
+    Args:
+        path: as for :func:`make_server`.
+        port: as for :func:`make_server`.
+        ready: is given the address once the server listens.
+
+    Raises:
+        ConfigError: the port is taken.
+        StoreError: there is nothing to show.
+    """
+    server, address = make_server(path, port)
+    with server:
+        ready(address)
+        # Ctrl-C is how this ends, not an accident
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()

@@ -1,0 +1,121 @@
+"""``pchem status``: how far a run is, once or until the command that works on it ends."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from pchem_pipeline.run.runner import StageState
+from pchem_pipeline.run.session import Target, run_status
+from pchem_pipeline.store.progress_file import read_beacon
+
+__all__ = ["json_line", "pace_words", "rows", "watch"]
+
+_INTERVAL = 1.0
+#: Moves the cursor up so many lines and clears what is below.
+_UP = "\x1b[{}A\x1b[J"
+
+Snapshot = tuple[list[StageState], dict[str, Any] | None]
+
+
+def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> list[str]:
+    """Return a line for each stage, and where a command works on one, how fast.
+
+    Args:
+        states: of the stages, in order.
+        progress: what that command tells, or None.
+    """
+    label = "" if progress is None else str(progress.get("stage", ""))
+    running = label.partition(":")[0]
+    lines = []
+    for state in states:
+        words = state.words()
+        if progress is not None and state.stage == running:
+            words = pace_words(progress)
+        lines.append(f"{state.stage:<11} {words}")
+    if progress is not None and running not in {state.stage for state in states}:
+        lines.append(f"{'':<11} {pace_words({**progress, 'stage': f': {label}' if label else ''})}")
+    return lines
+
+
+def pace_words(progress: Mapping[str, Any]) -> str:
+    """Return how far a command is, its rate and the time that remains, in words."""
+    label, done, total = str(progress.get("stage", "")), progress.get("done"), progress.get("total")
+    part = label.partition(": ")[2]
+    words = f"running{f' ({part})' if part else ''}"
+    if done is None or total is None:
+        return words
+    unit = str(progress.get("unit", "unit"))
+    words += f" {done} of {total} {unit}{'s' if unit.islower() else ''}"
+    rate, remaining = progress.get("rate"), progress.get("remaining")
+    if rate:
+        words += f", {rate:.3g}/s" if rate >= 1 else f", {1 / rate:.3g} s each"
+    if remaining is not None:
+        words += f", {_time(remaining)} left"
+    return words
+
+
+def _time(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def json_line(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> str:
+    """Return how far a run is as one line of JSON."""
+    content = {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "stages": [vars(state) for state in states],
+        "progress": None if progress is None else dict(progress),
+    }
+    return json.dumps(content)
+
+
+def watch(
+    target: Target,
+    write: Callable[[str], None],
+    *,
+    follow: bool = False,
+    as_json: bool = False,
+    terminal: bool = False,
+    sleep: Callable[[float], None] = time.sleep,
+) -> None:
+    """Tell how far a run is.
+
+    Args:
+        target: the run.
+        write: takes a text of whole lines, the last without its end.
+        follow: go on until no command works on the run; Ctrl-C ends it, too.
+        as_json: JSON lines instead of rows.
+        terminal: rows may be drawn over; else only those that changed are written.
+        sleep: waits between two looks.
+    """
+    shown: list[str] = []
+    try:
+        for states, progress in _snapshots(target, follow, sleep):
+            lines = [json_line(states, progress)] if as_json else rows(states, progress)
+            if as_json or not shown:
+                write("\n".join(lines))
+            elif terminal:
+                write(_UP.format(len(shown)) + "\n".join(lines))
+            elif changed := [line for line in lines if line not in shown]:
+                write("\n".join(changed))
+            shown = lines
+    except KeyboardInterrupt:
+        return
+
+
+def _snapshots(target: Target, follow: bool, sleep: Callable[[float], None]) -> Iterator[Snapshot]:
+    """Look at the run; where asked again and again, the last time after the command's end."""
+    while True:
+        # before the states: what is done when nobody works is done for good
+        progress = read_beacon(target.store)
+        yield run_status(target), progress
+        if not follow or progress is None:
+            return
+        sleep(_INTERVAL)

@@ -1,0 +1,1 @@
+"""Effects named on ready-made histograms, by likelihood."""

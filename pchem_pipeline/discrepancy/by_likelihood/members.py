@@ -1,0 +1,252 @@
+"""Effects as parameters of a likelihood: which change a pixel's own histogram, and what of them is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = ["NO_ORDER", "Member", "find_members", "law_of"]
+
+FloatArray = NDArray[np.float64]
+
+#: Why effects in time and space cannot be looked for.
+NO_ORDER = "ready-made histograms hold no order in time and no neighbours"
+_SAME_LAW = "it leaves the law of a single pixel's samples as it is, or only widens its read noise"
+_FAMILIES = ("shape", "code", "tail")  # of statistics that histograms have
+_MOST_EXTRA = 2
+_MOST_STARTS = 6  # of one effect
+_UNLIMITED = {True: 10.0, False: 1e4}  # of a strength, of another field
+_FARTHEST = 4.0  # factor by which other fields than the strength may move
+_LONGEST_LIST = 8
+_LEAST_CHANGE = 1e-12
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A fitted field of an effect, as the power of it in which small effects are linear.
+
+    Attributes:
+        name: of the field.
+        power: the field is ``sign(c) |c| ** (1 / power)``.
+        bounds: of the coordinate.
+    """
+
+    name: str
+    power: float
+    bounds: tuple[float, float]
+
+    def value(self, coordinate: float) -> float:
+        """Return the field of a coordinate."""
+        return float(np.sign(coordinate) * abs(coordinate) ** (1.0 / self.power))
+
+    def coordinate(self, value: float) -> float:
+        """Return the coordinate of a field."""
+        return float(np.sign(value) * abs(value) ** self.power)
+
+    def error(self, coordinate: float, stderr: float) -> float:
+        """Return the standard error of the field of a coordinate's."""
+        return (
+            float(stderr * abs(coordinate) ** (1.0 / self.power - 1.0) / self.power) if coordinate else stderr
+        )
+
+
+@dataclass(frozen=True)
+class Member:
+    """A candidate at a start, with what of it is fitted.
+
+    Attributes:
+        effect: at the start.
+        coordinates: its strength first, if it has one.
+    """
+
+    effect: Effect
+    coordinates: tuple[Coordinate, ...]
+
+    @classmethod
+    def of(cls, effect: Effect) -> Member:
+        """Find the fields to fit: the strength, and real numbers with limits beside it."""
+        names = [effect.strength] if effect.strength else []
+        for name, value in effect.model_dump().items():
+            if isinstance(value, float) and name not in names and len(names) <= _MOST_EXTRA and names:
+                low, high = _limits(type(effect), name)
+                if np.isfinite([low, high]).all():
+                    names.append(name)
+        found = []
+        for name in names:
+            power = effect.power if name == effect.strength else 1.0
+            limits = _limits(type(effect), name)
+            if name != effect.strength and limits[0] > 0:
+                value = float(getattr(effect, name))
+                limits = max(limits[0], value / _FARTHEST), min(limits[1], value * _FARTHEST)
+            bounds = [np.sign(b) * min(abs(b), _UNLIMITED[name == effect.strength]) ** power for b in limits]
+            found.append(Coordinate(name, power, (float(bounds[0]), float(bounds[1]))))
+        return cls(effect, tuple(found))
+
+    @property
+    def tag(self) -> str:
+        """Tag of the effect."""
+        return self.effect.tag
+
+    @property
+    def kind(self) -> str:
+        """The effect without what is fitted."""
+        return str(self.effect.model_dump(mode="json", exclude={c.name for c in self.coordinates}))
+
+    @property
+    def start(self) -> FloatArray:
+        """Coordinates of the start."""
+        return np.array([c.coordinate(float(getattr(self.effect, c.name))) for c in self.coordinates])
+
+    @property
+    def scale(self) -> FloatArray:
+        """Natural scale of the coordinates."""
+        return np.maximum(np.abs(self.start), 1e-6)
+
+    @property
+    def tabulated(self) -> bool:
+        """Whether it is a table of numbers read off the residuals, which mimics whatever left them."""
+        return any(isinstance(v, tuple | list) and len(v) > _LONGEST_LIST for _, v in self.effect)
+
+    @property
+    def bends_codes(self) -> bool:
+        """Whether it moves the edges of codes, which no comb of a pixel's own follows."""
+        law = self.effect.marginal(MarginalModel(), _ONE_PIXEL)
+        return law.edge_shift.size > 0
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether a fitted field is at a limit of its range: another effect is what it stands for."""
+        reached = np.isclose(self.start[:, None], [c.bounds for c in self.coordinates], rtol=1e-6, atol=0.0)
+        return bool(reached.any()) if self.coordinates else False
+
+    def at(self, coordinates: FloatArray) -> Effect:
+        """Return the effect at coordinates.
+
+        Raises:
+            pydantic.ValidationError: the effect refuses them.
+        """
+        values = self.effect.model_dump()
+        for c, value in zip(self.coordinates, coordinates, strict=True):
+            values[c.name] = c.value(float(value))
+        return type(self.effect).model_validate(values)
+
+    def moved(self, coordinates: FloatArray) -> Member:
+        """Return the member with another start."""
+        return Member(self.at(coordinates), self.coordinates)
+
+    def excludes(self, other: Member) -> bool:
+        """Tell whether both cannot be in one model: one effect, or two laws of the electron number."""
+        laws = [m.effect.marginal(MarginalModel(), _ONE_PIXEL).law for m in (self, other)]
+        return self.tag == other.tag or all(law != "poisson" for law in laws)
+
+
+_ONE_PIXEL = pixel_maps([np.array([v]) for v in (2.0, 0.1, 100.0, 3.0)], np.ones(1, np.bool_))
+
+
+def law_of(
+    present: Sequence[Effect], members: Sequence[Member], shared: FloatArray, own: FloatArray
+) -> MarginalModel:
+    """Return the law of pixels with the effects present and the members at their coordinates.
+
+    Args:
+        present: effects of the model.
+        members: candidates.
+        shared: coordinates of all members, one after the other.
+        own: (H, g, mu, sigma) of the pixels, shape (n, 4).
+    """
+    effects, at = list(present), 0
+    for member in members:
+        n = len(member.coordinates)
+        effects.append(member.at(shared[at : at + n]))
+        at += n
+    return marginal_model(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
+
+
+def find_members(
+    classes: Mapping[str, type[Effect]], evidence: Evidence, present: Sequence[Effect]
+) -> tuple[list[Member], dict[str, str], dict[str, str]]:
+    """Return the candidates that change a pixel's own histogram, at one or more starts each.
+
+    Args:
+        classes: candidates by tag.
+        evidence: of the histograms, from which some estimate themselves.
+        present: effects of the model; they are not candidates.
+
+    Returns:
+        Members; effects that histograms cannot show and why; effects that failed and why.
+    """
+    members: list[Member] = []
+    untestable: dict[str, str] = {}
+    failed: dict[str, str] = {}
+    have = {effect.tag for effect in present}
+    for tag, effect in classes.items():
+        if tag in have:
+            continue
+        if effect.signature and effect.signature[0].partition(".")[0] not in _FAMILIES:
+            untestable[tag] = NO_ORDER
+            continue
+        # whatever a stranger's effect raises must not stop the others
+        try:
+            starts = [*effect.estimate(evidence), *effect.typical()]
+            found = [Member.of(start) for start in _distinct(starts) if _changes(start, evidence)]
+        except Exception as error:
+            failed[tag] = f"{type(error).__name__}: {error}"
+            continue
+        if starts and not found:
+            untestable[tag] = f"{NO_ORDER}: {_SAME_LAW}"
+        members += found[:_MOST_STARTS]
+    return members, untestable, failed
+
+
+def _distinct(effects: Sequence[Effect]) -> list[Effect]:
+    """Leave out starts that differ in nothing but their strength, sign included."""
+    kept: dict[str, Effect] = {}
+    for effect in effects:
+        values: dict[str, Any] = effect.model_dump(mode="json")
+        value = values.pop(effect.strength, 0.0)
+        kept.setdefault(f"{values} {np.sign(value)}", effect)
+    return list(kept.values())
+
+
+def _changes(effect: Effect, evidence: Evidence) -> bool:
+    """Tell whether an effect changes the law of the pixels in more than the width of its read noise."""
+    usable = np.flatnonzero(evidence.maps.usable.ravel())[:4]
+    columns = [
+        np.asarray(values, np.float64).ravel()[usable]
+        for values in (
+            evidence.maps.quanta_exposure,
+            evidence.maps.conversion_gain,
+            evidence.maps.bias,
+            evidence.maps.read_noise_dn,
+        )
+    ]
+    maps = pixel_maps(columns, np.ones(usable.size, np.bool_))
+    law = marginal_model([effect], maps)
+    low = int((maps.bias - 8.0 * maps.read_noise_dn).min())
+    high = int((maps.bias + (maps.quanta_exposure * 3.0 + 8.0) / maps.conversion_gain).max())
+    codes = np.arange(low, high + 1)
+    change = np.abs(marginal_mass(law, maps, codes) - marginal_mass(MarginalModel(), maps, codes)).max()
+    return bool(change > _LEAST_CHANGE)
+
+
+def _limits(effect: type[Effect], name: str) -> tuple[float, float]:
+    """Return the limits that a field states, infinite where it states none."""
+    low, high = -np.inf, np.inf
+    for limit in effect.model_fields[name].metadata:
+        for key in ("ge", "gt"):
+            low = max(low, float(getattr(limit, key, low) if getattr(limit, key, None) is not None else low))
+        for key in ("le", "lt"):
+            high = min(
+                high, float(getattr(limit, key, high) if getattr(limit, key, None) is not None else high)
+            )
+    return low, high

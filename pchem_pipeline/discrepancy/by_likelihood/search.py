@@ -1,0 +1,264 @@
+"""Which effects explain histograms: on all codes if that succeeds, else on the codes that are understood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_likelihood.gap import Meter
+from pchem_pipeline.discrepancy.by_likelihood.members import Member
+from pchem_pipeline.discrepancy.by_likelihood.sets import (
+    SWAPPED,
+    Arena,
+    Contest,
+    FittedSet,
+    compare_sets,
+    find_rivals,
+    of_best_kind,
+)
+from pchem_pipeline.discrepancy.by_likelihood.views import (
+    Interval,
+    doubtful_peaks,
+    electrons_of,
+    inside,
+    valleys,
+)
+
+__all__ = ["Explanation", "Named", "combs_coincide", "explain"]
+
+FloatArray = NDArray[np.float64]
+
+_SIGMAS = 3.0
+#: a set must leave less of the gap than this
+LARGEST_REST = 0.2
+_PAYS = 0.5  # of the gap: more must go with a peak that is set aside
+_PEAKS_TRIED = 3
+_COINCIDE = 0.3  # e-
+_STEADY = 4.0  # factor within which a strength must stay when more codes are compared
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect of the explanation.
+
+    Attributes:
+        member: as fitted.
+        apart: by how much its strength differs when fewer codes are compared.
+        rivals: sets with another effect in its place, the best first.
+        without: the set without it.
+        equals: rivals (tags) that do as well within three standard errors.
+        weight: what it adds to the score, nats.
+    """
+
+    member: Member
+    apart: float
+    rivals: tuple[FittedSet, ...]
+    without: FittedSet | None
+    equals: tuple[str, ...]
+    weight: float
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What the search came to.
+
+    Attributes:
+        arena: with the codes on which effects were compared.
+        kept: codes that the gap compares, shape (n, B): all but a peak set aside.
+        set_aside: codes that the fit leaves out.
+        plain: the fit without effects to all codes.
+        best: the named effects, fitted to the codes that the gap compares.
+        judged: the set in which they were compared, perhaps with unsteady members.
+        named: its effects, the weightiest first.
+        unsteady: effects that fit in one view and not in another: stand-ins of something unknown.
+        nearest: tags of the best single effects on all codes.
+        rest: share of the gap that the judged set leaves among the codes of the arena.
+    """
+
+    arena: Arena
+    kept: NDArray[np.bool_]
+    set_aside: tuple[Interval, ...]
+    plain: FittedSet
+    best: FittedSet
+    judged: FittedSet
+    named: tuple[Named, ...]
+    unsteady: tuple[Member, ...]
+    nearest: tuple[str, ...]
+    rest: float
+
+    @property
+    def peak(self) -> Interval | None:
+        """The peak that was set aside."""
+        return self.set_aside[0] if self.set_aside else None
+
+
+def explain(
+    arena: Arena, candidates: Sequence[Member], replicates: int, rng: np.random.Generator
+) -> Explanation:
+    """Find the effects that explain histograms.
+
+    Args:
+        arena: with all codes.
+        candidates: effects at their starts.
+        replicates: behind what chance leaves.
+        rng: their random numbers.
+    """
+    contest = compare_sets(arena, candidates)
+    nearest = tuple(m.tag for s in contest.fitted[:3] for m in s.members)
+    left, floor = _left(arena, contest.best, replicates, rng)
+    if left > floor and any(m.tabulated for m in contest.best.members):
+        candidates = [c for c in candidates if not c.tabulated]
+        contest = compare_sets(arena, candidates)
+        left, floor = _left(arena, contest.best, replicates, rng)
+    at_first = max(arena.gap(contest.plain), 1e-12)
+    if contest.best.members and left <= max(floor, LARGEST_REST * at_first):
+        named = [_named(arena, contest.best, m, candidates) for m in contest.best.members]
+        return Explanation(
+            arena, arena.kept, (), contest.plain, contest.best, contest.best, _sorted(named), (), nearest,
+            left / at_first,
+        )  # fmt: skip
+    fixed_in_dn = combs_coincide(contest.plain.fit.parameters)
+    pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.bends_codes))]
+    return _narrowed(arena, pool, contest, nearest)
+
+
+def _left(arena: Arena, best: FittedSet, replicates: int, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the gap that a set leaves on the scored part, and its floor, nats per sample."""
+    gap = Meter(arena.test, arena.kept, 0.0, replicates, rng).gap(arena.problem(best.members), best.fit)
+    return gap.value, gap.floor
+
+
+def combs_coincide(parameters: FloatArray) -> bool:
+    """Tell whether the peaks of all pixels lie at the same DN, so that nothing tells codes from electrons.
+
+    Args:
+        parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
+    """
+    gain, bias = np.median(parameters[:, 1]), parameters[:, 2]
+    return bool(np.ptp(np.quantile(bias, [0.1, 0.9])) * gain < _COINCIDE)
+
+
+def _narrowed(
+    arena: Arena, candidates: Sequence[Member], whole: Contest, nearest: tuple[str, ...]
+) -> Explanation:
+    """Compare on the codes that are understood, and keep what holds on more of them."""
+    plain = whole.plain
+    parameters = plain.fit.parameters
+    electrons = electrons_of(arena.origin, arena.train.shape[1], parameters)
+    peak = _cut_peak(arena, electrons, candidates, whole)
+    between = valleys(arena, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
+    wide = _narrow(arena, ~inside(peak, electrons), parameters)
+    view = _narrow(arena, ~inside(peak + between, electrons), parameters)
+    contest = compare_sets(view, candidates, coarse=True)
+    steady, unsteady = _steady(wide, contest.best, candidates)
+    rest = view.gap(contest.best) / max(view.gap(contest.plain), 1e-12)
+    named: list[Named] = []
+    best = wide.fit((), parameters)
+    if steady:
+        start = contest.best.fit.parameters
+        fitted = wide.attempt(steady, start)
+        best = best if fitted is None else of_best_kind(wide, fitted, candidates)
+        there = view.attempt(best.members, start)
+        for member in best.members:
+            found = _named(view, contest.best, _member(contest.best, member.tag), candidates)
+            apart = 0.0 if there is None else _apart(member, _member(there, member.tag))
+            named.append(replace(found, member=member, apart=apart))
+    return Explanation(
+        view, wide.kept, peak, plain, best, contest.best, _sorted(named), tuple(unsteady), nearest, rest
+    )
+
+
+def _cut_peak(
+    arena: Arena, electrons: FloatArray, candidates: Sequence[Member], whole: Contest
+) -> tuple[Interval, ...]:
+    """Return the peak without which known effects explain far more, if there is one."""
+    best, found = _PAYS * arena.gap(whole.best) * arena.n_test, None
+    for interval in doubtful_peaks(arena, electrons)[:_PEAKS_TRIED]:
+        view = _narrow(arena, ~interval.holds(electrons), whole.plain.fit.parameters)
+        left = view.gap(compare_sets(view, candidates, largest=2, coarse=True).best) * view.n_test
+        if left < best:
+            best, found = left, interval
+    return () if found is None else (found,)
+
+
+def _member(fitted: FittedSet, tag: str) -> Member:
+    return next(m for m in fitted.members if m.tag == tag)
+
+
+def _apart(member: Member, there: Member) -> float:
+    """Return how far the strengths of two fits of an effect are apart."""
+    name = member.effect.strength
+    return abs(float(getattr(member.effect, name)) - float(getattr(there.effect, name))) if name else 0.0
+
+
+def _narrow(arena: Arena, kept: NDArray[np.bool_], start: FloatArray) -> Arena:
+    return Arena(arena.train, arena.test, arena.origin, kept, arena.present, start, dict(arena.failed))
+
+
+def _steady(wide: Arena, best: FittedSet, candidates: Sequence[Member]) -> tuple[list[Member], list[Member]]:
+    """Split a set into members that hold on more codes, as fitted there, and those that do not.
+
+    On more codes each member may be exchanged for another effect; those for which one does better, and those
+    that change their sign or their strength, stand in for something else.
+    """
+    fitted = wide.attempt(best.members, best.fit.parameters) if best.members else None
+    if fitted is None:
+        return [], list(best.members)
+    fitted = _exchanged(wide, fitted, candidates)
+    steady: list[Member] = []
+    unsteady: list[Member] = []
+    for member in best.members:
+        other = next((m for m in fitted.members if m.tag == member.tag), None)
+        if other is None or other.at_limit or member.at_limit or not _alike(member, other):
+            unsteady.append(member)
+            continue
+        without = wide.attempt(tuple(m for m in fitted.members if m.tag != member.tag), fitted.fit.parameters)
+        rise, error = wide.difference(fitted, without) if without else (0.0, 0.0)
+        (steady if rise > _SIGMAS * error else unsteady).append(other)
+    return steady, unsteady
+
+
+def _exchanged(wide: Arena, fitted: FittedSet, candidates: Sequence[Member]) -> FittedSet:
+    """Exchange one member of a set for another effect while that is better."""
+    plain = wide.fit((), fitted.fit.parameters)
+    for _ in fitted.members:
+        offers = []
+        whole = wide.difference(fitted, plain)[0]
+        for member in fitted.members:
+            others = tuple(m for m in fitted.members if m.tag != member.tag)
+            base = wide.attempt(others, fitted.fit.parameters)
+            if base is not None and wide.difference(fitted, base)[0] < SWAPPED * whole:
+                offers += find_rivals(wide, fitted, member, candidates)[1][:1]
+        best = max(offers, key=lambda s: s.score, default=fitted)
+        rise, error = wide.difference(best, fitted)
+        if rise <= _SIGMAS * error:
+            break
+        fitted = best
+    return fitted
+
+
+def _alike(one: Member, other: Member) -> bool:
+    """Tell whether two fits of an effect agree in sign and roughly in strength."""
+    if not one.effect.strength or one.kind != other.kind:
+        return True
+    a, b = (float(getattr(m.effect, m.effect.strength)) for m in (one, other))
+    return a * b > 0 and max(abs(a), abs(b)) < _STEADY * min(abs(a), abs(b))
+
+
+def _named(arena: Arena, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
+    """Compare a member of a set with what could stand in its place."""
+    without, rivals = find_rivals(arena, best, member, candidates)
+    equals = []
+    for rival in rivals:
+        rise, error = arena.difference(best, rival)
+        if rise < _SIGMAS * error:
+            equals += [tag for tag in rival.tags - best.tags if tag not in equals]
+    weight = arena.difference(best, without)[0] if without else 0.0
+    return Named(member, 0.0, tuple(rivals), without, tuple(equals), weight)
+
+
+def _sorted(named: Sequence[Named]) -> tuple[Named, ...]:
+    return tuple(sorted(named, key=lambda n: -n.weight))

@@ -1,0 +1,409 @@
+"""Sets of effects compared by likelihood on histograms: fitted on one part, scored on another.
+
+The samples of every pixel are dealt at random to three parts. A set of effects is fitted on the first
+together with the pixels' own four parameters and scored by its log-likelihood on the second; the standard
+error of a difference of scores is that of a mean of independent samples (Vuong 1989).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.base.errors import PchEmError
+from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent, fit_shared, to_theta
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = [
+    "SWAPPED",
+    "Arena",
+    "Contest",
+    "FittedSet",
+    "compare_sets",
+    "deal",
+    "find_rivals",
+    "of_best_kind",
+    "saturated",
+]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_SIGMAS = 3.0  # standard errors by which an effect must improve the score, and a set must beat a rival
+_PRICE = 3.0  # nats: and by so much at least
+_LARGEST_SET = 4
+_FITTED = 3  # candidates fitted in full, of those that a first-order step promises most of
+_TOLERANCE = 0.02  # nats; of a misfit more, since it is known no better
+_TOLERANCE_PER_SAMPLE = 1e-6
+_MOST_STEPS = 20
+_SECANT = 0.1  # of the start: where the slope at no effect is taken
+# of the gap, left by so many effects: none of them is what is missing
+_HOPELESS = {1: 0.8, 2: 0.5, 3: 0.5, 4: 0.5}
+_HARDLY = 0.03  # of what the set closes: a member that closes less is not one of a set that misfits anyway
+SWAPPED = 0.2  # of what the set closes: members that close more are not exchanged
+
+
+def deal(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) -> tuple[IntArray, ...]:
+    """Deal the samples of histograms (n, B) to equal parts at random, without replacement."""
+    left = counts.astype(np.int64)
+    found = []
+    for remaining in range(parts, 1, -1):
+        drawn = np.stack(
+            [
+                rng.multivariate_hypergeometric(row, int(row.sum()) // remaining, method="marginals")
+                for row in left
+            ]
+        )
+        found.append(drawn.astype(np.int64))
+        left = left - found[-1]
+    return (*found, left)
+
+
+def saturated(counts: IntArray, kept: NDArray[np.bool_]) -> FloatArray:
+    """Return the log-likelihood of histograms under their own frequencies in the kept codes, nats, (n,)."""
+    seen = np.where(kept, counts, 0).astype(np.float64)
+    total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)
+    return np.asarray((seen * np.log(np.maximum(seen, 1.0) / total)).sum(axis=1))
+
+
+def chance_of_cells(expected: FloatArray) -> float:
+    """Return the mean of ``sum n log(n / e)`` for Poisson counts n of expectation e, nats.
+
+    It is 1/2 per cell where many counts are expected, and less where few are.
+    """
+    grid, values = _chance_table()
+    some = expected[expected > 0.0]
+    found = np.interp(np.log(np.maximum(some, 1e-300)), grid, values)
+    few = some < np.exp(grid[0])
+    found[few] = -some[few] * np.log(some[few])
+    return float(found.sum())
+
+
+@functools.cache
+def _chance_table() -> tuple[FloatArray, FloatArray]:
+    """Return log e and the mean of ``n log(n / e)``, from 1e-6 to 1e3 (1/2 beyond)."""
+    expected = np.geomspace(1e-6, 1e3, 600)
+    n = np.arange(1, 1500)
+    log_mass = n * np.log(expected[:, None]) - expected[:, None] - special.gammaln(n + 1.0)
+    values = (np.exp(log_mass) * n * (np.log(n) - np.log(expected[:, None]))).sum(axis=1)
+    return np.log(expected), np.asarray(values, np.float64)
+
+
+@dataclass(frozen=True)
+class FittedSet:
+    """A set of candidates, fitted.
+
+    Attributes:
+        members: at the fitted coordinates.
+        fit: of own and shared parameters.
+        log_masses: of the codes under it, shape (n, B).
+        score: log-likelihood of the other part, nats.
+    """
+
+    members: tuple[Member, ...]
+    fit: SharedFit
+    log_masses: FloatArray
+    score: float
+
+    @property
+    def tags(self) -> frozenset[str]:
+        """Their tags."""
+        return frozenset(m.tag for m in self.members)
+
+    def coordinates(self, tag: str) -> tuple[FloatArray, FloatArray]:
+        """Return coordinates of a member and their standard errors."""
+        at = 0
+        for member in self.members:
+            n = len(member.coordinates)
+            if member.tag == tag:
+                variance = np.diag(self.fit.covariance)[at : at + n]
+                return self.fit.shared[at : at + n], np.sqrt(np.maximum(variance, 0.0))
+            at += n
+        raise KeyError(tag)
+
+
+@dataclass
+class Arena:
+    """Where sets are fitted and scored.
+
+    Attributes:
+        train, test: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        kept: codes that count, shape (n, B).
+        present: effects that the model has.
+        start: (H, g, mu, sigma), shape (n, 4).
+        failed: candidates that could not be fitted, and why.
+    """
+
+    train: IntArray
+    test: IntArray
+    origin: IntArray
+    kept: NDArray[np.bool_]
+    present: tuple[Effect, ...]
+    start: FloatArray
+    failed: dict[str, str] = field(default_factory=dict)
+    _known: dict[frozenset[str], FittedSet] = field(default_factory=dict)
+
+    @property
+    def n_test(self) -> float:
+        """Samples that count in the scored part."""
+        return float(np.where(self.kept, self.test, 0).sum())
+
+    def problem(self, members: Sequence[Member], counts: IntArray | None = None) -> SharedProblem:
+        """Return what a set is fitted to: the train part, or other histograms."""
+
+        def law(shared: FloatArray, own: FloatArray) -> MarginalModel:
+            return law_of(self.present, members, shared, own)
+
+        coordinates = [c for m in members for c in m.coordinates]
+        return SharedProblem(
+            self.train if counts is None else counts,
+            self.origin,
+            self.kept,
+            law,
+            np.array([c.bounds for c in coordinates], np.float64).reshape(-1, 2),
+            np.concatenate([np.zeros(0), *(m.scale for m in members)]),
+        )
+
+    def fit(
+        self, members: Sequence[Member], start: FloatArray | None = None, counts: IntArray | None = None
+    ) -> FittedSet:
+        """Fit a set from the starts of its members.
+
+        Raises:
+            Exception: whatever an effect raises.
+        """
+        problem = self.problem(members, counts)
+        shared = np.concatenate([np.zeros(0), *(m.start for m in members)])
+        tolerance = max(_TOLERANCE, _TOLERANCE_PER_SAMPLE * self.n_test)
+        fit = fit_shared(
+            problem,
+            self.start if start is None else start,
+            shared,
+            tolerance=tolerance,
+            max_steps=_MOST_STEPS,
+        )
+        at, moved = 0, []
+        for member in members:
+            n = len(member.coordinates)
+            moved.append(member.moved(fit.shared[at : at + n]))
+            at += n
+        log_masses = problem.log_masses(fit.theta, fit.shared)
+        return FittedSet(tuple(moved), fit, log_masses, float((self.test * log_masses).sum()))
+
+    def attempt(self, members: Sequence[Member], start: FloatArray | None = None) -> FittedSet | None:
+        """Fit a set, unless that was done; None where the last of its members cannot be fitted."""
+        kinds = frozenset(m.kind for m in members)
+        if kinds in self._known:
+            return self._known[kinds]
+        # whatever a stranger's effect raises must not stop the others
+        try:
+            return self._known.setdefault(kinds, self.fit(members, start))
+        except ValueError:
+            return None  # its fields do not go together where the fit led
+        except Exception as error:
+            reason = str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
+            self.failed[members[-1].tag] = reason
+            return None
+
+    def difference(self, one: FittedSet, other: FittedSet) -> tuple[float, float]:
+        """Return the score of one above that of the other, nats, and its standard error."""
+        apart = one.log_masses - other.log_masses
+        seen = np.where(self.kept, self.test, 0)
+        total = np.maximum(seen.sum(axis=1), 1)
+        sums = (seen * apart).sum(axis=1)
+        variance = (seen * apart**2).sum(axis=1) - sums**2 / total
+        return float(sums.sum()), float(np.sqrt(max(variance.sum(), 0.0)))
+
+    def gap(self, found: FittedSet) -> float:
+        """Return the distance of the scored part from the set beyond chance, nats per sample that counts."""
+        total = np.where(self.kept, self.test, 0).sum(axis=1, keepdims=True)
+        chance = chance_of_cells(np.where(self.kept, np.exp(found.log_masses), 0.0) * total)
+        # a fitted parameter costs half a nat on samples that were not fitted; the fixed total saves as much
+        chance += 0.5 * (3.0 * total.size + found.fit.shared.size)
+        return float(saturated(self.test, self.kept).sum() - found.score - chance) / max(self.n_test, 1.0)
+
+    def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
+        """Return candidates, each moved by a first-order step, by the rise that this step promises."""
+        problem = self.problem(base.members)
+        theta = to_theta(base.fit.parameters)
+        tangent = Tangent.at(problem, theta, base.fit.shared)
+        seen = np.where(self.kept, self.train, 0).astype(np.float64)
+        weights = tangent.masses * seen.sum(axis=1)[:, None]
+        ranked = []
+        for member in candidates:
+            if any(member.excludes(m) for m in base.members) or member.tag in self.failed:
+                continue
+            try:
+                slope, step = self._slope(base, theta, member, tangent.log_masses)
+            # whatever a stranger's effect raises must not stop the others
+            except Exception as error:
+                self.failed[member.tag] = f"{type(error).__name__}: {error}"
+                continue
+            d = np.concatenate([tangent.derivatives, slope[:, None, :]], axis=1)
+            information = (d * weights[:, None, :]) @ d.transpose(0, 2, 1)
+            score = np.einsum("nab,nb->na", d, seen)
+            rise, length = _one_step(information, score, len(theta[0]))
+            if not member.coordinates:
+                ranked.append((np.inf, member))
+            elif length * step > 0 or member.coordinates[0].bounds[0] < 0:
+                ranked.append((rise, _placed(member, length)))
+        ranked.sort(key=lambda pair: -pair[0])
+        return [member for _, member in ranked]
+
+    def _slope(
+        self, base: FittedSet, theta: FloatArray, member: Member, log_masses: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """Return the derivative of the log masses in a candidate's strength near none of it."""
+        shared, step = np.zeros(0), 1.0
+        if member.coordinates:
+            shared = member.start.copy()
+            shared[0] *= _SECANT
+            step = float(shared[0])
+        problem = self.problem((*base.members, member))
+        moved = problem.log_masses(theta, np.concatenate([base.fit.shared, shared]))
+        return (moved - log_masses) / step, step
+
+
+def _one_step(information: FloatArray, score: FloatArray, n_own: int) -> tuple[float, float]:
+    """Return the rise that the last parameter (shared) promises, the pixels' own free, and its step."""
+    own = information[:, :n_own, :n_own]
+    own = own + 1e-9 * np.einsum("naa->na", own)[:, :, None] * np.eye(n_own)
+    through = np.linalg.solve(own, information[:, :n_own, -1:])[:, :, 0]
+    left = float((information[:, -1, -1] - (information[:, :n_own, -1] * through).sum(axis=1)).sum())
+    right = float((score[:, -1] - (score[:, :n_own] * through).sum(axis=1)).sum())
+    return (0.5 * right**2 / left, right / left) if left > 0 else (0.0, 0.0)
+
+
+def _placed(member: Member, length: float) -> Member:
+    """Return the member with the strength that a step leads to, where its limits allow."""
+    start = member.start
+    first = member.coordinates[0]
+    low, high = (0.5 * b for b in first.bounds)
+    start[0] = float(np.clip(length, max(low, -50.0 * abs(start[0])), min(high, 50.0 * abs(start[0]))))
+    try:
+        return member.moved(start)
+    except ValueError:
+        return member
+
+
+@dataclass(frozen=True)
+class Contest:
+    """What the comparison of the sets came to.
+
+    Attributes:
+        plain: the fit without candidates.
+        best: the chosen set, perhaps empty.
+        fitted: all sets fitted with one candidate, the best first.
+    """
+
+    plain: FittedSet
+    best: FittedSet
+    fitted: list[FittedSet]
+
+
+def compare_sets(
+    arena: Arena, candidates: Sequence[Member], *, largest: int = _LARGEST_SET, coarse: bool = False
+) -> Contest:
+    """Grow the set of effects greedily, with swaps, while the score improves by more than chance.
+
+    Effects that leave most of the gap are not what is missing: nothing is put on top of them.
+
+    Args:
+        arena: where to fit and score.
+        candidates: starts; several may be of one effect.
+        largest: size of the set.
+        coarse: end where little of the gap is left, since the rest is no matter of known effects.
+    """
+    plain = best = arena.fit(())
+    at_first = arena.gap(plain)
+    first: list[FittedSet] = []
+    while len(best.members) < largest and not (coarse and arena.gap(best) < _HARDLY * at_first):
+        grown = _additions(arena, best, candidates)
+        if best is plain:
+            first = grown
+        if not grown or not _better(arena, grown[0], best):
+            break
+        best = _swapped(arena, grown[0], plain, candidates)
+        if arena.gap(best) > _HOPELESS[len(best.members)] * at_first:
+            break
+    return Contest(plain, of_best_kind(arena, _pruned(arena, best, plain), candidates), first)
+
+
+def _additions(
+    arena: Arena, base: FittedSet, candidates: Sequence[Member], most: int = _FITTED
+) -> list[FittedSet]:
+    """Fit the set with the most promising candidates beside it, the best start of each, the best first."""
+    found: dict[str, FittedSet] = {}
+    for member in arena.promising(base, candidates):
+        if len(found) == most:
+            break
+        if member.tag not in found:
+            fitted = arena.attempt((*base.members, member), base.fit.parameters)
+            if fitted is not None:
+                found[member.tag] = fitted
+    return sorted(found.values(), key=lambda s: -s.score)
+
+
+def _better(arena: Arena, one: FittedSet, other: FittedSet) -> bool:
+    rise, error = arena.difference(one, other)
+    return rise > max(_SIGMAS * error, _PRICE)
+
+
+def _swapped(arena: Arena, best: FittedSet, plain: FittedSet, candidates: Sequence[Member]) -> FittedSet:
+    """Exchange earlier members that have come to matter little for others, where that is better."""
+    whole = arena.difference(best, plain)[0]
+    for member in best.members[:-1]:
+        base = arena.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
+        if base is None or arena.difference(best, base)[0] > SWAPPED * whole:
+            continue
+        for fitted in _additions(arena, base, candidates, 2)[:1]:
+            if member.tag not in fitted.tags and _better(arena, fitted, best):
+                return fitted
+    return best
+
+
+def of_best_kind(arena: Arena, best: FittedSet, candidates: Sequence[Member]) -> FittedSet:
+    """Try other kinds of the effects in a set (a law of growth, a bit)."""
+    for member in best.members:
+        kinds = {c.kind: c for c in candidates if c.tag == member.tag and c.kind != member.kind}
+        for other in list(kinds.values())[:_FITTED]:
+            members = tuple(m for m in best.members if m.tag != member.tag)
+            fitted = arena.attempt((*members, other), best.fit.parameters)
+            if fitted is not None and fitted.score > best.score:
+                best = fitted
+    return best
+
+
+def _pruned(arena: Arena, best: FittedSet, plain: FittedSet) -> FittedSet:
+    """Leave out members that the set does as well without."""
+    whole = arena.difference(best, plain)[0]
+    for member in reversed(best.members):
+        if len(best.members) < 2:
+            break
+        without = arena.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
+        if without is None:
+            continue
+        misfits = arena.gap(best) > _HARDLY * arena.gap(plain)
+        small = misfits and arena.difference(best, without)[0] < _HARDLY * whole
+        if small or not _better(arena, best, without):
+            best = without
+    return best
+
+
+def find_rivals(
+    arena: Arena, best: FittedSet, member: Member, candidates: Sequence[Member]
+) -> tuple[FittedSet | None, list[FittedSet]]:
+    """Return the set without a member, and sets with another effect in its place, the best first."""
+    others = tuple(m for m in best.members if m.tag != member.tag)
+    base = arena.attempt(others, best.fit.parameters)
+    if base is None:
+        return None, []
+    return base, _additions(arena, base, [c for c in candidates if c.tag != member.tag], 2)

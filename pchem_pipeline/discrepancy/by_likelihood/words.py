@@ -1,0 +1,136 @@
+"""Where on the comb histograms and model disagree, and in words: windows of DN between and at the peaks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.discrepancy.verdict import Residual
+
+__all__ = ["find_residuals", "place_words", "set_aside_residual"]
+
+FloatArray = NDArray[np.float64]
+
+_WIDEST = 1.0  # e-
+_MOST = 6
+_SIGNIFICANT = 0.005
+_PEAK = 0.25  # e-: half width of what is called a peak
+
+
+def place_words(low: float, high: float) -> str:
+    """Return the words for an interval on the comb, e-."""
+    centre = 0.5 * (low + high)
+    k = round(centre)
+    if centre < -_PEAK:
+        return "below the 0-electron peak"
+    if high - low > 1.0:
+        return f"from the {max(round(low), 0)}- to the {round(high)}-electron peak"
+    if abs(centre - k) < _PEAK:
+        return f"at the {k}-electron peak"
+    below = int(np.floor(centre))
+    return f"between the {below}- and the {below + 1}-electron peak"
+
+
+def find_residuals(
+    observed: FloatArray, expected: FloatArray, electrons: FloatArray, parameters: FloatArray
+) -> list[Residual]:
+    """Scan for windows of codes that hold too many or too few samples, the most significant first.
+
+    As in a bump hunt (Choudalakis 2011), windows of every place and width are tried, and each p-value counts
+    the trials. The codes of pixels are lined up by their place on the comb.
+
+    Args:
+        observed: samples, shape (n, B); 0 in codes that are not compared.
+        expected: the same under the model.
+        electrons: place of every code, e-, shape (n, B).
+        parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
+    """
+    gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))
+    index = np.floor((electrons + 0.5 * gain) / gain).astype(np.int64)
+    first = int(index.min())
+    seen, wanted = (
+        np.bincount((index - first).ravel(), values.ravel()).astype(np.float64)
+        for values in (observed, expected)
+    )
+    sums = [np.concatenate([[0.0], np.cumsum(values)]) for values in (seen, wanted)]
+    widest = max(int(_WIDEST / gain), 1)
+    windows: list[tuple[float, int, int]] = []
+    for width in range(1, min(widest, seen.size) + 1):
+        o, e = (total[width:] - total[:-width] for total in sums)
+        roots = _signed_root(o, np.maximum(e, 1e-9))
+        windows += [(float(roots[i]), int(i), width) for i in np.argsort(-np.abs(roots))[:40]]
+    windows.sort(key=lambda item: -abs(item[0]))
+    taken = np.zeros(seen.size, np.bool_)
+    found: list[Residual] = []
+    whole = max(float(_contribution(seen, wanted).sum()), 1e-12)
+    for z, start, width in windows:
+        place = slice(start, start + width)
+        p = float(min(1.0, 2.0 * special.ndtr(-abs(z)) * widest * seen.size))
+        if p > _SIGNIFICANT or len(found) == _MOST:
+            break
+        if taken[place].any():
+            continue
+        taken[place] = True
+        low, high = (first + start - 0.5) * gain, (first + start + width - 0.5) * gain
+        dn = int(np.ceil(bias + low / gain)), int(np.floor(bias + high / gain))
+        share = float(_contribution(seen[place], wanted[place]).sum()) / whole
+        found.append(
+            _residual(low, high, dn, float(seen[place].sum()), float(wanted[place].sum()), z, p, share)
+        )
+    return found
+
+
+def set_aside_residual(
+    low: float | None, high: float | None, seen: float, expected: float, parameters: FloatArray, share: float
+) -> Residual:
+    """Return what a peak that was set aside holds, against what the model that fits the rest expects in it.
+
+    Args:
+        low: lower limit, e-; None: no limit.
+        high: upper limit, e-; None: no limit.
+        seen: samples that it holds.
+        expected: samples that the model expects.
+        parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
+        share: of the remaining gap.
+    """
+    gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))
+    ends = (-0.5 if low is None else low, (low or 0.0) + 1.0 if high is None else high)
+    dn = tuple(int(np.round(bias + end / gain)) for end in ends)
+    z = float(_signed_root(np.array([seen]), np.array([max(expected, 1e-9)]))[0])
+    return _residual(ends[0], ends[1], (dn[0], dn[1]), seen, expected, z, 0.0, share)
+
+
+def _residual(
+    low: float,
+    high: float,
+    dn: tuple[int, int],
+    seen: float,
+    expected: float,
+    z: float,
+    p: float,
+    share: float,
+) -> Residual:
+    more = "more" if z > 0 else "fewer"
+    words = (
+        f"{more} samples than the model has {place_words(low, high)} (DN {dn[0]} to {dn[1]}: "
+        f"{seen:.3g} seen, {expected:.3g} expected)"
+    )
+    return Residual(words, "+" if z > 0 else "-", z, p, dn, seen, expected, share)
+
+
+def _contribution(seen: FloatArray, expected: FloatArray) -> FloatArray:
+    """Return what codes contribute to the gap, nats: ``o log(o / e) - o + e``."""
+    return np.asarray(special.kl_div(seen, np.maximum(expected, 1e-9)))
+
+
+def _signed_root(seen: FloatArray, expected: FloatArray) -> FloatArray:
+    """Return the signed root of the Poisson deviance, about N(0, 1) by chance."""
+    return np.asarray(np.sign(seen - expected) * np.sqrt(2.0 * special.kl_div(seen, expected)))
+
+
+def closing(residuals: Sequence[Residual], most: int = 3) -> str:
+    """Return the residuals in one clause."""
+    return "; ".join(r.words for r in residuals[:most])

@@ -1,0 +1,1 @@
+"""Effects named by simulating them: fingerprints, replicates, rounds."""

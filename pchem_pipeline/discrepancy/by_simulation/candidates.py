@@ -1,0 +1,284 @@
+"""The candidates: every effect's guesses about itself, what they would do, and how strong they must be."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
+
+__all__ = ["REPEATS", "Laboratory", "Mapper", "candidate_classes", "placebo_for", "serial"]
+
+FloatArray = NDArray[np.float64]
+Vector = Mapping[str, float]
+#: Runs replicates and returns their statistics in the same order; an exception in place of those that failed.
+Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
+
+_log = logging.getLogger(__name__)
+_MOST_HYPOTHESES = 6  # of one effect
+_REFINED = 12  # hypotheses of which the strength is refined by a second simulation
+_CLOSE = 0.15  # relative: a strength known so well is not simulated again
+_LARGEST_STEP = 30.0
+REPEATS = 3  # simulations of the hypotheses that sets are made of
+# standard deviations of what a single simulation may show by chance, below and above which it is nothing or
+# all of it; of the mean of several, in its own standard errors
+_CHANCE, _CERTAIN = 2.0, 4.0
+_CHANCE_OF_MEAN, _CERTAIN_OF_MEAN = 1.0, 2.0
+
+
+def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
+    """Do the work here, one after the other."""
+    found: list[Vector | Exception] = []
+    for replicate in replicates:
+        try:
+            found.append(replicate())
+        except PchEmError as error:
+            found.append(error)
+    return found
+
+
+def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
+    """Return the effects to consider by tag; those that no such frames can show are not among them.
+
+    Raises:
+        ConfigError: a candidate is unknown.
+    """
+    known = effect_classes()
+    wanted = tuple(known) if settings.candidates is None else settings.candidates
+    unknown = sorted(({*wanted, *settings.exclude}) - set(known))
+    if unknown:
+        broken = "; ".join(f"{name}: {why}" for name, why in broken_plugins().items())
+        raise ConfigError(
+            f"discrepancy.candidates: unknown effects {', '.join(unknown)}; known are {', '.join(known)}"
+            + (f" (left out: {broken})" if broken else "")
+        )
+    return {tag: known[tag] for tag in wanted if tag not in settings.exclude and not known[tag].untestable}
+
+
+def placebo_for(guesses: Sequence[Effect], classes: Mapping[str, type[Effect]]) -> list[Effect]:
+    """Return an effect for which nothing speaks and that is no relative of those for which something does.
+
+    It is fitted like the others: a gap that it closes as well proves nothing.
+    """
+    guessed = {effect.tag: type(effect) for effect in guesses}
+    related = {tag for effect in guessed.values() for tag in effect.separate}
+    for tag in sorted(classes):
+        effect = classes[tag]
+        if tag in guessed or tag in related or guessed.keys() & effect.separate.keys() or not effect.strength:
+            continue
+        try:
+            typical = effect.typical()
+        except Exception:
+            continue  # it was left out, or will be, where it is asked for its guesses
+        if typical:
+            return [typical[0]]
+    return []
+
+
+@dataclass
+class Laboratory:
+    """Simulates what candidates would do on top of the present model.
+
+    Attributes:
+        maps: parameters of the pixels under the model.
+        model: effects that the model has.
+        acquisition: of the split that is simulated.
+        names: of the statistics.
+        mapper: who does the work.
+        prefix: begins the keys of its replicates.
+        seed: of the random numbers that all candidates share.
+        left_out: candidates that failed, and why.
+    """
+
+    maps: PixelMaps
+    model: tuple[Effect, ...]
+    acquisition: Acquisition
+    names: tuple[str, ...]
+    mapper: Mapper
+    prefix: str
+    seed: int
+    left_out: dict[str, str] = field(default_factory=dict)
+    _rows: dict[str, FloatArray] = field(default_factory=dict)
+
+    def guesses(self, classes: Mapping[str, type[Effect]], evidence: Sequence[Evidence]) -> list[Effect]:
+        """Ask every candidate for hypotheses; one that raises is left out.
+
+        The first evidence in which a candidate sees anything counts. A guess says only what to look at:
+        strengths are fitted on one split and scored on the other, both ways round.
+        """
+        found: list[Effect] = []
+        for tag, effect in classes.items():
+            if tag in {present.tag for present in self.model} | self.left_out.keys():
+                continue
+            try:
+                guessed = next(filter(None, (list(effect.estimate(one)) for one in evidence)), [])
+                found += guessed[:_MOST_HYPOTHESES]
+            # whatever a stranger's estimator raises must not stop the others
+            except Exception as error:
+                self._leave_out(tag, error)
+        return found
+
+    def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
+        """Simulate effects on the random numbers of the model without them; failures are left out.
+
+        Args:
+            effects: with their parameters.
+            repeats: simulations of each; what moves a statistic by less than chance does in a single one is
+                lost there, and that is what tells relatives apart.
+        """
+        if not effects:
+            return []
+        shown = [effect.representative(self.acquisition.numbers) for effect in effects]
+        self._simulate([None, *(effect for effect, _ in shown)], repeats)
+        base = self._known(None, repeats)
+        return [
+            Hypothesis(effect, share * _without_chance(self._known(one, repeats) - base))
+            for effect, (one, share) in zip(effects, shown, strict=True)
+            if all(self._replicate(one, j).key in self._rows for j in range(repeats))
+        ]
+
+    def _simulate(self, effects: Sequence[Effect | None], repeats: int) -> None:
+        """Simulate the model with each effect, and with none (which must succeed), unless that is known."""
+        tasks = [(effect, self._replicate(effect, j)) for effect in effects for j in range(repeats)]
+        new = {task.key: (effect, task) for effect, task in tasks if task.key not in self._rows}
+        results = self.mapper([task for _, task in new.values()]) if new else []
+        for (effect, task), result in zip(new.values(), results, strict=True):
+            if not isinstance(result, Exception):
+                self._rows[task.key] = self._row(result)
+            elif effect is None:
+                raise result
+            else:
+                self._leave_out(effect.tag, result)
+
+    def _known(self, effect: Effect | None, repeats: int) -> FloatArray:
+        """Return the statistics of the model with an effect, shape (repeat, statistic)."""
+        return np.array([self._rows[self._replicate(effect, j).key] for j in range(repeats)])
+
+    def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
+        """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
+
+        Those are simulated several times in the end.
+        """
+        fits = [fit_set([h], shift, noise) for h in hypotheses]
+        order = np.argsort([-fit.log_score(shift, noise) for fit in fits], kind="stable")
+        chosen = [int(i) for i in order[:_REFINED] if fits[i].factors[0] > 0.0]
+        tuned = self.tuned([(hypotheses[i],) for i in chosen], shift, noise, steps=2, close=_CLOSE)
+        sharp = {id(h.effect): h for h in self.fingerprints([one.effect for (one,) in tuned], REPEATS)}
+        better = {i: sharp.get(id(one.effect), one) for i, (one,) in zip(chosen, tuned, strict=True)}
+        return [better.get(int(i), hypotheses[i]) for i in order]
+
+    def tuned(
+        self,
+        sets: Sequence[tuple[Hypothesis, ...]],
+        shift: FloatArray,
+        noise: Noise,
+        *,
+        steps: int,
+        close: float,
+        repeats: int = 1,
+    ) -> list[tuple[Hypothesis, ...]]:
+        """Tune the strengths within each set, by simulation; a step that predicts worse is halved.
+
+        Extrapolation alone is not enough: a line that drowns, or a clipped tail, is far from any power law.
+
+        Args:
+            sets: of hypotheses whose effects are in the data together.
+            shift: what they shall explain, shape (m,).
+            noise: of the shift.
+            steps: simulations of each hypothesis, at most.
+            close: relative change of a strength that is not worth a simulation.
+            repeats: simulations of each at each strength.
+        """
+        states = [_Tuning(one, _as_simulated(one, shift, noise)) for one in sets]
+        for _ in range(steps):
+            proposals = [state.proposal(shift, noise, close) for state in states]
+            effects = [effect for proposal in proposals for effect in proposal]
+            simulated = {id(h.effect): h for h in self.fingerprints(effects, repeats)}
+            for state, proposal in zip(states, proposals, strict=True):
+                new = tuple(simulated[id(e)] for e in proposal if id(e) in simulated)
+                if new and len(new) == len(proposal):
+                    state.judge(new, _as_simulated(new, shift, noise))
+        return [state.best for state in states]
+
+    def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
+        text = json.dumps([] if effect is None else [effect.model_dump(mode="json")], sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
+        effects = self.model if effect is None else (*self.model, effect)
+        return Replicate(f"{self.prefix}-{label}", self.maps, effects, self.seed + repeat, self.acquisition)
+
+    def _row(self, vector: Vector) -> FloatArray:
+        return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
+
+    def _leave_out(self, tag: str, error: Any) -> None:
+        self.left_out[tag] = (
+            f"{type(error).__name__}: {error}" if not isinstance(error, PchEmError) else str(error)
+        )
+        _log.warning("effect %s left out: %s", tag, self.left_out[tag])
+
+
+def _without_chance(shifts: FloatArray) -> FloatArray:
+    """Return the mean shift of simulations, (repeat, statistic), without what is likely chance.
+
+    The random numbers are shared with the model without the effect, but where every sample moves a little the
+    histograms are drawn anew; regressed on such chance, every strength would come out too low.
+    """
+    mean, repeats = shifts.mean(axis=0), shifts.shape[0]
+    low, high, error = _CHANCE, _CERTAIN, np.ones_like(mean)
+    if repeats > 1:
+        scatter = shifts.std(axis=0, ddof=1)
+        # few simulations do not know their scatter well: never below that of most statistics
+        error = np.maximum(scatter, np.sqrt(np.mean(scatter**2))) / np.sqrt(repeats)
+        low, high = _CHANCE_OF_MEAN, _CERTAIN_OF_MEAN
+    weight = np.clip((np.abs(mean) - low * error) / np.maximum((high - low) * error, 1e-12), 0.0, 1.0)
+    return np.asarray(mean * weight)
+
+
+@dataclass
+class _Tuning:
+    """A set whose strengths are being tuned.
+
+    Attributes:
+        best: the set that predicts best so far, at simulated strengths.
+        score: its log score.
+        refused: steps from it that predicted worse.
+    """
+
+    best: tuple[Hypothesis, ...]
+    score: float
+    refused: int = 0
+
+    def proposal(self, shift: FloatArray, noise: Noise, close: float) -> tuple[Effect, ...]:
+        """Return the effects at the strengths to try next; none where they are what the data ask for."""
+        fit = fit_set(self.best, shift, noise)
+        if fit.settled(close) or not any(h.effect.strength for h in self.best):
+            return ()
+        factors = np.clip(fit.factors, 1.0 / _LARGEST_STEP, _LARGEST_STEP) ** (0.5**self.refused)
+        effects = tuple(h.rescaled(float(c)) for h, c in zip(self.best, factors, strict=True))
+        return () if all(e == h.effect for e, h in zip(effects, self.best, strict=True)) else effects
+
+    def judge(self, new: tuple[Hypothesis, ...], score: float) -> None:
+        """Keep the better one."""
+        if score > self.score:
+            self.best, self.score, self.refused = new, score, 0
+        else:
+            self.refused += 1
+
+
+def _as_simulated(hypotheses: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise) -> float:
+    """Return the log score of a set at the very strengths that were simulated."""
+    n = len(hypotheses)
+    return SetFit(hypotheses, np.ones(n), np.zeros(n), np.zeros(n, np.bool_)).log_score(shift, noise)

@@ -1,0 +1,130 @@
+"""One simulated stack, seen as the measured one is: the unit of work of everything that follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe.observe import fitted_maps, observe
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.simulate.chain import dn_dtype, simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+
+__all__ = ["Acquisition", "Replicate", "simulate_frames", "truth_of"]
+
+_QUANTISATION_VARIANCE = 1.0 / 12.0
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """How the frames of a split were taken.
+
+    Attributes:
+        numbers: frame numbers in the run, whole blocks, shape (n,).
+        n_run: frames of the whole run.
+        block_frames: frames in a block.
+        bit_depth: bits of the ADC.
+        integration_time: s.
+        beside: numbers of further frames from which, together with these, the pixels' fits are begun; None:
+            they are begun at the truth, which is faster, and the same where no pixel's bias can be mistaken.
+    """
+
+    numbers: NDArray[np.int64]
+    n_run: int
+    block_frames: int
+    bit_depth: int
+    integration_time: float = 1.0
+    beside: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True)
+class Replicate:
+    """A stack to simulate from maps and effects, and to observe.
+
+    Attributes:
+        key: names it among all others of a run of the workflow.
+        maps: parameters of the pixels.
+        effects: of the model, in their order.
+        seed: root of its random numbers; equal seeds share them whatever the effects.
+        acquisition: which frames.
+    """
+
+    key: str
+    maps: PixelMaps
+    effects: tuple[Effect, ...]
+    seed: int
+    acquisition: Acquisition
+
+    def evidence(self) -> Evidence:
+        """Simulate and observe."""
+        taken, start = self.acquisition, self.maps
+        if taken.beside is None:
+            frames = simulate_frames(self.maps, self.effects, self.seed, taken)
+        else:
+            seen = np.union1d(taken.numbers, taken.beside)
+            frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
+            start = fitted_maps(frames, ~self.maps.usable)
+            frames = frames[np.isin(seen, taken.numbers)]
+        return observe(
+            frames,
+            taken.numbers,
+            n_run=taken.n_run,
+            block_frames=taken.block_frames,
+            exclude=~start.usable,
+            start=start,
+        )
+
+    def __call__(self) -> dict[str, float]:
+        """Simulate, observe, and return the statistics by name."""
+        return {name: float(value) for name, value in self.evidence().z.items()}
+
+
+def simulate_frames(
+    maps: PixelMaps, effects: tuple[Effect, ...], seed: int, taken: Acquisition
+) -> NDArray[np.unsignedinteger]:
+    """Return the frames (frame, y, x) of a split, DN, simulated from fitted maps with effects."""
+    shape = maps.bias.shape
+    settings = SimulateSettings(
+        shape=(shape[0], shape[1]),
+        n_frames=taken.n_run,
+        seed=seed,
+        bit_depth=taken.bit_depth,
+        integration_time=taken.integration_time,
+        effects=effects,
+    )
+    truth = truth_of(maps)
+    out = np.empty((taken.numbers.size, *shape), dn_dtype(taken.bit_depth))
+    position = 0
+    for first, last in _runs(taken.numbers):
+        n = last - first
+        out[position : position + n], _ = simulate_block(truth, settings, (first, last), electron_frames=0)
+        position += n
+    return out
+
+
+def truth_of(maps: PixelMaps) -> TruthMaps:
+    """Return fitted maps as the truth of a simulated sensor; unusable pixels get medians."""
+    values = {}
+    for item in fields(PixelMaps):
+        if item.name != "usable":
+            one = np.array(getattr(maps, item.name), np.float64)
+            one[~maps.usable] = np.median(one[maps.usable])
+            values[item.name] = one
+    analog = np.sqrt(np.maximum(values["read_noise_dn"] ** 2 - _QUANTISATION_VARIANCE, 0.0))
+    return TruthMaps(
+        quanta_exposure=values["quanta_exposure"],
+        conversion_gain=values["conversion_gain"],
+        bias=values["bias"],
+        analog_read_noise_e=analog * values["conversion_gain"],
+        defect=np.zeros(maps.usable.shape, np.uint8),
+    )
+
+
+def _runs(numbers: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return the ranges of consecutive frame numbers, ends excluded."""
+    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
+    return [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, breaks)]

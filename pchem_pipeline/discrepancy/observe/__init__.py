@@ -1,0 +1,1 @@
+"""From frames to the vector of statistics that model and data are compared by."""

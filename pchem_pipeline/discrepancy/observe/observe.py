@@ -1,0 +1,310 @@
+"""From a stack of frames, measured or simulated, to the evidence and its vector of statistics.
+
+One function for both, so that whatever the histogram, the fit and the tables do to the data they do to the
+replicates too. It is deterministic, and a function of the data only: the fit is that of the plain PCD,
+whatever the model of the run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError, PchEmError
+from pchem_pipeline.discrepancy.observe import tables_numba as column
+from pchem_pipeline.discrepancy.observe.laws import poisson
+from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
+from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, marginal_statistics
+from pchem_pipeline.discrepancy.observe.vector_frames import (
+    FrameView,
+    frame_statistics,
+    pixel_lags,
+    quadrant_series,
+    quadrant_sums,
+    time_statistics,
+)
+from pchem_pipeline.discrepancy.observe.vector_space import neighbour_sums, space_statistics
+from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.histogram.count import histogram_frames
+
+__all__ = ["MINIMUM_BLOCKS", "UNTRUSTWORTHY", "fitted_maps", "observe", "observe_histograms"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MINIMUM_BLOCKS = 4
+#: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for. Nor is a
+#: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
+#: with an unambiguous sample would bias the statistics of the rest.
+UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
+_MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
+
+
+def observe(
+    frames: NDArray[np.unsignedinteger[Any]],
+    numbers: IntArray,
+    *,
+    n_run: int,
+    block_frames: int,
+    fit: FitSettings | None = None,
+    exclude: NDArray[np.bool_] | None = None,
+    start: PixelMaps | None = None,
+) -> Evidence:
+    """Return the evidence of a split of the frames.
+
+    Args:
+        frames: codes (n, y, x), DN.
+        numbers: their frame numbers in the run, increasing, (n,).
+        n_run: frames of the whole run.
+        block_frames: frames in a block; blocks begin anew where numbers are missing.
+        fit: settings of the fit; the defaults if None.
+        exclude: pixels not to look at, (y, x).
+        start: parameters near those of these frames, where they are known: saves time.
+
+    Raises:
+        InputError: the frames are fewer than four blocks, or not as described.
+        PchEmError: no pixel is usable.
+    """
+    _check(frames, numbers, block_frames)
+    shape = frames.shape[1:]
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
+    outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
+    wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
+    origin = histograms.origin.ravel().astype(np.int64)
+    evidence, laws = _marginal(
+        counts, origin, outside, wanted.ravel(), fit, (shape[0], shape[1]),
+        (histograms.minimum.ravel(), histograms.maximum.ravel()), start,
+    )  # fmt: skip
+    edges = blocks_of(numbers, block_frames)
+    maps = evidence.maps
+    pixels = pixel_statistics(
+        laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), maps.usable.shape
+    )
+    sums = sum_frames(frames, numbers, edges, laws, pixels)
+    view = FrameView(sums, pixels, numbers, edges, block_frames)
+    chance = _chance_of_repeats(counts, outside, frames.shape, sums.consecutive)
+    lags = pixel_lags(view)
+    z = {
+        **evidence.z,
+        "tail.high.clusters": _clusters(sums.hits, laws, frames.shape),
+        **time_statistics(view, lags),
+        **frame_statistics(view, chance),
+        **space_statistics(view),
+    }
+    return replace(evidence, time=_time_series(view, lags, n_run), z=in_order(z))
+
+
+def observe_histograms(
+    counts: NDArray[np.unsignedinteger[Any]], origin: IntArray, *, fit: FitSettings | None = None
+) -> Evidence:
+    """Return the evidence of ready-made histograms: no time, no neighbours.
+
+    Args:
+        counts: one histogram per pixel, (n, B).
+        origin: DN of bin 0, (n,).
+        fit: settings of the fit; the defaults if None.
+
+    Returns:
+        Evidence with maps of shape (1, n) and ``time`` None.
+
+    Raises:
+        PchEmError: no pixel is usable.
+    """
+    n = counts.shape[0]
+    filled = counts > 0
+    low = origin + np.argmax(filled, axis=1)
+    high = origin + counts.shape[1] - 1 - np.argmax(filled[:, ::-1], axis=1)
+    every = np.ones(n, np.bool_)
+    return _marginal(counts, origin.astype(np.int64), np.zeros((n, 2)), every, fit, (1, n), (low, high))[0]
+
+
+def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
+    if frames.ndim != 3 or frames.dtype.kind != "u" or numbers.shape != frames.shape[:1] or block_frames < 1:
+        raise InputError(
+            f"frames {frames.dtype}{frames.shape} with {numbers.shape} numbers in blocks of {block_frames}; "
+            "give unsigned frames (frame, y, x) and one number for each"
+        )
+    if frames.shape[0] < MINIMUM_BLOCKS * block_frames:
+        raise InputError(
+            f"{frames.shape[0]} frames are fewer than {MINIMUM_BLOCKS} blocks of {block_frames}; take more "
+            "frames or shorter blocks"
+        )
+
+
+def _marginal(
+    counts: NDArray[Any],
+    origin: IntArray,
+    outside: FloatArray,
+    wanted: NDArray[np.bool_],
+    fit: FitSettings | None,
+    shape: tuple[int, int],
+    extremes: tuple[NDArray[Any], NDArray[Any]],
+    near: PixelMaps | None = None,
+) -> tuple[Evidence, PixelLaws]:
+    """Fit the histograms and compare them with their laws."""
+    result, parameters, usable = _fitted(counts, origin, outside, wanted, fit, near)
+    inside = counts.sum(axis=1)
+    laws = pixel_laws(counts, origin, outside, parameters, usable)
+    good = laws.good
+    if not good.any():
+        raise PchEmError(
+            f"none of the {good.size} pixels has a fit that can be relied upon; see the flags of the fit"
+        )
+    masked = np.where(good[:, None], parameters, np.nan)
+    moments = np.where(good[:, None], laws.moments, np.nan)
+    residuals = CodeResiduals(
+        laws.first_code,
+        laws.codes[0],
+        laws.codes[1],
+        int(extremes[0][good].min()),
+        int(extremes[1][good].max()),
+    )
+
+    def tail(seen: int) -> NDArray[np.uint32]:
+        return np.where(good, laws.moments[:, seen], 0.0).reshape(shape).astype(np.uint32)
+
+    evidence = Evidence(
+        maps=_maps(masked, good.reshape(shape)),
+        n_frames=int((inside + outside.sum(axis=1)).max()),
+        charge_std=moments[:, column.MODEL_STD_K].reshape(shape),
+        readout_std=moments[:, column.MODEL_STD_R].reshape(shape),
+        scores={
+            name: np.where(good, laws.scores[:, 0, j], np.nan).reshape(shape).astype(np.float32)
+            for j, name in enumerate(SCORES)
+        },
+        goodness=np.where(good, goodness_of(laws.moments), np.nan).reshape(shape).astype(np.float32),
+        tail_low=tail(column.SEEN_LOW),
+        tail_high=tail(column.SEEN_HIGH),
+        code=residuals,
+        time=None,
+        z=in_order(marginal_statistics(laws, parameters[:, 0], residuals)),
+        covariance=result.covariance.reshape(*shape, 4, 4),
+        ambiguous=float(np.mean((result.fit_status[good] & FitStatus.BIAS_AMBIGUOUS) != 0)),
+    )
+    return evidence, laws
+
+
+def _fitted(
+    counts: NDArray[Any],
+    origin: IntArray,
+    outside: FloatArray,
+    wanted: NDArray[np.bool_],
+    fit: FitSettings | None,
+    near: PixelMaps | None,
+) -> tuple[FitResult, FloatArray, NDArray[np.bool_]]:
+    """Return the fit, its parameters (n, 4), and which pixels can be used."""
+    start = None
+    if near is not None:
+        known = (near.quanta_exposure, near.conversion_gain, near.bias, near.read_noise_dn)
+        start = np.stack([values.ravel() for values in known], axis=1)
+    # every sample counts here: what the tail guard would leave out is what is looked for
+    settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
+    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
+    parameters = np.stack(
+        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
+    )
+    usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
+    usable &= outside.sum(axis=1) <= _MOST_OUTSIDE * counts.sum(axis=1)
+    return result, parameters, usable
+
+
+def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:
+    """Return the plain fit of some frames, from nothing, as :func:`observe` makes it.
+
+    Args:
+        frames: codes (n, y, x), DN.
+        exclude: pixels not to look at, (y, x).
+    """
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
+    outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
+    origin = histograms.origin.ravel().astype(np.int64)
+    _, parameters, usable = _fitted(counts, origin, outside, ~exclude.ravel(), None, None)
+    return _maps(np.where(usable[:, None], parameters, np.nan), usable.reshape(exclude.shape))
+
+
+def _maps(parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelMaps:
+    exposure, gain, bias, noise = (np.ascontiguousarray(m).reshape(usable.shape) for m in parameters.T)
+    return PixelMaps(exposure, gain, bias, noise, usable)
+
+
+def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
+    """Return the statistic of hits next to each other in the same frame, chance coincidences expected."""
+    n, ny, nx = shape
+    expected = np.zeros((ny + 2, nx + 2))
+    expected[1:-1, 1:-1] = np.where(laws.good, laws.moments[:, column.EXPECTED_HIGH], 0.0).reshape(ny, nx)
+    neighbours = expected[1:-1, 2:] + expected[2:, 2:] + expected[2:, 1:-1] + expected[2:, :-2]
+    chance = float((expected[1:-1, 1:-1] * neighbours).sum() / n)
+    keys = {(int(t), int(y), int(x)) for t, y, x in hits[:, :3]}
+    pairs = sum(
+        (t, y + dy, x + dx) in keys for t, y, x in keys for dy, dx in ((0, 1), (1, 1), (1, 0), (1, -1))
+    )
+    return poisson(pairs, chance)
+
+
+def _chance_of_repeats(
+    counts: NDArray[Any], outside: FloatArray, shape: tuple[int, ...], consecutive: int
+) -> tuple[float, float]:
+    """Return how many frames and rows are expected to repeat the one before by chance."""
+    real = counts.astype(np.float32)
+    total = np.maximum(real.sum(axis=1) + outside.sum(axis=1), 1.0)
+    alike = np.einsum("ib,ib->i", real, real) / total**2
+    same = np.log(np.maximum(alike, 1e-12)).reshape(shape[1:]).sum(axis=1)
+    return consecutive * float(np.exp(min(same.sum(), 0.0))), consecutive * float(
+        np.exp(np.minimum(same, 0)).sum()
+    )
+
+
+def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
+    sums, pixels = view.sums, view.pixels
+    usable = pixels.usable
+    exposure, number = pixels.exposure, usable.astype(np.float64)
+
+    def over(values: FloatArray, count: FloatArray) -> FloatArray:
+        return np.asarray(values / np.maximum(count, 1e-300) * (count > 0))
+
+    def mapped(values: FloatArray) -> NDArray[np.float32]:
+        return np.where(usable, values, np.nan).astype(np.float32)
+
+    k, r = sums.rows[:2].sum(axis=0), sums.rows[2:].sum(axis=0)
+    length = np.diff(view.edges)[:, None, None]
+    found = {
+        f"{axis}.{kind}": (correlation, pairs)
+        for axis in ("x", "y")
+        for kind, (correlation, pairs, _) in neighbour_sums(view, axis).items()
+    }
+    return TimeSeries(
+        frames=view.numbers,
+        n_run=n_run,
+        block_frames=view.block_frames,
+        block_start=view.numbers[view.edges[:-1]],
+        frame_charge=k.sum(axis=1) / exposure.sum(),
+        frame_readout=r.sum(axis=1) / number.sum(),
+        frame_gain=sums.gain,
+        quadrant_charge=over(quadrant_series(sums.rows[:2]), quadrant_sums(exposure)),
+        quadrant_readout=over(quadrant_series(sums.rows[2:]), quadrant_sums(number)),
+        row_charge=over(k, number.sum(axis=1)).astype(np.float32),
+        row_readout=over(r, number.sum(axis=1)).astype(np.float32),
+        column_charge=over(sums.columns[0], number.sum(axis=0)).astype(np.float32),
+        column_readout=over(sums.columns[1], number.sum(axis=0)).astype(np.float32),
+        block_charge=mapped(sums.blocks[:, 0] / length),
+        block_readout=mapped(sums.blocks[:, 1] / length),
+        lag_charge=mapped(lags[:3]),
+        lag_readout=mapped(lags[3:6]),
+        lag_readout_charge=mapped(lags[6]),
+        lag_charge_readout=mapped(lags[7]),
+        n_pairs=sums.n_pairs[0],
+        neighbours={name: value[0] for name, value in found.items()},
+        neighbour_pairs={name: value[1] for name, value in found.items()},
+        repeated=view.numbers[sums.repeated],
+        repeated_rows=sums.repeated_rows,
+        hits=np.column_stack([view.numbers[sums.hits[:, 0]], sums.hits[:, 1:]]).astype(np.int64),
+    )

@@ -1,0 +1,257 @@
+"""Loops of :mod:`pchem_pipeline.discrepancy.observe.sums`: one pass over the frames of a split.
+
+The frames go through in chunks that stay in the cache. Every sample becomes (k, r) by its pixel's table; the
+common mode of each frame is subtracted before products of different pixels or frames are summed. The inner
+loops run over x with one sum each, over whole arrays by index, so that the compiler can use vector
+instructions; views of the rows would cost more than the work on a short row.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["LAGS", "count_repeats", "find_hits", "sum_block"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Float32Array = NDArray[np.float32]
+
+LAGS = 3
+
+
+@njit(nogil=True, cache=True)
+def _look_up(
+    frames: NDArray[Any],
+    support: NDArray[np.int32],
+    tables: Float32Array,
+    y: int,
+    done: int,
+    size: int,
+    charge: Float32Array,
+    readout: Float32Array,
+) -> None:
+    """Turn the codes of a row into k and r; codes beyond the support count as its ends."""
+    for j in range(size):
+        for x in range(frames.shape[2]):
+            first = support[y, 0, x]
+            code = min(max(np.int32(frames[done + j, y, x]), first), support[y, 1, x])
+            at = support[y, 2, x] + (code - first)
+            charge[LAGS + j, y, x] = tables[at, 0]
+            readout[LAGS + j, y, x] = tables[at, 1]
+
+
+@njit(nogil=True, cache=True)
+def _sum_half(
+    charge: Float32Array, readout: Float32Array, weights: Float32Array, j: int, y: int, begin: int, end: int
+) -> tuple[Any, Any, Any]:
+    """Return the sums of k, r and r (w_0 k + w_1) over part of a row.
+
+    In single precision: over a row that costs a millionth of the spread of the sum. Two sums at a time, since
+    each addition waits for the one before.
+    """
+    k0 = k1 = r0 = r1 = g0 = g1 = np.float32(0.0)
+    x = begin
+    while x < end - 1:
+        k, r = charge[j, y, x], readout[j, y, x]
+        k0 += k
+        r0 += r
+        g0 += r * (weights[0, y, x] * k + weights[1, y, x])
+        k, r = charge[j, y, x + 1], readout[j, y, x + 1]
+        k1 += k
+        r1 += r
+        g1 += r * (weights[0, y, x + 1] * k + weights[1, y, x + 1])
+        x += 2
+    if x < end:
+        k, r = charge[j, y, x], readout[j, y, x]
+        k0 += k
+        r0 += r
+        g0 += r * (weights[0, y, x] * k + weights[1, y, x])
+    return k0 + k1, r0 + r1, g0 + g1
+
+
+@njit(nogil=True, cache=True)
+def _sum_rows(
+    charge: Float32Array,
+    readout: Float32Array,
+    weights: Float32Array,
+    y: int,
+    done: int,
+    size: int,
+    rows: FloatArray,
+    gain: FloatArray,
+) -> None:
+    half, nx = charge.shape[2] // 2, charge.shape[2]
+    for j in range(size):
+        t = done + j
+        left = _sum_half(charge, readout, weights, LAGS + j, y, 0, half)
+        right = _sum_half(charge, readout, weights, LAGS + j, y, half, nx)
+        rows[0, t, y], rows[1, t, y] = left[0], right[0]
+        rows[2, t, y], rows[3, t, y] = left[1], right[1]
+        gain[t] += left[2] + right[2]
+
+
+@njit(nogil=True, cache=True)
+def _add(
+    values: Float32Array, channel: int, y: int, done: int, size: int, columns: Float32Array, block: FloatArray
+) -> None:
+    """Add the rows of a chunk to the sums of columns, frame by frame, and of pixels."""
+    for j in range(size):
+        for x in range(values.shape[2]):
+            columns[done + j, channel, x] += values[LAGS + j, y, x]
+    for j in range(size):
+        for x in range(values.shape[2]):
+            block[channel, y, x] += values[LAGS + j, y, x]
+
+
+@njit(nogil=True, cache=True)
+def _subtract(values: Float32Array, pattern: Float32Array, amount: np.float32, j: int) -> None:
+    for y in range(pattern.shape[0]):
+        for x in range(pattern.shape[1]):
+            values[j, y, x] -= amount * pattern[y, x]
+
+
+@njit(nogil=True, cache=True)
+def _add_lagged(
+    now: Float32Array,
+    before: Float32Array,
+    lag: int,
+    y: int,
+    done: int,
+    size: int,
+    which: int,
+    total: FloatArray,
+) -> None:
+    """Add products of frames ``lag`` apart; those before the block's first frame do not exist."""
+    for j in range(max(0, lag - done), size):
+        for x in range(now.shape[2]):
+            total[which, y, x] += now[LAGS + j, y, x] * before[LAGS + j - lag, y, x]
+
+
+@njit(nogil=True, cache=True)
+def _add_neighbours(
+    charge: Float32Array, readout: Float32Array, y: int, dy: int, dx: int, size: int, total: FloatArray
+) -> None:
+    """Add the products kk, rr, r k + k r of a row with the pixels ``dy`` rows and ``dx`` columns on."""
+    for j in range(LAGS, LAGS + size):
+        for x in range(charge.shape[2] - dx):
+            total[0, y, x] += charge[j, y, x] * charge[j, y + dy, x + dx]
+        for x in range(charge.shape[2] - dx):
+            total[1, y, x] += readout[j, y, x] * readout[j, y + dy, x + dx]
+        for x in range(charge.shape[2] - dx):
+            one = readout[j, y, x] * charge[j, y + dy, x + dx]
+            total[2, y, x] += one + charge[j, y, x] * readout[j, y + dy, x + dx]
+
+
+@njit(nogil=True, cache=True)
+def sum_block(
+    frames: NDArray[Any],
+    support: NDArray[np.int32],
+    tables: Float32Array,
+    modes: Float32Array,
+    weights: Float32Array,
+    norms: FloatArray,
+    charge: Float32Array,
+    readout: Float32Array,
+    rows: FloatArray,
+    columns: Float32Array,
+    gain: FloatArray,
+    block: FloatArray,
+    lags: FloatArray,
+    beside: FloatArray,
+    below: FloatArray,
+) -> None:
+    """Add one block of consecutive frames to the sums.
+
+    Args:
+        frames: codes (frame, y, x).
+        support: first code, last code, row of the first one in ``tables``, (y, 3, x).
+        tables: k and r, (rows, 2).
+        modes: H, and 1, in usable pixels, else 0, (2, y, x).
+        weights: of r k and of r in the gain, (2, y, x).
+        norms: sum of H, number of usable pixels.
+        charge: workspace (LAGS + frames in a chunk, y, x).
+        readout: the same.
+        rows: k left, k right, r left, r right of each row, (4, frame, y); to fill.
+        columns: sums of k and r of each column, (frame, 2, x); to add to.
+        gain: weighted sums of r k and r, (frame,); to add to.
+        block: sums of k and r of each pixel, (2, y, x); to add to.
+        lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x); to add to.
+        beside: products kk, rr, rk + kr with the next column, (3, y, x); to add to.
+        below: the same with the next row.
+    """
+    n, ny, _ = frames.shape
+    chunk = charge.shape[0] - LAGS
+    done = 0
+    while done < n:
+        size = min(chunk, n - done)
+        for y in range(ny):
+            _look_up(frames, support, tables, y, done, size, charge, readout)
+            _sum_rows(charge, readout, weights, y, done, size, rows, gain)
+            _add(charge, 0, y, done, size, columns, block)
+            _add(readout, 1, y, done, size, columns, block)
+        for j in range(size):
+            common_k = common_r = 0.0
+            for y in range(ny):
+                common_k += rows[0, done + j, y] + rows[1, done + j, y]
+                common_r += rows[2, done + j, y] + rows[3, done + j, y]
+            _subtract(charge, modes[0], np.float32(common_k / norms[0]), LAGS + j)
+            _subtract(readout, modes[1], np.float32(common_r / norms[1]), LAGS + j)
+        for y in range(ny):
+            for lag in range(1, LAGS + 1):
+                _add_lagged(charge, charge, lag, y, done, size, lag - 1, lags)
+                _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, lags)
+            _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, lags)
+            _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, lags)
+            _add_neighbours(charge, readout, y, 0, 1, size, beside)
+            if y < ny - 1:
+                _add_neighbours(charge, readout, y, 1, 0, size, below)
+        done += size
+        for j in range(LAGS):
+            charge[j] = charge[size + j]
+            readout[j] = readout[size + j]
+
+
+@njit(nogil=True, cache=True)
+def count_repeats(frames: NDArray[Any], consecutive: NDArray[np.bool_], repeated: NDArray[np.bool_]) -> int:
+    """Mark frames equal to the one before, and return the number of such rows in the other frames.
+
+    Args:
+        frames: codes (frame, y, x).
+        consecutive: whether a frame directly follows the one before it in the stack, (frame,).
+        repeated: to fill, (frame,).
+    """
+    n, ny, nx = frames.shape
+    found = 0
+    for t in range(1, n):
+        if not consecutive[t]:
+            continue
+        rows = 0
+        for y in range(ny):
+            x = 0
+            while x < nx and frames[t, y, x] == frames[t - 1, y, x]:
+                x += 1
+            rows += x == nx
+        if rows == ny:
+            repeated[t] = True
+        else:
+            found += rows
+    return found
+
+
+@njit(nogil=True, cache=True)
+def find_hits(frames: NDArray[Any], pixels: IntArray, last: IntArray, hits: IntArray) -> int:
+    """Fill ``hits`` (frame, y, x, DN) with samples of pixels (m, 2) above ``last``; return how many."""
+    found = 0
+    for i in range(pixels.shape[0]):
+        y, x = pixels[i]
+        for t in range(frames.shape[0]):
+            if np.int64(frames[t, y, x]) > last[i]:
+                if found < hits.shape[0]:
+                    hits[found, 0], hits[found, 1], hits[found, 2] = t, y, x
+                    hits[found, 3] = np.int64(frames[t, y, x])
+                found += 1
+    return found

@@ -1,0 +1,134 @@
+"""The exact law of every pixel over its codes: channel tables, efficient scores, goodness, code residuals.
+
+The mass of a code is that of the rounded PCD (differences of normal cdfs, Hendrickson et al. 2023, eq.
+PCD_RV_definition), so that coarse quantisation is no discrepancy. The scores are Rao's efficient scores: the
+part of a Hermite x Charlier polynomial that is orthogonal, in the Fisher metric of the mass, to the four
+directions in which the parameters move it; to first order the fit does not matter for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe import tables_numba as kernel
+from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS, supports
+from pchem_pipeline.model.law.pcd import QUANTISATION_VARIANCE
+
+__all__ = ["LONGEST_SUPPORT", "PixelLaws", "pixel_laws"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Pixels whose law covers more codes than this are not looked at.
+LONGEST_SUPPORT = 8192
+#: Samples expected beyond the support of a pixel on either side, at most.
+ALLOWED_BEYOND = 1e-2
+#: The same far beyond it, in all pixels together.
+ALLOWED_FAR_BEYOND = 1e-2
+_NEGLIGIBLE = 1e-5  # samples expected beyond the electron numbers considered, in all pixels
+_LONGEST_AXIS = 1 << 17
+_COARSE, _MOST_BINS = 16, 256
+_SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
+
+
+@dataclass(frozen=True)
+class PixelLaws:
+    """What the fitted law of n pixels and their histograms give.
+
+    Attributes:
+        good: pixels with a law, (n,); all else is meaningless elsewhere.
+        moments: columns of ``tables_numba`` (``MODEL_STD_K`` and so on), (n, N_MOMENTS).
+        scores: standardised score, its skewness and its kurtosis excess, (n, 3, 8).
+        support: first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good.
+        tables: k (e-) and r (DN) of every code of the support, minus their mean over the samples, (rows, 2).
+        first_code: DN of the first element of ``codes``.
+        codes: observed, expected, residual, its variance, (4, n_codes).
+        fold, fold_covariance: residuals by DN modulo 16.
+        bins, bin_covariance: score of a shift of the scale, its variance for given expectations, and
+            expectation by bins of 16 (or more) codes.
+    """
+
+    good: NDArray[np.bool_]
+    moments: FloatArray
+    scores: FloatArray
+    support: IntArray
+    tables: NDArray[np.float32]
+    first_code: int
+    codes: FloatArray
+    fold: FloatArray
+    fold_covariance: FloatArray
+    bins: FloatArray
+    bin_covariance: FloatArray
+
+
+def pixel_laws(
+    counts: NDArray[np.unsignedinteger],
+    origin: IntArray,
+    outside: FloatArray,
+    parameters: FloatArray,
+    usable: NDArray[np.bool_],
+) -> PixelLaws:
+    """Compare the histogram of every usable pixel with its fitted law.
+
+    Args:
+        counts: histograms, (n, B).
+        origin: DN of bin 0, (n,).
+        outside: samples below and above the histogram, (n, 2).
+        parameters: H, g, mu, sigma (with quantisation), (n, 4); anything where not usable.
+        usable: pixels to look at, (n,).
+    """
+    n = usable.size
+    natural = _natural(parameters, usable)
+    window, electrons = np.zeros((n, 2), np.int64), np.zeros((n, 2), np.int64)
+    samples = float(counts.sum(axis=1).max(initial=1)) + float(outside.sum(axis=1).max(initial=0.0))
+    supports(*np.ascontiguousarray(natural.T), np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
+    length = window[:, 1] - window[:, 0] + 1
+    good = usable & (length <= LONGEST_SUPPORT)
+    axis, n_codes = _code_axis(window[good])
+    coarse = _COARSE
+    while n_codes > coarse * _MOST_BINS:
+        coarse *= 2
+    n_bins = n_codes // coarse + 1
+    laws = PixelLaws(
+        good=good,
+        moments=np.zeros((n, kernel.N_MOMENTS)),
+        scores=np.full((n, 3, N_TESTS), np.nan),
+        support=np.tile(np.array([0, 1, 0]), (n, 1)),
+        tables=np.zeros((1 + int(length[good].sum()), 2), np.float32),
+        first_code=axis,
+        codes=np.zeros((4, n_codes)),
+        fold=np.zeros(16),
+        fold_covariance=np.zeros((16, 16)),
+        bins=np.zeros((3, n_bins)),
+        bin_covariance=np.zeros((n_bins, n_bins)),
+    )
+    kernel.summarise_pixels(
+        counts, origin, outside, natural, electrons, window, axis, coarse, ALLOWED_BEYOND,
+        ALLOWED_FAR_BEYOND / max(int(good.sum()), 1),
+        laws.moments, laws.scores, laws.good, laws.support, laws.tables, laws.codes,
+        laws.fold, laws.fold_covariance, laws.bins, laws.bin_covariance,
+    )  # fmt: skip
+    for covariance in (laws.fold_covariance, laws.bin_covariance):
+        covariance += np.tril(covariance, -1).T
+    return laws
+
+
+def _natural(parameters: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
+    """Return H, 1/g (DN), mu and the analog read noise (DN); harmless numbers for unusable pixels."""
+    exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
+    width = np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2))
+    return np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, width], axis=1))
+
+
+def _code_axis(window: IntArray) -> tuple[int, int]:
+    """Return the first DN and the length of the axis that holds the windows, or most of them."""
+    if window.size == 0:
+        return 0, 1
+    first, last = int(window[:, 0].min()), int(window[:, 1].max())
+    if last - first >= _LONGEST_AXIS:
+        first = max(first, int(np.median(window[:, 0])) - _LONGEST_AXIS // 2)
+        last = min(last, first + _LONGEST_AXIS - 1)
+    return first, last - first + 1

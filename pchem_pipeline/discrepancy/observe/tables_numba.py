@@ -1,0 +1,324 @@
+"""Loops of :mod:`pchem_pipeline.discrepancy.observe.tables`: what a pixel's law and its histogram give."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe.law_numba import (
+    N_COLUMNS,
+    N_NUISANCE,
+    NOTHING,
+    fill_law,
+    within,
+)
+from pchem_pipeline.discrepancy.observe.scores_numba import pixel_scores, whiten
+
+__all__ = ["N_MOMENTS", "summarise_pixels"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Columns of ``moments``, see :func:`_channels` for the first eight.
+N_MOMENTS = 19
+MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET_K = range(8)
+CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
+EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
+_FOLD = 16
+
+
+@njit(nogil=True, cache=True)
+def _goodness(
+    law: FloatArray, seen: FloatArray, expected: FloatArray, n: float, smallest: float
+) -> tuple[float, float, float]:
+    """Return Pearson's chi-square of merged codes, its mean and variance with the parameters fitted."""
+    chi2 = mean = inverse = 0.0
+    groups = 0
+    observed = wanted = 0.0
+    remaining = n
+    taken = np.zeros(N_NUISANCE)
+    last = seen.size - 1
+    for x in range(seen.size):
+        observed += seen[x]
+        wanted += expected[x]
+        for i in range(N_NUISANCE):
+            taken[i] += law[x, i]
+        if (wanted >= smallest and remaining - wanted >= smallest) or x == last:
+            if wanted <= 0.0:
+                break
+            chi2 += (observed - wanted) ** 2 / wanted
+            used = 0.0
+            for i in range(N_NUISANCE):
+                used += taken[i] * taken[i]
+                taken[i] = 0.0
+            mean += max(0.0, 1.0 - used * n / wanted)
+            inverse += 1.0 / wanted
+            groups += 1
+            remaining -= wanted
+            observed = wanted = 0.0
+    variance = 2.0 * mean + max(0.0, inverse - (groups * groups + 2.0 * groups - 2.0) / n)
+    return chi2, mean, variance
+
+
+@njit(nogil=True, cache=True)
+def _channels(
+    mass: FloatArray,
+    charge: FloatArray,
+    readout: FloatArray,
+    seen: FloatArray,
+    low: float,
+    high: float,
+    out: FloatArray,
+) -> None:
+    """Fill ``out`` with moments of the two channels, and centre their tables.
+
+    0, 1: standard deviations of k and r by the law. 2 .. 7 with the samples (those beyond the support count
+    as its ends), k and r centred: means of k^2, r^2, k r, k r^2, k^2 r^2, and the mean of k before centring.
+    """
+    last = mass.size - 1
+    total = mean_k = mean_r = square_k = square_r = 0.0
+    for x in range(mass.size):
+        total += mass[x]
+        mean_k += mass[x] * charge[x]
+        mean_r += mass[x] * readout[x]
+        square_k += mass[x] * charge[x] * charge[x]
+        square_r += mass[x] * readout[x] * readout[x]
+    out[0] = math.sqrt(max(0.0, square_k / total - (mean_k / total) ** 2))
+    out[1] = math.sqrt(max(0.0, square_r / total - (mean_r / total) ** 2))
+    n = low + high
+    mean_k, mean_r = low * charge[0] + high * charge[last], low * readout[0] + high * readout[last]
+    for x in range(mass.size):
+        n += seen[x]
+        mean_k += seen[x] * charge[x]
+        mean_r += seen[x] * readout[x]
+    mean_k /= n
+    mean_r /= n
+    for x in range(mass.size):
+        charge[x] -= mean_k
+        readout[x] -= mean_r
+        c = seen[x] + (low if x == 0 else 0.0) + (high if x == last else 0.0)
+        k, r = charge[x], readout[x]
+        out[2] += c * k * k / n
+        out[3] += c * r * r / n
+        out[4] += c * k * r / n
+        out[5] += c * k * r * r / n
+        out[6] += c * k * k * r * r / n
+    out[7] = mean_k
+
+
+@njit(nogil=True, cache=True)
+def _code_sums(
+    law: FloatArray,
+    seen: FloatArray,
+    expected: FloatArray,
+    shift: FloatArray,
+    n: float,
+    first: int,
+    origin: int,
+    coarse: int,
+    codes: FloatArray,
+    fold: FloatArray,
+    fold_covariance: FloatArray,
+    bins: FloatArray,
+    bin_covariance: FloatArray,
+) -> None:
+    """Add a pixel's residuals and covariance: per code, per code modulo 16, per bin of ``coarse`` codes.
+
+    In the bins they are weighted with what a shift of the scale does to each code, so that they sum to the
+    shift of the scale there.
+    Only the lower triangles of the covariances are filled.
+    """
+    size = seen.size
+    folded = np.zeros((N_NUISANCE, _FOLD))
+    begin = (first - origin) // coarse
+    n_bins = (first + size - 1 - origin) // coarse - begin + 1
+    binned = np.zeros((N_NUISANCE, n_bins))
+    for x in range(size):
+        residual = seen[x] - expected[x]
+        at, modulo = first + x - origin, (first + x) % _FOLD
+        b = at // coarse
+        used = 0.0
+        for i in range(N_NUISANCE):
+            u = law[x, i]
+            used += u * u
+            folded[i, modulo] += u
+            binned[i, b - begin] += u * shift[x]
+        codes[2, at] += residual
+        codes[3, at] += max(0.0, expected[x] - n * used)
+        fold[modulo] += residual
+        fold_covariance[modulo, modulo] += expected[x]
+        bins[0, b] += residual * shift[x]
+        bins[1, b] += expected[x] * shift[x] ** 2
+        bins[2, b] += expected[x]
+        bin_covariance[b, b] += expected[x] * shift[x] ** 2
+    for i in range(N_NUISANCE):
+        for a in range(_FOLD):
+            value = n * folded[i, a]
+            for b in range(a + 1):
+                fold_covariance[a, b] -= value * folded[i, b]
+        for a in range(n_bins):
+            value = n * binned[i, a]
+            for b in range(a + 1):
+                bin_covariance[begin + a, begin + b] -= value * binned[i, b]
+
+
+@njit(nogil=True, cache=True)
+def _count(
+    counts: NDArray[Any], origin: int, first: int, seen: FloatArray, axis: int, codes: FloatArray
+) -> tuple[float, float]:
+    """Spread a histogram over the support; return how many samples lie below and above it."""
+    seen[:] = 0.0
+    low = high = 0.0
+    for b in range(counts.size):
+        c = float(counts[b])
+        if c > 0.0:
+            x = origin + b - first
+            if x < 0:
+                low += c
+            elif x >= seen.size:
+                high += c
+            else:
+                seen[x] = c
+            at = origin + b - axis
+            if 0 <= at < codes.shape[1]:
+                codes[0, at] += c
+    return low, high
+
+
+@njit(nogil=True, cache=True)
+def _fill_tables(
+    law: FloatArray,
+    inverse: FloatArray,
+    exposure: float,
+    step: float,
+    offset: float,
+    electrons: IntArray,
+    table: FloatArray,
+) -> None:
+    """Fill ``table`` (2, code) with k = E[K | x] and r = x - mu - k / g; ``offset``: mu from the first DN."""
+    root = math.sqrt(exposure)
+    for x in range(law.shape[0]):
+        if inverse[x] > 0.0:
+            k = exposure + root * law[x, 1] * inverse[x]
+        else:  # between two peaks far apart
+            k = min(max(math.floor((x - offset) / step + 0.5), float(electrons[0])), float(electrons[1]))
+        table[0, x] = k
+        table[1, x] = x - offset - k * step
+
+
+@njit(nogil=True, cache=True)
+def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: FloatArray) -> None:
+    """Fill what is expected of each code, the parameters moved (first order) to suit the samples."""
+    total = np.zeros(N_NUISANCE)
+    for x in range(seen.size):
+        weight = seen[x] * inverse[x]
+        if weight > 0.0:
+            for i in range(N_NUISANCE):
+                total[i] += weight * law[x, i]
+    for x in range(seen.size):
+        for i in range(N_NUISANCE):
+            expected[x] += total[i] * law[x, i]
+
+
+@njit(nogil=True, cache=True)
+def summarise_pixels(
+    counts: NDArray[Any],
+    origin: IntArray,
+    outside: FloatArray,
+    parameters: FloatArray,
+    electrons: IntArray,
+    window: IntArray,
+    axis: int,
+    coarse: int,
+    allowed: float,
+    allowed_far: float,
+    moments: FloatArray,
+    scores: FloatArray,
+    good: NDArray[np.bool_],
+    support: IntArray,
+    tables: NDArray[np.float32],
+    codes: FloatArray,
+    fold: FloatArray,
+    fold_covariance: FloatArray,
+    bins: FloatArray,
+    bin_covariance: FloatArray,
+) -> None:
+    """Fill tables and sums of all pixels.
+
+    Args:
+        counts: histograms (n, B).
+        origin: DN of bin 0, (n,).
+        outside: samples below and above the histogram, (n, 2).
+        parameters: H, 1/g, mu, analog read noise in DN, (n, 4).
+        electrons: range of electron numbers, (n, 2).
+        window: range of codes of the law, (n, 2).
+        axis: DN of the first code of ``codes``.
+        coarse: codes in a bin of ``bins``.
+        allowed: samples expected beyond the support on either side, at most.
+        allowed_far: the same for samples far beyond.
+        moments: see the constants, (n, N_MOMENTS).
+        scores: standardised score, its skewness and kurtosis excess, (n, 3, N_TESTS).
+        good: pixels to do; unset where the parameters cannot be told apart, (n,).
+        support: first code and number of codes, and the row of the first one in ``tables``, (n, 3).
+        tables: k and r, centred on the samples, one pixel after the other; enough rows for all, (rows, 2).
+        codes: counts, expectation, residual and its variance per DN, (4, n_codes).
+        fold: residuals by DN modulo 16, (16,).
+        fold_covariance: theirs; only the lower triangle, as of all covariances.
+        bins: scores of a shift, variance for given expectations, and expectation per bin, (3, n_bins).
+        bin_covariance: of the residuals.
+    """
+    gram = np.empty((N_NUISANCE, N_COLUMNS))
+    used = 1  # row 0 is that of the pixels without a law
+    for p in range(counts.shape[0]):
+        if not good[p]:
+            continue
+        exposure, step, bias, width = parameters[p]
+        full = np.empty((window[p, 1] - window[p, 0] + 1, N_COLUMNS))
+        fill_law(exposure, step, bias - window[p, 0], width, electrons[p, 0], electrons[p, 1], full)
+        n = outside[p, 0] + outside[p, 1] + counts[p].sum()
+        low, high, below, above = within(full, n, allowed)
+        law, first = full[low : high + 1], window[p, 0] + low
+        size = high - low + 1
+        mass, inverse, seen, expected = np.empty(size), np.empty(size), np.empty(size), np.zeros(size)
+        for x in range(size):
+            mass[x] = law[x, 0]
+            inverse[x] = 1.0 / mass[x] if mass[x] > NOTHING else 0.0
+        table = np.empty((2, size))
+        _fill_tables(law, inverse, exposure, step, bias - first, electrons[p], table)
+        if not whiten(law, inverse, gram):
+            good[p] = False
+            continue
+        under, over = _count(counts[p], origin[p], first, seen, axis, codes)
+        _expect(law, inverse, seen, expected)
+        for x in range(full.shape[0]):
+            at = window[p, 0] + x - axis
+            if 0 <= at < codes.shape[1]:
+                codes[1, at] += expected[x - low] if low <= x <= high else n * full[x, 0]
+        pixel_scores(law, inverse, seen, gram, exposure, scores[p])
+        out = moments[p]
+        inside = seen.sum()
+        out[CHI2], out[CHI2_MEAN], out[CHI2_VARIANCE] = _goodness(law, seen, expected, inside, 5.0)
+        out[EXPECTED_LOW], out[EXPECTED_HIGH] = below, above
+        out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
+        _channels(mass, table[0], table[1], seen, out[SEEN_LOW], out[SEEN_HIGH], out)
+        far_low, far_high, out[EXPECTED_FAR_LOW], out[EXPECTED_FAR_HIGH] = within(full, n, allowed_far)
+        out[SEEN_FAR_LOW], out[SEEN_FAR_HIGH] = outside[p]
+        for b in range(counts.shape[1]):
+            at = origin[p] + b - window[p, 0]
+            if at < far_low:
+                out[SEEN_FAR_LOW] += counts[p, b]
+            elif at > far_high:
+                out[SEEN_FAR_HIGH] += counts[p, b]
+        support[p, 0], support[p, 1], support[p, 2] = first, size, used
+        for x in range(size):
+            tables[used + x, 0], tables[used + x, 1] = table[0, x], table[1, x]
+        used += size
+        if first >= axis and first + size <= axis + codes.shape[1]:
+            _code_sums(
+                law, seen, expected, table[1] / (width * width + 1.0 / 12.0), inside, first, axis, coarse,
+                codes, fold, fold_covariance, bins, bin_covariance,
+            )  # fmt: skip

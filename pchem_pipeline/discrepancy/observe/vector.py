@@ -1,0 +1,195 @@
+"""The vector of statistics: what the histograms alone give (shape, code, tail), and the order of all.
+
+Every statistic has its mean and variance from theory, so that it is about N(0, 1) where the PCD holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe import laws
+from pchem_pipeline.discrepancy.observe import tables_numba as column
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
+
+__all__ = ["STANDS_OUT", "goodness_of", "in_order", "marginal_statistics", "outliers", "without_skew"]
+
+FloatArray = NDArray[np.float64]
+
+#: A pixel beyond this many standard deviations counts as one that stands out.
+STANDS_OUT = 3.5
+_TAIL = 2.3262907903552504e-4  # of the normal distribution, above STANDS_OUT
+_ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
+_SHORT_END = 0.25
+_LOW, _HIGH = [column.SEEN_LOW, column.EXPECTED_LOW], [column.SEEN_HIGH, column.EXPECTED_HIGH]
+_FAR_LOW = [column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW]
+_FAR_HIGH = [column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH]
+_SMALLEST_EIGENVALUE = 0.02  # of residuals, relative to Poisson counts: below it the fits have absorbed them
+
+
+def in_order(found: Mapping[str, float]) -> dict[str, float]:
+    """Return the statistics that exist and are finite, in the order of the catalogue."""
+    return {name: float(found[name]) for name in STATISTICS if name in found and np.isfinite(found[name])}
+
+
+def outliers(z: FloatArray, *, two_sided: bool) -> float:
+    """Return the statistic of how many pixels stand out, z being N(0, 1) otherwise."""
+    count = int(np.sum((np.abs(z) if two_sided else z) > STANDS_OUT))
+    return laws.poisson(count, _TAIL * z.size * (2.0 if two_sided else 1.0))
+
+
+def without_skew(z: FloatArray, skewness: FloatArray) -> FloatArray:
+    """Return standardised sums with a known skewness as normal quantiles (Wilson and Hilferty 1931).
+
+    The gamma law behind it ends on its short side, where the cubic root is steep; real sums do not quite end.
+    """
+    skew = np.where(np.abs(skewness) < 1e-6, 1e-6, skewness)
+    root = np.cbrt(np.maximum(1.0 + 0.5 * skew * z, _SHORT_END))
+    return np.asarray(6.0 / skew * (root - 1.0) + skew / 6.0)
+
+
+def goodness_of(moments: FloatArray) -> FloatArray:
+    """Return the goodness of fit of each pixel as a normal quantile, 0 without degrees of freedom, (n,)."""
+    mean, variance = moments[:, column.CHI2_MEAN], moments[:, column.CHI2_VARIANCE]
+    some = mean > 0.5
+    z = laws.chi_square(moments[:, column.CHI2], np.where(some, mean, 1.0), np.where(some, variance, 2.0))
+    return np.where(some, z, 0.0)
+
+
+def marginal_statistics(
+    pixels: PixelLaws, exposure: FloatArray, residuals: CodeResiduals
+) -> dict[str, float]:
+    """Return the families shape, code and tail (but for the clusters, which need frames).
+
+    Args:
+        pixels: laws of the pixels; at least one is good.
+        exposure: H, (n,).
+        residuals: counts per DN, with the extremes of the good pixels.
+    """
+    good = pixels.good
+    found = _score_statistics(pixels.scores[good], np.log(exposure[good]))
+    moments = pixels.moments[good]
+    z = goodness_of(moments)
+    n = z.size
+    found["shape.goodness.mean"] = float(z.sum() / np.sqrt(n))
+    found["shape.goodness.chi"] = float((np.sum(z**2) - n) / np.sqrt(2.0 * n))
+    found["shape.goodness.cnt"] = outliers(z, two_sided=False)
+    for side, near, far in (
+        ("low", moments[:, _LOW], moments[:, _FAR_LOW]),
+        ("high", moments[:, _HIGH], moments[:, _FAR_HIGH]),
+    ):
+        found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
+        pixels_near = [np.count_nonzero(near[:, 0]), -np.expm1(-near[:, 1]).sum()]
+        pixels_far = [np.count_nonzero(far[:, 0]), -np.expm1(-far[:, 1]).sum()]
+        found[f"tail.{side}.pixels"] = _beyond(np.array(pixels_near), np.array(pixels_far))
+    return found | _code_statistics(pixels, residuals)
+
+
+def _beyond(near: FloatArray, far: FloatArray) -> float:
+    """Return the statistic of samples (seen, expected) beyond the support and far beyond it.
+
+    Few samples of heavy tails are far out, where none is expected; many of a lobe are near.
+    """
+    z = laws.poisson(int(near[0]), float(near[1]))
+    return laws.best(z, laws.poisson(int(far[0]), float(far[1]))) if far[0] > 0 else z
+
+
+def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str, float]:
+    found = {}
+    spread = log_exposure.std()
+    for j, name in enumerate(SCORES):
+        fit = np.isfinite(scores[:, 0, j])
+        z, skewness, kurtosis = scores[fit, :, j].T
+        n = int(z.size)
+        if n == 0:
+            continue
+        normal = without_skew(z, skewness)
+        found[f"shape.{name}.mean"] = float(z.sum() / np.sqrt(n))
+        found[f"shape.{name}.chi"] = float((z @ z - n) / np.sqrt(np.sum(np.maximum(2.0 + kurtosis, 1.0))))
+        found[f"shape.{name}.cnt"] = outliers(normal, two_sided=True)
+        if n >= 3 and spread > 1e-6:
+            slope = log_exposure[fit] - log_exposure[fit].mean()
+            found[f"shape.{name}.slope"] = float(slope @ z / np.sqrt(max(float(slope @ slope), 1e-300)))
+    return found
+
+
+def _code_statistics(pixels: PixelLaws, residuals: CodeResiduals) -> dict[str, float]:
+    found = _periods(pixels.fold, pixels.fold_covariance) if pixels.fold_covariance.trace() > 0 else {}
+    expected, variance = pixels.codes[1], np.maximum(pixels.codes[3], 0.05 * pixels.codes[1])
+    judged = expected >= _ENOUGH
+    z = np.where(judged, pixels.codes[2] / np.sqrt(np.where(judged, variance, 1.0)), 0.0)
+    middle = judged[:-2] & judged[1:-1] & judged[2:]
+    if middle.sum() >= 4:
+        # deviation from the mean of both neighbours; the variance of its square sum is that of white noise
+        # under the weights (-1/2, 1, -1/2), whose autocorrelation is (1, -2/3, 1/6)
+        rough = (z[1:-1] - 0.5 * (z[:-2] + z[2:]))[middle]
+        m = rough.size
+        found["code.rough"] = float(
+            laws.chi_square(np.sum(rough**2) / 1.5, m, 2.0 * m * (1 + 8 / 9 + 1 / 18))
+        )
+    if judged.any():
+        found["code.largest"] = laws.largest_normal(z[judged])
+    smooth = _absorbed_chi_square(
+        pixels.bins[0], pixels.bin_covariance, np.where(pixels.bins[2] >= _ENOUGH, pixels.bins[1], 0.0)
+    )
+    if np.isfinite(smooth):
+        found["code.smooth"] = smooth
+    at = np.array([residuals.maximum, residuals.minimum]) - residuals.first
+    found["code.top"] = _pile_up(residuals.observed, residuals.expected, int(at[0]))
+    found["code.bottom"] = _pile_up(
+        residuals.observed[::-1], residuals.expected[::-1], residuals.observed.size - 1 - int(at[1])
+    )
+    return found
+
+
+def _periods(fold: FloatArray, covariance: FloatArray) -> dict[str, float]:
+    """Return the statistics of residuals by DN modulo 16; each period without the shorter ones in it."""
+    code = np.arange(16)
+    sign = (-1.0) ** code
+    found = {"code.alternating": float(sign @ fold / np.sqrt(max(float(sign @ covariance @ sign), 1e-300)))}
+    scale = np.diag(covariance).clip(1e-300)
+    for period in (2, 4, 8, 16):
+        angles = [2.0 * np.pi * m * code / period for m in range(1, period // 2 + 1, 2)]
+        waves = [np.cos(a) for a in angles] + ([np.sin(a) for a in angles] if period > 2 else [])
+        basis = np.array(waves)
+        small = _absorbed_chi_square(
+            basis @ fold, basis @ covariance @ basis.T, np.diag(basis @ np.diag(scale) @ basis.T)
+        )
+        if np.isfinite(small):
+            found[f"code.period{period}"] = small
+    return found
+
+
+def _absorbed_chi_square(values: FloatArray, covariance: FloatArray, poisson: FloatArray) -> float:
+    """Return the normal quantile of the chi-square of correlated residuals, NaN where the fits absorb all.
+
+    Directions in which hardly any variance is left of that of Poisson counts are left out: there the
+    linear theory of the fits is not exact enough.
+    """
+    used = poisson > 0
+    if not used.any():
+        return float("nan")
+    scale = 1.0 / np.sqrt(poisson[used])
+    values = values[used] * scale
+    eigenvalues, vectors = np.linalg.eigh(covariance[np.ix_(used, used)] * np.outer(scale, scale))
+    kept = eigenvalues > _SMALLEST_EIGENVALUE
+    if not kept.any():
+        return float("nan")
+    projected = vectors.T[kept] @ values
+    return float(laws.chi_square(np.sum(projected**2 / eigenvalues[kept]), int(kept.sum())))
+
+
+def _pile_up(observed: FloatArray, expected: FloatArray, at: int) -> float:
+    """Return how surprising it is that no sample lies beyond a code and so many on it.
+
+    The chance of none beyond the extreme code is uniform over repetitions, and given some, the counts on it
+    follow a Poisson law: both as normal quantiles, averaged.
+    """
+    on = float(expected[at]) if 0 <= at < expected.size else 0.0
+    beyond = float(expected[max(at + 1, 0) :].sum())
+    count = int(observed[at]) if 0 <= at < observed.size else 1
+    return laws.extreme(max(count, 1), on, beyond)

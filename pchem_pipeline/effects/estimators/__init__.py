@@ -1,0 +1,1 @@
+"""Statistics that several effects use to guess their own strength."""

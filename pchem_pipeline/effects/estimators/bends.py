@@ -1,0 +1,160 @@
+"""Find a smooth bend of the ADC's transfer curve in the counts per code.
+
+A deviation ``delta(x)`` of the transfer curve moves the code edges by ``-delta``. The pixels' own fits take
+up what looks like a change of their H, g, mu or sigma; what they leave is computed here to first order, for
+a sample of pixels (the same projection as of an efficient score), summed over the codes and compared with
+the residuals for sines of many periods.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.effects.estimators.codes import usable_codes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+
+__all__ = ["Bend", "best_bend"]
+
+_PIXELS = 256
+_PERIODS = 48
+_MOST_CODES = 1500
+_SHORTEST = 8.0
+# fall of chi2 by two coefficients at one of some 20 independent periods: p about 0.02
+_LEAST_GAIN = 14.0
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A deviation ``amplitude sin(2 pi x / period + phase)``: LSB, DN, rad."""
+
+    amplitude: float
+    period: float
+    phase: float
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """A sample of pixels in their own windows of codes.
+
+    Attributes:
+        first: code of the first cell of each window, (n, 1).
+        density: of the samples at the cells' edges, per DN, (n, cells + 1).
+        mass: of the cells, (n, cells).
+        tangents: change of the masses with H, mu, sigma, g, orthonormal under ``1 / mass``, (n, 4, cells).
+    """
+
+    first: NDArray[np.int64]
+    density: NDArray[np.float64]
+    mass: NDArray[np.float64]
+    tangents: NDArray[np.float64]
+
+
+def best_bend(evidence: Evidence) -> list[Bend]:
+    """Return the bends that explain the residuals of the codes, the best first; none if none stands out."""
+    codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
+    chosen = _sample(evidence.maps)
+    if codes.size < 16 or chosen is None:
+        return []
+    pixels = _tangents(*chosen)
+    samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
+    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(expected), 4.0 * _SHORTEST), _PERIODS)
+    turned = np.outer(np.append(codes, codes[-1] + 1) - 0.5, 2.0 * np.pi / periods)
+    # per code and period what a sine and a cosine of 1 DN would leave, in standard errors
+    response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
+    designs = np.stack([response @ np.sin(turned), response @ np.cos(turned)], axis=2)
+    fits = [_fit(designs[:, i], residuals * np.sqrt(expected)) for i in range(_PERIODS)]
+    gains = np.array([gain for gain, _ in fits])
+    total = float((residuals**2 * expected).sum())
+    found = []
+    for place in np.argsort(-gains):
+        left = max(1.0, (total - gains[place]) / max(codes.size - 6, 1))
+        peak = gains[place] >= gains[max(place - 2, 0) : place + 3].max()
+        if gains[place] > _LEAST_GAIN * left and peak:
+            a, b = fits[place][1]
+            found.append(Bend(float(np.hypot(a, b)), float(periods[place]), float(np.arctan2(b, a))))
+    return found[:2]
+
+
+def _in_use(expected: NDArray[np.float64]) -> float:
+    """Return over how many DN the middle 98 % of the samples spread."""
+    share = np.cumsum(expected) / expected.sum()
+    return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
+
+
+def _sample(maps: PixelMaps) -> tuple[NDArray[np.float64], ...] | None:
+    """Return H, g, mu, sigma of pixels spread over the sensor, each (n, 1), without the widest histograms."""
+    every = [maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn]
+    parts = np.stack([part[maps.usable] for part in every]).astype(np.float64)
+    parts = parts[:, np.isfinite(parts).all(axis=0)]
+    if not parts.shape[1]:
+        return None
+    widths = (parts[0] + 6.0 * np.sqrt(parts[0])) / parts[1]
+    parts = parts[:, widths <= np.quantile(widths, 0.95)]
+    step = max(1, parts.shape[1] // _PIXELS)
+    return tuple(part[::step, None] for part in parts)
+
+
+def _tangents(
+    exposure: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    bias: NDArray[np.float64],
+    noise: NDArray[np.float64],
+) -> _Pixels:
+    """Return masses and tangents of the pixels' PCDs (exact rounded mass and its derivatives)."""
+    from scipy.special import gammaln, ndtr
+
+    sigma = np.sqrt(np.maximum(noise**2 - 1.0 / 12.0, 0.01))
+    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
+    most = int(np.ceil((exposure + 6.0 * np.sqrt(exposure) + 3.0).max()))
+    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
+    edges = first - 0.5 + np.arange(cells + 1)
+    cdf, density = np.zeros(edges.shape), np.zeros(edges.shape)
+    by_exposure, by_noise, by_gain = np.zeros(edges.shape), np.zeros(edges.shape), np.zeros(edges.shape)
+    for k in range(most + 1):
+        weight = np.exp(k * np.log(exposure) - exposure - gammaln(k + 1.0))
+        z = (edges - bias - k / gain) / sigma
+        below, bell = ndtr(z), np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+        cdf += weight * below
+        density += weight * bell / sigma
+        by_exposure += weight * (k / exposure - 1.0) * below
+        by_noise -= weight * bell * z
+        by_gain += weight * bell * k
+    mass = np.maximum(np.diff(cdf, axis=1), 1e-12)
+    raw = np.stack([np.diff(part, axis=1) for part in (by_exposure, -density, by_noise, by_gain)], axis=2)
+    tangents = np.linalg.qr(raw / np.sqrt(mass)[:, :, None])[0] * np.sqrt(mass)[:, :, None]
+    return _Pixels(first, density, mass, tangents.transpose(0, 2, 1))
+
+
+def _response(pixels: _Pixels, codes: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
+
+    Summed over the sample of pixels, with what their fits take up projected out.
+    """
+    n_cells = pixels.mass.shape[1]
+    total = np.zeros((codes.size + 2 * n_cells, codes.size + 2 * n_cells + 1))
+    cells = np.arange(n_cells)
+    for first, density, mass, tangents in zip(
+        pixels.first[:, 0] - codes[0] + n_cells, pixels.density, pixels.mass, pixels.tangents, strict=True
+    ):
+        if not 0 <= first <= total.shape[0] - n_cells:
+            continue
+        # a deviation at an edge moves the samples there into the upper cell
+        change = np.zeros((n_cells, n_cells + 1))
+        change[cells, cells] = density[:-1]
+        change[cells, cells + 1] = -density[1:]
+        change -= tangents.T @ (tangents / mass @ change)
+        total[first : first + n_cells, first : first + n_cells + 1] += change
+    return total[n_cells:-n_cells, n_cells:-n_cells]
+
+
+def _fit(design: NDArray[np.float64], scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return by how much a sine and a cosine lower chi2 of the codes, and their factors."""
+    factors: NDArray[np.float64] = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
+    return float((scaled**2).sum() - ((scaled - design @ factors) ** 2).sum()), factors

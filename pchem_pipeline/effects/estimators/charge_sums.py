@@ -1,0 +1,127 @@
+"""What the charge channel of the evidence says of the exposure: deviations in time, their noise, mixtures.
+
+The expected electron number ``k = E[K | x]`` answers to a change of the exposure by less than the electrons
+do: ``d E[k] / dH = Var(k) / H``, for the score of a Poisson law is ``(K - H) / H`` and ``Cov(k, K) =
+Var(k)``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.evidence import Evidence
+
+__all__ = ["BlockCharge", "ExposureCourse", "block_charge", "exposure_course", "exposure_nodes"]
+
+FloatArray = NDArray[np.float64]
+
+
+class ExposureCourse(NamedTuple):
+    """Relative deviation of the exposure of each frame from its mean, and its shot noise.
+
+    Attributes:
+        frames: frame numbers, shape (n,).
+        deviation: estimates, no unit, shape (n,).
+        variance: their variance if the exposure is constant, one for all.
+    """
+
+    frames: FloatArray
+    deviation: FloatArray
+    variance: float
+
+
+def exposure_course(evidence: Evidence) -> ExposureCourse | None:
+    """Return how the exposure common to all pixels went along, or None where time is not known.
+
+    Frame t has ``sum(k - H) / sum(H)`` of mean ``d_t sum(Var k) / sum(H)`` and variance ``sum(Var k) /
+    sum(H)^2``.
+    """
+    time, good = evidence.time, evidence.maps.usable
+    if time is None or time.frames.size < 8 or not good.any():
+        return None
+    variance, exposure = (
+        float(np.sum(values[good] ** power))
+        for values, power in ((evidence.charge_std, 2), (evidence.maps.quanta_exposure, 1))
+    )
+    if not (variance > 0 and exposure > 0):
+        return None
+    deviation = np.asarray(time.frame_charge, np.float64) * (exposure / variance)
+    return ExposureCourse(time.frames.astype(np.float64), deviation, 1.0 / variance)
+
+
+class BlockCharge(NamedTuple):
+    """Deviations of the block means of the usable pixels' charge, the part common to all of them taken away.
+
+    Attributes:
+        start, length: first frame and number of frames of each block, shape (b,).
+        deviation: e- of exposure (the slope Var(k) / H taken out), shape (b, n).
+        variance: of a single frame, e-^2 of exposure, shape (n,).
+        y, x: rows and columns of the pixels, shape (n,).
+    """
+
+    start: FloatArray
+    length: FloatArray
+    deviation: FloatArray
+    variance: FloatArray
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+
+
+def block_charge(evidence: Evidence) -> BlockCharge | None:
+    """Return how each pixel's exposure went along by blocks, or None with fewer than 4 blocks."""
+    time = evidence.time
+    if time is None or time.block_start.size < 4:
+        return None
+    good = evidence.maps.usable & (evidence.charge_std > 0) & (evidence.maps.quanta_exposure > 0)
+    if not good.any():
+        return None
+    last = np.append(np.searchsorted(time.frames, time.block_start[1:]), time.frames.size)
+    length = np.diff(np.append(np.searchsorted(time.frames, time.block_start[0]), last)).astype(np.float64)
+    exposure, variance = evidence.maps.quanta_exposure[good], evidence.charge_std[good] ** 2
+    charge = np.asarray(time.block_charge, np.float64)[:, good]
+    charge -= np.average(charge, axis=0, weights=length)
+    common = charge.sum(axis=1) / variance.sum()
+    slope = variance / exposure
+    deviation = (charge - common[:, None] * variance) / slope
+    y, x = np.nonzero(good)
+    return BlockCharge(time.block_start.astype(np.float64), length, deviation, exposure**2 / variance, y, x)
+
+
+def exposure_nodes(factors: ArrayLike, n: int = 3) -> tuple[FloatArray, FloatArray]:
+    """Return weights and nodes of a mixture of ``n`` exposures with the same first 2n moments as ``factors``.
+
+    Gauss's quadrature for the empirical law (Golub and Welsch 1969), from its moments by Lanczos's recursion.
+
+    Args:
+        factors: exposures relative to H, one for each frame, mean 1.
+        n: nodes; fewer where the factors take fewer values.
+
+    Returns:
+        Weights that sum to 1, and factors of mean 1, each (n,).
+    """
+    values = np.asarray(factors, np.float64).reshape(-1)
+    scale = float(values.std())
+    if scale < 1e-9:
+        return np.ones(1), np.ones(1)
+    z = (values - values.mean()) / scale
+    diagonal, off = np.zeros(n), np.zeros(n - 1)
+    before, current = np.zeros(z.size), np.full(z.size, z.size**-0.5)
+    size = n
+    for j in range(n):
+        step = z * current - (off[j - 1] * before if j else 0.0)
+        diagonal[j] = float(current @ step)
+        step = step - diagonal[j] * current
+        norm = float(np.linalg.norm(step))
+        if j == n - 1 or norm < 1e-6:
+            size = j + 1
+            break
+        off[j], before, current = norm, current, step / norm
+    matrix = np.diag(diagonal[:size]) + np.diag(off[: size - 1], 1) + np.diag(off[: size - 1], -1)
+    nodes, vectors = np.linalg.eigh(matrix)
+    weights = vectors[0] ** 2
+    nodes = 1.0 + scale * (nodes - weights @ nodes)
+    return weights / weights.sum(), np.maximum(nodes, 0.0)

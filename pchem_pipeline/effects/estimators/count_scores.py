@@ -1,0 +1,112 @@
+"""How much excess variance of the electron numbers a score of the second Charlier polynomial stands for.
+
+A law near Poisson with ``Var K = H + c V`` (c small) has the mass ``P(k; H) [1 + c V C2(k) / (2 H^2)]``, ``C2
+= (k - H)^2 - k``. Its efficient score (Rao 1948) is ``E[C2 | x] / 2``, with what the four parameters of the
+PCD can do taken away; the standardised score of N frames then has the mean ``c V / H^2 sqrt(N I)``, where I
+is the score's variance.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.evidence import Evidence
+
+__all__ = ["charlier_information", "count_excess"]
+
+FloatArray = NDArray[np.float64]
+
+# the information is smooth in both: nodes of its table, e-
+_EXPOSURES = np.geomspace(0.02, 60.0, 25)
+_NOISES = np.geomspace(0.08, 1.6, 14)
+_POINTS_PER_SIGMA = 4
+# standard deviations from what is expected beyond which a score is cut, and rounds of it
+_CUT = 4.0
+_ROUNDS = 4
+
+
+def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
+    """Return c and its standard error for ``Var K = H + c H^(2 + power)``, from the scores of C2.
+
+    Every pixel gives ``score = c H^power sqrt(N I) + noise of variance 1``; this is their least squares, with
+    pixels that are far off (another effect's) cut back.
+
+    Args:
+        evidence: what a split of the frames shows.
+        power: 0 for a relative variance of the exposure, -1 for an excess proportional to H.
+    """
+    maps, score = evidence.maps, evidence.scores.get("C2")
+    if score is None:
+        return 0.0, np.inf
+    good = maps.usable & np.isfinite(score) & (maps.quanta_exposure > 0)
+    exposure = maps.quanta_exposure[good]
+    noise = maps.read_noise_dn[good] * maps.conversion_gain[good]
+    slope = np.sqrt(evidence.n_frames * charlier_information(exposure, noise)) * exposure**power
+    weight = float(slope @ slope)
+    if not weight > 0:
+        return 0.0, np.inf
+    seen = np.asarray(score[good], np.float64)
+    excess = float(np.median(seen) / np.median(slope))
+    for _ in range(_ROUNDS):
+        expected = excess * slope
+        excess = float(slope @ (expected + np.clip(seen - expected, -_CUT, _CUT))) / weight
+    return excess, weight**-0.5
+
+
+def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return I, the variance per frame of the efficient score ``E[C2 | x] / 2``, e-^4.
+
+    Args:
+        exposure: H, e-, shape (n,).
+        noise: sigma_e, e-, shape (n,).
+
+    Returns:
+        Bilinear interpolation, in logarithms, of a table; shape (n,).
+    """
+    table = _table()
+    i, u = _place(np.log(_EXPOSURES), np.log(np.maximum(exposure, 1e-9)))
+    j, v = _place(np.log(_NOISES), np.log(np.maximum(noise, 1e-9)))
+    upper = (1 - v) * table[i + 1, j] + v * table[i + 1, j + 1]
+    information: FloatArray = np.exp((1 - u) * ((1 - v) * table[i, j] + v * table[i, j + 1]) + u * upper)
+    return information
+
+
+def _place(nodes: FloatArray, values: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    index = np.clip(np.searchsorted(nodes, values) - 1, 0, nodes.size - 2)
+    return index, np.clip((values - nodes[index]) / (nodes[index + 1] - nodes[index]), 0.0, 1.0)
+
+
+@functools.cache
+def _table() -> FloatArray:
+    return np.log([[_information(h, s) for s in _NOISES] for h in _EXPOSURES])
+
+
+def _information(exposure: float, noise: float) -> float:
+    """Return I of one pixel: sums over x of the densities of the PCD, eq. PCD of Hendrickson et al. 2023."""
+    spread = 6.0 * np.sqrt(exposure)
+    k = np.arange(max(0, int(exposure - spread)), int(exposure + spread + 8.0))
+    x = np.arange(k[0] - 6.0 * noise, k[-1] + 6.0 * noise, noise / _POINTS_PER_SIGMA)
+    log_mass = k * np.log(exposure) - exposure - np.cumsum(np.log(np.maximum(np.arange(k[-1] + 1), 1)))[k]
+    residual = (x[:, None] - k) / noise
+    joint = np.exp(log_mass - 0.5 * residual**2)
+    density = joint.sum(axis=1)
+    keep = density > 1e-30
+    share = joint[keep] / density[keep, None]
+    weight = density[keep] / density[keep].sum()
+    k, residual = np.broadcast_to(k, residual.shape)[keep], residual[keep]
+
+    def expected(score: FloatArray) -> FloatArray:
+        values: FloatArray = np.sqrt(weight) * (share * score).sum(axis=1)
+        return values
+
+    # the four parameters: exposure, bias, gain, read noise
+    tangent = [expected(s) for s in (k - exposure, residual, residual * k, residual**2 - 1.0)]
+    score = expected(0.5 * ((k - exposure) ** 2 - k))
+    basis = np.linalg.qr(np.stack(tangent, axis=1))[0]
+    left = score - basis @ (basis.T @ score)
+    return max(float(left @ left), 1e-30)

@@ -1,0 +1,237 @@
+"""The exact law of the rounded samples, one pixel at a time, and how far another law moves its scores.
+
+The efficient score of a polynomial ``He_a(r / sigma) C_b(k; H)`` (Hermite in the noise, Charlier in the
+counts) is its expectation given the code, less its projection on the scores of the four parameters of the
+PCD (Rao 1948; Neyman 1959). A law that differs from the PCD shifts the mean of that score; the shift of its
+standardised sum over ``n`` frames is ``n^(1/2)`` times a number that depends on the pixel's parameters alone.
+
+This is for estimating an effect from a few pixels that stand for all, so clarity comes before speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+__all__ = ["PixelLaw", "refitted", "select_pixels", "typical_pixels"]
+
+FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+#: polynomials (a, b) that the four parameters of the PCD take up: bias, exposure, gain, read noise
+_PARAMETERS = ((1, 0), (0, 1), (1, 1), (2, 0))
+_SMALLEST_MASS = 1e-100
+_SMALLEST_WIDTH = 0.1  # DN
+_ROUNDING = 1 / 12  # DN^2, of rounding to whole DN
+# samples expected beyond the codes of a pixel, on either side
+_ALLOWED = 1e-2
+# samples expected in a code for it to count in chi squared
+_FEWEST = 5.0
+# standard deviations of the noise, and electrons, that are considered beyond the peaks
+_REACH, _REACH_E = 12.0, 6.0
+# samples of a histogram without noise of its own
+_SAMPLES = 1e9
+
+
+def select_pixels(maps: PixelMaps, where: NDArray[np.intp]) -> PixelMaps:
+    """Return the parameters of some pixels, by their flat indices, each of that shape."""
+    names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "usable")
+    return PixelMaps(**{name: np.asarray(getattr(maps, name)).reshape(-1)[where] for name in names})
+
+
+def typical_pixels(maps: PixelMaps, n: int = 8) -> tuple[NDArray[np.intp], list[NDArray[np.intp]]]:
+    """Return up to n pixels that stand for all usable ones, and the pixels that each stands for.
+
+    They are the medians in ``sigma g`` (read noise, e-) of groups of equal size in H. Flat indices.
+    """
+    usable = np.flatnonzero(np.asarray(maps.usable))
+    if usable.size == 0:
+        return usable, []
+    exposure = np.asarray(maps.quanta_exposure).reshape(-1)
+    noise = (np.asarray(maps.read_noise_dn) * np.asarray(maps.conversion_gain)).reshape(-1)
+    order = usable[np.argsort(exposure[usable], kind="stable")]
+    groups = np.array_split(order, min(n, order.size))
+    chosen = [group[np.argsort(noise[group], kind="stable")[group.size // 2]] for group in groups]
+    return np.array(chosen, np.intp), groups
+
+
+class PixelLaw:
+    """The PCD of one pixel over the codes that its samples reach, and how another law differs from it.
+
+    What lies beyond the codes does not count: the tails of a sample are looked at by themselves.
+
+    Attributes:
+        maps: of that pixel, shape (1,) each.
+        codes: DN, shape (n,).
+        mass: of the PCD, exactly rounded, shape (n,).
+        charge: E[K | x], e-, shape (n,).
+        readout: x - mu - E[K | x] / g, DN, shape (n,).
+    """
+
+    def __init__(self, maps: PixelMaps, where: int, n_frames: int):
+        """Tabulate the PCD of one pixel of the maps, by its flat index, for that many samples."""
+        self.maps = select_pixels(maps, np.array([where]))
+        exposure, gain, bias, sigma = (
+            float(getattr(self.maps, name)[0])
+            for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+        )
+        analog = float(np.sqrt(max(sigma**2 - _ROUNDING, _SMALLEST_WIDTH**2)))
+        counts = _counts(exposure)
+        levels = bias + counts / gain
+        self._wide = _wide_codes(levels, analog, gain)
+        parts = [_hermite_cells(a, self._wide, levels, analog) for a in range(5)]
+        weights = [_poisson(counts, exposure) * _charlier(b, counts, exposure) for b in range(4)]
+        mass = weights[0] @ parts[0]
+        below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]
+        inside = (below * n_frames >= _ALLOWED) & (above * n_frames >= _ALLOWED)
+        self.codes = self._wide[inside]
+        # between narrow peaks there may be nothing
+        within = np.maximum(mass[inside], _SMALLEST_MASS)
+        self.mass = np.maximum(self.on_codes(self._wide, mass), _SMALLEST_MASS)
+        self._scores = {(a, b): (weights[b] @ parts[a])[inside] / within for a in range(5) for b in range(4)}
+        self.charge = ((weights[0] * counts) @ parts[0])[inside] / within
+        self.readout = self.codes - bias - self.charge / gain
+        self._nuisance = np.stack([np.ones(self.codes.size), *(self._scores[order] for order in _PARAMETERS)])
+
+    def on_codes(self, codes: FloatArray, mass: FloatArray) -> FloatArray:
+        """Return a mass over other codes as one over those of this law, whose sum is 1, shape (n,)."""
+        at = (codes - self.codes[0]).astype(np.intp)
+        here = (at >= 0) & (at < self.codes.size)
+        found: FloatArray = np.bincount(at[here], mass[here], self.codes.size).astype(np.float64)
+        return found / max(float(found.sum()), _SMALLEST_MASS)
+
+    def below(self, law: MarginalModel) -> float:
+        """Return the probability of a sample below the codes under a law."""
+        codes, mass = self.mass_of(law)
+        return float(mass[codes < self.codes[0]].sum())
+
+    def change(self, law: MarginalModel) -> FloatArray:
+        """Return the mass of the codes under a law less that under the PCD, shape (n,)."""
+        return self.on_codes(*self.mass_of(law)) - self.mass
+
+    def score_shift(self, name: str, change: FloatArray) -> float:
+        """Return the mean per sample of a standardised efficient score, no unit.
+
+        Times the root of the number of frames it is the expected score of the pixel.
+
+        Args:
+            name: the score, such as "He2C1".
+            change: of the mass, shape (n,).
+        """
+        wanted = self._scores[_orders(name)]
+        weighted = self._nuisance * self.mass
+        slopes = np.linalg.lstsq(weighted @ self._nuisance.T, weighted @ wanted, rcond=1e-9)[0]
+        efficient = wanted - slopes @ self._nuisance
+        deviation = np.sqrt(max(float((efficient**2) @ self.mass), _SMALLEST_MASS))
+        return float(efficient @ change) / float(deviation)
+
+    def goodness(self, change: FloatArray, n_frames: int) -> float:
+        """Return the goodness of fit to expect of samples whose mass is changed, as a normal quantile.
+
+        The cube root of chi squared is about normal (Wilson and Hilferty 1931).
+        """
+        expected = self.mass * n_frames
+        grouped = expected >= _FEWEST
+        degrees = max(int(grouped.sum()) - len(_PARAMETERS), 1)
+        excess = n_frames * float((change[grouped] ** 2 / self.mass[grouped]).sum())
+        width = 2.0 / (9.0 * degrees)
+        return float((np.cbrt(1.0 + excess / degrees) - (1.0 - width)) / np.sqrt(width))
+
+    def mass_of(self, law: MarginalModel) -> tuple[FloatArray, FloatArray]:
+        """Return codes, DN, somewhat beyond those of the PCD, and their mass under a law."""
+        from pchem_pipeline.model.fit.grown import marginal_mass
+
+        mass: FloatArray = marginal_mass(law, self.maps, self._wide)[0]
+        return self._wide, mass
+
+    def scaled(self, factor: float) -> MarginalModel:
+        """Return the law whose signal and noise are larger by a factor."""
+        return MarginalModel().with_levels(scale=factor).with_noise([1.0], width=factor)
+
+
+def refitted(
+    laws: Sequence[PixelLaw], masses: Sequence[tuple[FloatArray, FloatArray]], n_frames: int
+) -> list[PixelLaw]:
+    """Return the PCDs that are fitted to samples of other laws: what the fit of the pixels would find.
+
+    Args:
+        laws: PCDs of pixels.
+        masses: codes and mass of the samples of each.
+        n_frames: samples of a pixel.
+
+    Returns:
+        The fitted PCDs; that of ``laws`` where the fit fails.
+    """
+    from pchem_pipeline.model.fit.pchem import fit_histograms
+    from pchem_pipeline.model.fit.settings import FitSettings
+
+    origin = np.array([codes[0] for codes, _ in masses], np.int64)
+    counts = np.zeros((len(masses), max(codes.size for codes, _ in masses)), np.uint32)
+    for row, (_, mass) in zip(counts, masses, strict=True):
+        row[: mass.size] = np.rint(mass * _SAMPLES)
+    fit = fit_histograms(counts, origin, settings=FitSettings(tail_guard=0))
+    good = np.isfinite(fit.quanta_exposure)
+    maps = PixelMaps(fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn, good)
+    return [PixelLaw(maps, i, n_frames) if good[i] else laws[i] for i in range(len(laws))]
+
+
+def _orders(name: str) -> tuple[int, int]:
+    """Return (2, 1) of "He2C1"."""
+    hermite, _, charlier = name.partition("C")
+    return int(hermite.removeprefix("He") or 0), int(charlier or 0)
+
+
+def _counts(exposure: float) -> FloatArray:
+    spread = 10.0 * np.sqrt(exposure + 1.0)
+    return np.arange(max(0.0, np.floor(exposure - spread)), np.ceil(exposure + spread) + 1.0)
+
+
+def _wide_codes(levels: FloatArray, sigma: float, gain: float) -> FloatArray:
+    reach = max(_REACH * sigma, _REACH_E / gain + 4.0 * sigma)
+    return np.arange(np.floor(levels[0] - reach), np.ceil(levels[-1] + reach) + 1)
+
+
+def _poisson(counts: FloatArray, mean: float) -> FloatArray:
+    from scipy.special import gammaln, xlogy
+
+    found: FloatArray = np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0))
+    return found
+
+
+def _charlier(b: int, counts: FloatArray, mean: float) -> FloatArray:
+    """Return the monic Charlier polynomial of order b."""
+    before, now = np.zeros_like(counts), np.ones_like(counts)
+    for n in range(b):
+        before, now = now, (counts - n - mean) * now - n * mean * before
+    return now
+
+
+def _hermite_cells(a: int, codes: FloatArray, levels: FloatArray, sigma: float) -> FloatArray:
+    """Return the integral of He_a times the normal density over the cell of each code, (level, code)."""
+    if a == 0:
+        return _cells(codes, levels, np.full(levels.size, sigma))
+    edges = (np.append(codes - 0.5, codes[-1] + 0.5) - levels[:, None]) / sigma
+    before, now = np.zeros_like(edges), np.ones_like(edges)
+    for n in range(a - 1):
+        before, now = now, edges * now - n * before
+    # He_a phi is minus the derivative of He_{a-1} phi
+    found: FloatArray = -np.diff(now * np.exp(-0.5 * edges**2) / np.sqrt(2 * np.pi), axis=1)
+    return found
+
+
+def _cells(codes: FloatArray, levels: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Return the normal mass in the cell of each code, (level, code)."""
+    from scipy.special import ndtr
+
+    edges = (np.append(codes - 0.5, codes[-1] + 0.5) - levels[:, None]) / sigma[:, None]
+    # above the level the difference is taken of the upper tails, which keep their digits
+    above = -np.diff(ndtr(-edges), axis=1)
+    found: FloatArray = np.where(edges[:, :-1] > 0, above, np.diff(ndtr(edges), axis=1))
+    return found

@@ -1,0 +1,1 @@
+"""What an effect is, how it is found, composed and given evidence."""

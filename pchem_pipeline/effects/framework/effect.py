@@ -1,0 +1,222 @@
+"""What an effect is, and the registry of our own.
+
+An effect is one file in the folder of its plane: a frozen settings class that is at once its YAML
+section, its documentation and its forward model. It is a function of a block of frames and of random
+numbers keyed on position, so that the simulated frames do not depend on how the work is divided:
+
+- **independent samples** need nothing: return a new array of the same shape;
+- **common modes** draw one number per frame, row, column or run: ``context.random.normal(("frame", "y"))``;
+- **neighbours** declare ``halo``: the band is simulated with that many more rows on each side (as far as
+  the sensor goes), and they are cut off afterwards. Columns are always complete;
+- **short memory** declares ``history``: that many earlier frames are simulated too and cut off afterwards
+  (frames before the run have negative numbers and are as good as any other);
+- **long memory** (a drift, a Markov chain, a random walk) is a function of the frame number: computed from
+  ``context.frames``, or replayed from frame 0 with the pixel's own ``context.random.generator(y=, x=)``,
+  drawing dwell times rather than frames so that this stays cheap.
+
+Halos and histories of several effects add up.
+
+The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
+:attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
+(:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.marginal`), so that the
+fit of the four parameters can run with it. What it adds to the exposure of single pixels, it finds in the
+frames (:meth:`~Effect.added_exposure`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.framework.plane import Plane
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = ["Effect", "Plane", "register_effect", "registered_effects"]
+
+_registered: dict[str, type[Effect]] = {}
+
+
+class Effect(Section):
+    """Base of all effects.
+
+    A subclass is registered under the default of its ``tag`` and gives:
+
+    Attributes:
+        tag: name in the YAML and in verdicts; a ``Literal`` with one value, which is the default.
+        plane: where in the signal chain it acts, and so what :meth:`apply` gets (see :class:`Plane`).
+        title: its name in the literature.
+        source: where it is described.
+        signature: the statistics (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`) that it moves
+            first, the most telling one first.
+        strength: the parameter that scales it; 0 is no effect (a clipping limit and its like have none: "").
+        power: near zero the statistics grow like ``strength ** power``.
+        separate: for each effect that it is confused with (tag), the measurement that tells them apart.
+        erratic: whether its course is drawn anew in every simulation, so that a fingerprint is one of many
+            and another effect outdoes it only by a clear margin.
+        untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
+    """
+
+    tag: str
+    plane: ClassVar[Plane]
+    title: ClassVar[str] = ""
+    source: ClassVar[str] = ""
+    signature: ClassVar[tuple[str, ...]] = ()
+    strength: ClassVar[str] = ""
+    power: ClassVar[float] = 1.0
+    separate: ClassVar[Mapping[str, str]] = {}
+    erratic: ClassVar[bool] = False
+    untestable: ClassVar[str] = ""
+
+    @abstractmethod
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return what the plane becomes under this effect.
+
+        Args:
+            values: (frame, y, x), unit and dtype of the plane; not to be changed.
+            context: the block's frame numbers, rows, maps and random numbers.
+
+        Returns:
+            A new array of the same shape and dtype.
+        """
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at strengths met in practice, one for each of its kinds (signs, patterns).
+
+        Used as guesses where :meth:`estimate` has nothing better, and for demonstrations.
+        """
+        return ()
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return hypotheses about its parameters, the likeliest first; none where nothing speaks for it.
+
+        A hypothesis is only a guess: its strength is refined and its fingerprint compared with the evidence
+        afterwards, so a false one costs time and nothing else. The default is :meth:`typical` where the
+        leading statistics of the signature stand out.
+        """
+        return cls.typical() if evidence.strongest(*cls.signature[:2]) > 3.0 else ()
+
+    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+        """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
+
+        For effects of rare events: by chance a simulated stack holds none of them, or too many.
+
+        Args:
+            frames: numbers of the frames to be simulated, increasing, shape (n,).
+        """
+        return self, 1.0
+
+    def scaled(self, factor: float) -> Self:
+        """Return a copy of ``factor`` times the strength, kept within the limits of its field.
+
+        Raises:
+            ConfigError: if the effect has no strength to scale.
+        """
+        if not self.strength:
+            raise ConfigError(f"effect {self.tag!r} has no strength to scale")
+        values = self.model_dump()
+        values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
+        return type(self).model_validate(values)
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law of the pixels' samples with this effect: its place in the fit.
+
+        Args:
+            model: the law so far, of n pixels.
+            maps: parameters of these pixels, each (n,) (what is known before the fit with the effect).
+
+        Returns:
+            The law with the effect; the same one where it leaves a pixel's own histogram as it is.
+        """
+        return model
+
+    def added_exposure(
+        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+    ) -> AddedExposure | None:
+        """Return what it adds to the exposure of each pixel: H is then the exposure without.
+
+        For effects on single pixels, whose histograms show the mean exposure whatever it is made of.
+
+        Args:
+            frames: (frame, y, x), DN; not to be changed.
+            numbers: their numbers in the run, increasing, shape (frame,).
+            maps: plain fit of these pixels, (y, x) each.
+
+        Returns:
+            Levels and weights, (j, y, x) each; None where it adds nothing, or only in proportion to H.
+        """
+        return None
+
+    def halo(self) -> int:
+        """Return how many rows on either side a row depends on, px."""
+        return 0
+
+    def history(self) -> int:
+        """Return how many frames before it a frame depends on."""
+        return 0
+
+
+def _within(effect: type[Effect], name: str, value: float) -> float:
+    """Return the value cut to the limits that the field states."""
+    for limit in effect.model_fields[name].metadata:
+        low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
+        value = max(value, low) if low is not None else value
+        value = min(value, high) if high is not None else value
+    return value
+
+
+EffectClass = TypeVar("EffectClass", bound=type[Effect])
+
+
+def register_effect(effect: EffectClass) -> EffectClass:
+    """Register an effect of this package under its tag (class decorator).
+
+    Raises:
+        ConfigError: if it has no tag or plane, or another class has the tag.
+    """
+    tag = tag_of(effect)
+    known = _registered.get(tag)
+    if known is not None and known.__qualname__ + known.__module__ != effect.__qualname__ + effect.__module__:
+        raise ConfigError(
+            f"effect tag {tag!r} of {effect.__module__} is taken by {known.__module__}; choose another tag"
+        )
+    _registered[tag] = effect
+    return effect
+
+
+def registered_effects() -> dict[str, type[Effect]]:
+    """Return the effects registered so far by tag (see ``registry.effect_classes`` for all there are)."""
+    return dict(_registered)
+
+
+def tag_of(effect: type[Effect]) -> str:
+    """Return the tag of an effect class.
+
+    Raises:
+        ConfigError: if the class is not an :class:`Effect` with a tag, a plane and its own ``apply``.
+    """
+    where = f"{getattr(effect, '__module__', '?')}.{getattr(effect, '__qualname__', effect)}"
+    if not (isinstance(effect, type) and issubclass(effect, Effect)):
+        raise ConfigError(
+            f"{where} is not an effect; derive it from pchem_pipeline.effects.framework.effect.Effect"
+        )
+    tag = effect.model_fields["tag"].default
+    if not isinstance(tag, str) or not tag:
+        raise ConfigError(f'{where} has no tag; add a field `tag: Literal["name"] = "name"`')
+    if not isinstance(getattr(effect, "plane", None), Plane):
+        raise ConfigError(f"{where} has no plane; add `plane: ClassVar[Plane] = Plane....`")
+    if effect.apply is Effect.apply:
+        raise ConfigError(f"{where} does nothing; give it a method apply(self, values, context)")
+    return tag

@@ -1,0 +1,174 @@
+"""What a stack of frames shows beyond the PCD, as an effect's estimator is given it.
+
+Every sample x of a pixel with a fitted PCD is split in two (Hendrickson et al. 2023, eqs. gamma_nk,
+update_eqns): the **charge** channel ``k = E[K | x]``, the expected electron number, and the **readout**
+channel ``r = x - mu - k / g``, what is left. Both are functions of the code alone, so tables do it. An effect
+of the light or the dark current shows in one, an effect of the electronics in the other, and a coupling of
+the two in their products. The evidence is a set of sums over one subset of the frames (a *split*); it holds
+no samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = ["SCORES", "CodeResiduals", "Evidence", "PixelMaps", "TimeSeries"]
+
+#: Per-pixel efficient scores: products of Hermite (readout) and Charlier (charge) polynomials beyond the four
+#: that are the PCD's own parameters.
+SCORES = ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1")
+
+
+@dataclass(frozen=True)
+class PixelMaps:
+    """Fitted parameters of the pixels, each (y, x); NaN where ``usable`` is False.
+
+    Attributes:
+        quanta_exposure: H, e-.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        read_noise_dn: sigma, DN, quantisation included.
+        usable: pixels with a fit that can be relied upon.
+    """
+
+    quanta_exposure: NDArray[np.float64]
+    conversion_gain: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    read_noise_dn: NDArray[np.float64]
+    usable: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CodeResiduals:
+    """Counts per absolute DN, summed over the usable pixels.
+
+    Attributes:
+        first: DN of the first element.
+        observed: samples seen, shape (n_codes,).
+        expected: samples expected from the fitted PCDs (exact rounded mass), shape (n_codes,).
+        minimum, maximum: smallest and largest DN seen in the usable pixels.
+    """
+
+    first: int
+    observed: NDArray[np.float64]
+    expected: NDArray[np.float64]
+    minimum: int
+    maximum: int
+
+
+@dataclass(frozen=True)
+class TimeSeries:
+    """What is kept along time; None of it exists for ready-made histograms.
+
+    Frames come in blocks of ``block_frames`` consecutive frames; different blocks may be far apart.
+    Lagged products never cross the edge of a block.
+
+    Attributes:
+        frames: frame numbers in the run, increasing, shape (n,).
+        n_run: number of frames of the whole run.
+        block_frames: frames in a block (the last one may be shorter).
+        block_start: frame number of the first frame of each block, shape (n_blocks,).
+        frame_charge: sum over usable pixels of (k - H) divided by the sum of H: relative deviation of the
+            exposure of each frame, shape (n,).
+        frame_readout: mean of r over the usable pixels, DN, shape (n,).
+        frame_gain: slope of r against k - H over the usable pixels of a frame, in units of 1/g: relative
+            deviation of the gain (DN/e-) of each frame, shape (n,).
+        quadrant_charge, quadrant_readout: the same two for each quadrant (top left, top right, bottom left,
+            bottom right), shape (n, 4).
+        row_charge: mean of k - H of each row, e-, shape (n, y).
+        row_readout: mean of r of each row, DN, shape (n, y).
+        column_charge: mean of k - H of each column, e-, shape (n, x).
+        column_readout: mean of r of each column, DN, shape (n, x).
+        block_charge: mean of k - H of each pixel in each block, e-, shape (n_blocks, y, x).
+        block_readout: mean of r of each pixel in each block, DN, shape (n_blocks, y, x).
+        lag_charge: autocorrelation of k in each pixel at lags 1, 2, 3, after the frame's common mode was
+            removed as for the neighbours, and without the bias of a centred series, shape (3, y, x).
+        lag_readout: autocorrelation of r, shape (3, y, x).
+        lag_readout_charge: correlation of r at t with k at t - 1, shape (y, x).
+        lag_charge_readout: correlation of k at t with r at t - 1, shape (y, x).
+        n_pairs: number of pairs of frames behind a lag-1 correlation.
+        neighbours: correlation of neighbouring pixels in the same frame, mean over all pairs of usable
+            pixels: "x.kk", "x.rr", "x.rk" (readout of one with charge of the other, both ways) and the same
+            for "y", with the mean taken after the frame's common mode was removed.
+        neighbour_pairs: number of products behind each of them.
+        repeated: frame numbers that are, sample by sample, the frame before, shape (n_repeated,).
+        repeated_rows: number of rows (of frames not in ``repeated``) that are the same row of the frame
+            before.
+        hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
+            20,000.
+    """
+
+    frames: NDArray[np.int64]
+    n_run: int
+    block_frames: int
+    block_start: NDArray[np.int64]
+    frame_charge: NDArray[np.float64]
+    frame_readout: NDArray[np.float64]
+    frame_gain: NDArray[np.float64]
+    quadrant_charge: NDArray[np.float64]
+    quadrant_readout: NDArray[np.float64]
+    row_charge: NDArray[np.float32]
+    row_readout: NDArray[np.float32]
+    column_charge: NDArray[np.float32]
+    column_readout: NDArray[np.float32]
+    block_charge: NDArray[np.float32]
+    block_readout: NDArray[np.float32]
+    lag_charge: NDArray[np.float32]
+    lag_readout: NDArray[np.float32]
+    lag_readout_charge: NDArray[np.float32]
+    lag_charge_readout: NDArray[np.float32]
+    n_pairs: int
+    neighbours: Mapping[str, float]
+    neighbour_pairs: Mapping[str, int]
+    repeated: NDArray[np.int64]
+    repeated_rows: int
+    hits: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence of one split.
+
+    Attributes:
+        maps: plain PCD fit of this split, whatever the model of the run.
+        n_frames: samples of a pixel.
+        charge_std: standard deviation of k under the fitted PCD, e-, shape (y, x).
+        readout_std: standard deviation of r under the fitted PCD, DN, shape (y, x).
+        scores: standardised efficient score of each of :data:`SCORES`, about N(0, 1) under the PCD with the
+            four parameters fitted, NaN in unusable pixels, shape (y, x) each.
+        goodness: goodness of fit of each pixel as a standard normal quantile (large: poor), shape (y, x).
+        tail_low, tail_high: samples of each pixel beyond the support of its PCD (expected: below 1e-2 in the
+            whole split), uint32, shape (y, x).
+        code: counts per DN over the sensor.
+        time: what is kept along time and space; None for ready-made histograms.
+        z: the vector of statistics, each about N(0, 1) where the PCD holds, by name, in a fixed order
+            (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`). A statistic that these data cannot
+            give is absent.
+        covariance: of the pixels' (H, g, mu, sigma) in ``maps``, shape (y, x, 4, 4); None: not known.
+        ambiguous: share of the usable pixels whose bias may be off by an electron.
+    """
+
+    maps: PixelMaps
+    n_frames: int
+    charge_std: NDArray[np.float64]
+    readout_std: NDArray[np.float64]
+    scores: Mapping[str, NDArray[np.float32]]
+    goodness: NDArray[np.float32]
+    tail_low: NDArray[np.uint32]
+    tail_high: NDArray[np.uint32]
+    code: CodeResiduals
+    time: TimeSeries | None
+    z: Mapping[str, float] = field(default_factory=dict)
+    covariance: NDArray[np.float64] | None = None
+    ambiguous: float = 0.0
+
+    def strongest(self, *names: str) -> float:
+        """Return the largest |z| among the named statistics (0 where these data give none of them)."""
+        found: list[Any] = [abs(self.z[name]) for name in names if name in self.z]
+        return float(max(found, default=0.0))

@@ -1,0 +1,106 @@
+"""Find effects by tag: our own files, and those of other installed packages.
+
+Both are looked for only when somebody asks. Our own are the modules in the folders named after the
+planes, so that adding an effect touches no other file; others' are announced by entry points of
+the group ``pchem_pipeline.effects`` (name: the tag; value: ``package.module:Class``).
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import logging
+import pkgutil
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from types import MappingProxyType
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BeforeValidator, SerializeAsAny
+
+import pchem_pipeline.effects
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.effects.framework.effect import Effect, registered_effects, tag_of
+from pchem_pipeline.effects.framework.plane import Plane
+
+__all__ = ["ENTRY_POINT_GROUP", "EffectList", "broken_plugins", "effect_class", "effect_classes"]
+
+ENTRY_POINT_GROUP = "pchem_pipeline.effects"
+
+_log = logging.getLogger(__name__)
+
+
+class _Found(NamedTuple):
+    classes: Mapping[str, type[Effect]]
+    broken: Mapping[str, str]
+
+
+def effect_classes() -> Mapping[str, type[Effect]]:
+    """Return every effect by tag, ours and others', in alphabetical order."""
+    return _discover().classes
+
+
+def broken_plugins() -> Mapping[str, str]:
+    """Return the plug-ins that were left out, with the reason, by name of their entry point."""
+    return _discover().broken
+
+
+def effect_class(tag: str) -> type[Effect]:
+    """Return the effect of a tag.
+
+    Raises:
+        ConfigError: if there is none; names those there are and the plug-ins left out.
+    """
+    found = _discover()
+    if tag not in found.classes:
+        message = f"effect {tag!r} is unknown; known are {', '.join(found.classes)}"
+        if tag in found.broken:
+            message = f"effect {tag!r} comes from a plug-in that was left out: {found.broken[tag]}"
+        raise ConfigError(message)
+    return found.classes[tag]
+
+
+@functools.cache
+def _discover() -> _Found:
+    _import_own()
+    classes = registered_effects()
+    broken: dict[str, str] = {}
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        # whatever a stranger's import raises must not stop a run that does not use it
+        try:
+            effect = point.load()
+            tag = tag_of(effect)
+            if tag in classes:
+                raise ConfigError(f"tag {tag!r} is taken by {classes[tag].__module__}")
+        except Exception as error:
+            broken[point.name] = f"{point.value}: {type(error).__name__}: {error}"
+            _log.warning("effect plug-in %s left out: %s", point.name, broken[point.name])
+        else:
+            classes[tag] = effect
+    return _Found(MappingProxyType(dict(sorted(classes.items()))), MappingProxyType(broken))
+
+
+def _import_own() -> None:
+    root = pchem_pipeline.effects
+    for plane in Plane:
+        folder = importlib.import_module(f"{root.__name__}.{plane.value}")
+        for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
+            importlib.import_module(module.name)
+
+
+def _as_effect(entry: Any) -> Effect:
+    if isinstance(entry, Effect):
+        return entry
+    if isinstance(entry, str):
+        entry = {"tag": entry}
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("tag"), str):
+        raise ValueError(f"an effect needs a tag, for example `- tag: row_noise`; got {entry!r}")
+    try:
+        found = effect_class(entry["tag"])
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+    return found.model_validate(dict(entry))
+
+
+#: A list of effects in a YAML section: each is looked up by its tag and checked by its own class.
+EffectList = tuple[SerializeAsAny[Annotated[Effect, BeforeValidator(_as_effect)]], ...]

@@ -1,0 +1,26 @@
+"""YAML section ``model``: what the model of the data holds beyond the PCD."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.framework.registry import EffectList
+
+__all__ = ["ModelSettings"]
+
+
+class ModelSettings(Section):
+    """The model with which the pixels are fitted."""
+
+    effects: EffectList = Field(
+        default=(),
+        description="effects beyond the PCD with which pixels are fitted and ensembles predicted; "
+        "pchem discrepancy adds those that it names; a simulated camera has its own list, simulate.effects",
+    )
+    set_aside_e: tuple[tuple[float | None, float | None], ...] = Field(
+        default=(),
+        description="codes that the fit leaves out, since the model does not describe them: intervals of "
+        "their place on the comb of the plain fit, (x - bias) * gain, null for no limit ([[null, 0.5]] sets "
+        "the 0-electron peak aside), e-",
+    )

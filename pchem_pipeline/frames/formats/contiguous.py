@@ -1,0 +1,237 @@
+"""Frames that lie uncompressed in a file: read straight from their offsets into the caller's memory.
+
+Raw files, npy, SER, uncompressed TIFF and uncompressed FITS all come down to a table of byte offsets. Each
+call opens the file, reads by ``preadv`` and closes it: so threads do not disturb each other, a reader can
+be pickled,
+and thousands of files do not exhaust the file descriptors.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.identity import FileHasher
+from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+
+__all__ = ["ContiguousReader", "Layout", "OpenedFile", "unsigned_type", "unstore"]
+
+_MOST_BYTES = 1 << 30
+#: targets of one call of preadv
+_MOST_VECTORS = 1024
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the frames lie in a file, and how their samples are stored.
+
+    Attributes:
+        offsets: byte offset of each frame, (frames,).
+        rows: rows of a frame.
+        columns: columns of a frame.
+        stored: numpy type of a stored sample with its byte order; signed if ``biased`` or ``signed``.
+        biased: samples are signed integers with 2**(bits - 1) added to them by the header (FITS BZERO).
+        signed: samples are signed integers declared to be never negative; this is checked on reading.
+    """
+
+    offsets: NDArray[np.int64]
+    rows: int
+    columns: int
+    stored: np.dtype[Any]
+    biased: bool = False
+    signed: bool = False
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one frame."""
+        return self.rows * self.columns * self.stored.itemsize
+
+    @functools.cached_property
+    def in_order(self) -> bool:
+        """The frames lie one behind the other."""
+        return bool((np.diff(self.offsets) >= self.frame_bytes).all())
+
+    @property
+    def end(self) -> int:
+        """Byte behind the last frame."""
+        return int(self.offsets.max()) + self.frame_bytes if self.offsets.size else 0
+
+
+def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the native unsigned type of the same size."""
+    return np.dtype(f"=u{stored.itemsize}")
+
+
+class OpenedFile:
+    """A file open for one call, checked to be the one that was inspected.
+
+    Raises:
+        InputError: the file vanished or its size changed.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path = path
+        try:
+            self._handle = os.open(path, os.O_RDONLY)
+        except FileNotFoundError as error:
+            raise changed(path, "the file vanished") from error
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        if os.fstat(self._handle).st_size < size:
+            os.close(self._handle)
+            raise changed(path, "the file became shorter")
+
+    def __enter__(self) -> OpenedFile:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        os.close(self._handle)
+
+    def read_into(self, target: memoryview, offset: int) -> None:
+        """Fill the target (bytes) from the offset."""
+        done = 0
+        while done < len(target):
+            try:
+                count = os.preadv(self._handle, [target[done : done + _MOST_BYTES]], offset + done)
+            except OSError as error:
+                raise InputError(f"{self._path}: read error ({error.strerror}); check the disk") from error
+            if count == 0:
+                raise changed(self._path, "the file became shorter")
+            done += count
+
+    def scatter(self, targets: Sequence[memoryview], offset: int) -> None:
+        """Fill the targets (bytes) one after the other with what follows each other from the offset."""
+        for start in range(0, len(targets), _MOST_VECTORS):
+            batch = targets[start : start + _MOST_VECTORS]
+            wanted = sum(map(len, batch))
+            try:
+                count = os.preadv(self._handle, batch, offset) if wanted <= _MOST_BYTES else 0
+            except OSError as error:
+                raise InputError(f"{self._path}: read error ({error.strerror}); check the disk") from error
+            if count < wanted:  # a short read, or too much for one call: go on piece by piece
+                place = offset
+                for target in batch:
+                    self.read_into(target, place)
+                    place += len(target)
+            offset += wanted
+
+    def expect(self, offset: int, count: int) -> None:
+        """Let the disk fetch bytes that will be asked for, while these are worked on; no more than a hint."""
+        if hasattr(os, "posix_fadvise"):
+            with suppress(OSError):
+                os.posix_fadvise(self._handle, offset, count, os.POSIX_FADV_WILLNEED)
+
+    def read_bytes(self, offset: int, count: int) -> bytes:
+        """Return bytes from the offset."""
+        data = bytearray(count)
+        self.read_into(memoryview(data), offset)
+        return bytes(data)
+
+
+class ContiguousReader(FrameReader):
+    """A reader that needs nothing but a `Layout`."""
+
+    def _set_layout(self, path: Path, layout: Layout, size: int) -> None:
+        """Take the layout; ``size`` is the size of the file.
+
+        Raises:
+            InputError: the file is shorter than the layout says.
+        """
+        if layout.end > size:
+            whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
+            raise InputError(
+                f"{path}: truncated: {layout.offsets.size} frames need {layout.end} bytes, the file has "
+                f"{size} "
+                f"({whole} whole frames); copy the file again"
+            )
+        self.paths = (path,)
+        self.shape = (layout.offsets.size, layout.rows, layout.columns)
+        self.dtype = unsigned_type(layout.stored)
+        self._layout = layout
+        self._size = size
+
+    @property
+    def layout(self) -> Layout | None:
+        """Where the frames lie, or None where they have to be decoded."""
+        return getattr(self, "_layout", None)
+
+    def scatter(self, parts: Sequence[NDArray[Any]], t0: int, t1: int, hasher: FileHasher) -> None:
+        """Read whole frames into the bands of rows that make them up, and hash all bytes up to their end.
+
+        Args:
+            parts: C-contiguous, (t1 - t0, rows, columns) each, that cover the frames from top to bottom.
+            t0: first frame.
+            t1: end of the frames.
+            hasher: of this file; it stands before the first of the frames.
+
+        Raises:
+            InputError: the file vanished, changed or cannot be read.
+        """
+        layout = self._layout
+        bytes_of = [part.reshape(t1 - t0, -1).view(np.uint8) for part in parts]
+        with OpenedFile(self.paths[0], self._size) as file:
+            here, end = int(layout.offsets[t0]), int(layout.offsets[t1 - 1]) + layout.frame_bytes
+            file.expect(here, 2 * (end - here))
+            for first, count in _runs(layout.offsets[t0:t1], layout.frame_bytes):
+                start = int(layout.offsets[t0 + first])
+                hasher.read_to(start)
+                targets = [rows[i].data for i in range(first, first + count) for rows in bytes_of]
+                file.scatter(targets, start)
+                for target in targets:
+                    hasher.feed(target)
+        for part in parts:
+            unstore(part, layout.stored, biased=layout.biased, signed=layout.signed, path=self.paths[0])
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """See `FrameReader.read_into`."""
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        if buffer.size == 0:
+            return
+        layout = self._layout
+        skip = y0 * layout.columns * layout.stored.itemsize
+        target = buffer.data.cast("B")
+        band = len(target) // (t1 - t0)
+        with OpenedFile(self.paths[0], self._size) as file:
+            for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
+                start = int(layout.offsets[t0 + first]) + skip
+                file.read_into(target[first * band : (first + count) * band], start)
+        unstore(buffer, layout.stored, biased=layout.biased, signed=layout.signed, path=self.paths[0])
+
+
+def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]:
+    """Return (first, count) of frames that follow each other without a gap; -1 bytes: each alone."""
+    breaks = np.flatnonzero(np.diff(offsets) != frame_bytes) + 1
+    edges = [0, *breaks.tolist(), len(offsets)]
+    return [(a, b - a) for a, b in pairwise(edges)]
+
+
+def unstore(buffer: NDArray[Any], stored: np.dtype[Any], *, biased: bool, signed: bool, path: Path) -> None:
+    """Turn stored bytes into native unsigned samples, in place.
+
+    Args:
+        buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
+        stored: type in the file, with its byte order.
+        biased: add 2**(bits - 1) to signed samples, which flips the sign bit.
+        signed: samples must not be negative.
+        path: the file, for the message.
+
+    Raises:
+        InputError: a negative sample.
+    """
+    if not stored.isnative:
+        buffer.byteswap(inplace=True)
+    top = buffer.dtype.type(1 << (8 * stored.itemsize - 1))
+    if biased:
+        np.bitwise_xor(buffer, top, out=buffer)
+    elif signed and buffer.size and int(np.bitwise_or.reduce(buffer, axis=None)) & int(top):
+        raise InputError(f"{path}: signed samples with negative values; counts of an ADC must be 0 or more")

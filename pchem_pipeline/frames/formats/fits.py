@@ -1,0 +1,211 @@
+"""FITS cubes, lists of single images, images in extensions, and tile-compressed images.
+
+FITS stores unsigned integers as signed ones with BZERO = 2**(bits - 1). Uncompressed images are read
+straight from their offset, byte-swapped, and get their sign bit flipped in place; compressed ones go
+through astropy.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError, MissingDependencyError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, unsigned_type
+from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
+from pchem_pipeline.frames.reader import changed, check_window
+from pchem_pipeline.frames.registry import require
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["FitsReader", "write_frames"]
+
+_TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "TELAPSE", "INTTIME", "ITIME", "XPOSURE")
+#: BITPIX -> BZERO of unsigned integers of that size
+_UNSIGNED_ZERO = {16: 1 << 15, 32: 1 << 31}
+#: astropy's compressed images share a file handle and are not made for threads
+_LOCK = threading.Lock()
+
+
+class FitsReader(ContiguousReader):
+    """The first image of a FITS file that has data, 2-D or 3-D."""
+
+    format_name = "fits"
+    suffixes: ClassVar[tuple[str, ...]] = (".fits", ".fit", ".fts", ".fz")
+    magic: ClassVar[tuple[bytes, ...]] = (b"SIMPLE  =",)
+
+    _compressed: int | None = None
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        require("astropy.io.fits", "fits", "FITS files")
+        reader = cls()
+        try:
+            size = path.stat().st_size
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
+                reader._inspect(path, size, settings)
+        except (InputError, MissingDependencyError):
+            raise
+        except OSError as error:
+            raise InputError(
+                f"{path}: not a sound FITS file, or truncated ({error}); copy it again"
+            ) from error
+        except Exception as error:  # a damaged header can break the parser anywhere
+            raise InputError(f"{path}: not a sound FITS file ({error}); copy it again") from error
+        return reader
+
+    def _inspect(self, path: Path, size: int, settings: InputSettings) -> None:
+        from astropy.io import fits
+
+        with fits.open(path, memmap=False, do_not_scale_image_data=True, lazy_load_hdus=True) as hdus:
+            number, hdu, primary = _image(path, hdus, settings)
+            header = hdu.header
+            sizes = [header[f"NAXIS{axis}"] for axis in range(header["NAXIS"], 0, -1)]
+            stored, biased = _samples(path, header)
+            signed = False if biased else check_samples(path, stored, settings)
+            n, rows, columns = stack_shape(path, sizes, "image")
+            compressed = isinstance(hdu, fits.CompImageHDU)
+            if compressed:
+                self.rows_per_read = min(rows, int(hdu.tile_shape[-2]))
+            start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
+            end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
+            self._read_facts(primary, header)
+        if compressed:
+            if end > size:
+                raise InputError(
+                    f"{path}: truncated: {end} bytes are needed, the file has {size}; copy it again"
+                )
+            self.paths, self.shape, self.dtype = (path,), (n, rows, columns), unsigned_type(stored)
+            self._compressed, self._size, self._signed = number, size, signed
+            self._full = tuple(sizes)
+            return
+        offsets = start + rows * columns * stored.itemsize * np.arange(n, dtype=np.int64)
+        self._set_layout(path, Layout(offsets, rows, columns, stored, biased=biased, signed=signed), size)
+
+    def _read_facts(self, *headers: Any) -> None:
+        """Take integration time and bit depth from the first header that has them."""
+        for header in reversed(headers):
+            for keyword in _TIME_KEYWORDS:
+                value = header.get(keyword)
+                if self.integration_time is None and isinstance(value, int | float) and 0 < value < np.inf:
+                    self.integration_time = float(value)
+            value = header.get("BITDEPTH", header.get("ADCBITS"))
+            if self.bit_depth is None and isinstance(value, int) and 1 <= value <= 32:
+                self.bit_depth = value
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """See `FrameReader.read_into`."""
+        if self._compressed is None:
+            super().read_into(buffer, t0, t1, y0, y1)
+            return
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        if buffer.size == 0:
+            return
+        values = self._section(t0, t1, y0, y1).reshape(buffer.shape)
+        if self._signed and int(values.min()) < 0:
+            raise InputError(
+                f"{self.paths[0]}: signed samples with negative values; counts of an ADC must be 0 or more"
+            )
+        buffer[...] = values
+
+    def _section(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
+        """Decode a window of a compressed image."""
+        from astropy.io import fits
+
+        path = self.paths[0]
+        window = full_window(self._full, t0, t1, y0, y1)
+        try:
+            if path.stat().st_size != self._size:
+                raise changed(path, "the file changed its size")
+            with _LOCK, fits.open(path, memmap=False) as hdus:
+                return np.asarray(hdus[self._compressed].section[window])
+        except FileNotFoundError as error:
+            raise changed(path, "the file vanished") from error
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{path}: cannot be decoded ({error}); copy the file again") from error
+
+
+def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, Any]:
+    """Return number and unit of the only image of the file, and the primary header."""
+    from astropy.io import fits
+
+    images = []
+    for number, hdu in enumerate(hdus):
+        if (
+            isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
+            and hdu.header.get("NAXIS", 0) >= 2
+        ):
+            images.append((number, hdu))
+    if not images:
+        raise InputError(f"{path}: holds no image; leave it out")
+    if settings.dataset is not None:
+        wanted = settings.dataset.strip()
+        images = [(n, hdu) for n, hdu in images if wanted in (str(n), hdu.name)]
+    if len(images) != 1:
+        names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
+        names += f" and {len(images) - 12} more" if len(images) > 12 else ""
+        raise InputError(
+            f"{path}: images in the file{' of that name' * (settings.dataset is not None)}: {names}; "
+            "choose one by its number in input.dataset"
+        )
+    return *images[0], hdus[0].header
+
+
+def _samples(path: Path, header: Any) -> tuple[np.dtype[Any], bool]:
+    """Return the stored type, and whether BZERO makes it unsigned."""
+    bits = int(header["BITPIX"])
+    zero, scale = header.get("BZERO", 0), header.get("BSCALE", 1)
+    if bits < 0:
+        return np.dtype(f">f{-bits // 8}"), False
+    stored = np.dtype("u1") if bits == 8 else np.dtype(f">i{bits // 8}")
+    if scale != 1 or zero not in (0, _UNSIGNED_ZERO.get(bits, 0)):
+        raise InputError(
+            f"{path}: scaled data (BSCALE {scale}, BZERO {zero}), which are no digital numbers; write raw "
+            "integers"
+        )
+    return stored, zero != 0
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as one cube (one frame: one image); see `frames.writing.write_frames`."""
+    require("astropy.io.fits", "fits", "FITS files")
+    from astropy.io import fits
+
+    header = fits.Header()
+    header["SIMPLE"], header["BITPIX"] = True, 8 * dtype.itemsize
+    sizes = shape if shape[0] > 1 else shape[1:]
+    header["NAXIS"] = len(sizes)
+    for axis, length in enumerate(reversed(sizes), 1):
+        header[f"NAXIS{axis}"] = length
+    if dtype.itemsize > 1:
+        header["BSCALE"], header["BZERO"] = 1, _UNSIGNED_ZERO[8 * dtype.itemsize]
+    if integration_time is not None:
+        header["EXPTIME"] = (integration_time, "[s] integration time")
+    if bit_depth is not None:
+        header["BITDEPTH"] = (bit_depth, "bits of the ADC")
+    top = dtype.type(1 << (8 * dtype.itemsize - 1))
+    with temporary(path) as part, part.open("wb") as stream:
+        stream.write(header.tostring().encode("ascii"))
+        for block in blocks:
+            values = np.asarray(block, dtype) if dtype.itemsize == 1 else np.asarray(block, dtype) ^ top
+            stream.write(np.ascontiguousarray(values, dtype.newbyteorder(">")).data)
+        stream.write(bytes(-int(np.prod(shape)) * dtype.itemsize % 2880))
+    return [path]

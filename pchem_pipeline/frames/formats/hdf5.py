@@ -1,0 +1,194 @@
+"""HDF5 and NeXus: one dataset (frames, rows, columns), with any filter that h5py and hdf5plugin know.
+
+Frames that lie plainly in the file (contiguous, or in chunks of whole frames without filters) are read from
+their offsets. For others the file is opened for each call: handles of HDF5 must not cross processes, and h5py
+itself lets one thread in at a time.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.choice import choose_dataset
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, unsigned_type
+from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
+from pchem_pipeline.frames.reader import changed, check_window
+from pchem_pipeline.frames.registry import require
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["Hdf5Reader", "write_frames"]
+
+_TIME_NAMES = ("integration_time", "exposure_time", "count_time")
+_TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_LOCK = threading.Lock()
+
+
+class Hdf5Reader(ContiguousReader):
+    """One dataset of an HDF5 file."""
+
+    format_name = "hdf5"
+    suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
+    magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n",)
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        _require()
+        import h5py
+
+        reader = cls()
+        try:
+            with _LOCK, h5py.File(path, "r") as file:
+                reader._inspect(path, file, settings)
+        except InputError:
+            raise
+        except Exception as error:  # a damaged file can break the library anywhere
+            raise InputError(
+                f"{path}: not a sound HDF5 file, or truncated ({error}); copy it again"
+            ) from error
+        return reader
+
+    def _inspect(self, path: Path, file: Any, settings: InputSettings) -> None:
+        import h5py
+
+        found: dict[str, tuple[int, ...]] = {}
+
+        def visit(name: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset):
+                found[name] = item.shape or ()
+
+        file.visititems(visit)
+        self._name = choose_dataset(path, found, settings.dataset)
+        dataset = file[self._name]
+        self._signed = check_samples(path, dataset.dtype, settings)
+        self.paths = (path,)
+        self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
+        self.dtype = unsigned_type(dataset.dtype)
+        self._full = tuple(dataset.shape)
+        offsets = _plain_offsets(file, dataset, self.shape)
+        if offsets is not None:
+            layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
+            self._set_layout(path, layout, path.stat().st_size)
+        elif dataset.chunks is not None:
+            self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
+        self._read_facts(dataset)
+
+    def _read_facts(self, dataset: Any) -> None:
+        """Take integration time (count_time in NeXus) and bit depth from attributes or the group."""
+        for name in _TIME_NAMES:
+            value, unit = dataset.attrs.get(name), dataset.attrs.get(f"{name}_units", "s")
+            beside = dataset.parent.get(name)
+            if value is None and beside is not None and getattr(beside, "size", 0) == 1:
+                value, unit = np.ravel(beside[()])[0], beside.attrs.get("units", "s")
+            scale = _TIME_UNITS.get(unit.decode() if isinstance(unit, bytes) else str(unit))
+            if value is not None and scale is not None and np.isreal(value) and 0 < float(value) < np.inf:
+                self.integration_time = float(value) * scale
+                break
+        for name in ("bit_depth", "bit_depth_readout"):
+            value = dataset.attrs.get(name)
+            if value is None and name in dataset.parent:
+                value = np.ravel(dataset.parent[name][()])[0]
+            if self.bit_depth is None and isinstance(value, int | np.integer) and 1 <= value <= 32:
+                self.bit_depth = int(value)
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """See `FrameReader.read_into`."""
+        if self.layout is not None:
+            super().read_into(buffer, t0, t1, y0, y1)
+            return
+        import h5py
+
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        if buffer.size == 0:
+            return
+        path = self.paths[0]
+        window = full_window(self._full, t0, t1, y0, y1)
+        try:
+            with _LOCK, h5py.File(path, "r") as file:
+                dataset = file[self._name]
+                if tuple(dataset.shape) != self._full:
+                    raise changed(path, "the dataset changed its shape")
+                if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
+                    dataset.read_direct(buffer, window)
+                    return
+                values = dataset[window]
+        except FileNotFoundError as error:
+            raise changed(path, "the file vanished") from error
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{path}: {self._name} cannot be read ({error}); copy the file again") from error
+        if self._signed and int(values.min()) < 0:
+            raise InputError(
+                f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
+            )
+        buffer[...] = values.reshape(buffer.shape)
+
+
+def _plain_offsets(file: Any, dataset: Any, shape: tuple[int, int, int]) -> NDArray[np.int64] | None:
+    """Return the byte offset of each frame that lies plainly in the file, or None where they do not all."""
+    from h5py import h5t
+
+    n_frames, rows, columns = shape
+    frame_bytes = rows * columns * dataset.dtype.itemsize
+    plain_type = dataset.id.get_type().equal(h5t.py_create(dataset.dtype))
+    if file.userblock_size or not plain_type or not dataset.size:
+        return None
+    if dataset.chunks is None:  # None where it lies elsewhere, is virtual, or was never written
+        start = dataset.id.get_offset()
+        return None if start is None else start + frame_bytes * np.arange(n_frames, dtype=np.int64)
+    filters = dataset.id.get_create_plist().get_nfilters()
+    whole = dataset.ndim == 3 and dataset.chunks[1:] == dataset.shape[1:]
+    if filters or not whole or not hasattr(dataset.id, "chunk_iter"):
+        return None
+    starts = np.full(-(-n_frames // dataset.chunks[0]), -1, np.int64)
+
+    def take(chunk: Any) -> None:
+        starts[chunk.chunk_offset[0] // dataset.chunks[0]] = chunk.byte_offset
+
+    dataset.id.chunk_iter(take)
+    frame = np.arange(n_frames, dtype=np.int64)
+    number, inside = np.divmod(frame, dataset.chunks[0])
+    offsets: NDArray[np.int64] = starts[number] + frame_bytes * inside
+    return None if (starts < 0).any() else offsets
+
+
+def _require() -> None:
+    require("h5py", "hdf5", "HDF5 files")
+    if find_spec("hdf5plugin") is not None:
+        require("hdf5plugin", "hdf5", "compressed HDF5 files")  # its import registers the filters
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as the dataset ``frames``, stored plainly; see `frames.writing.write_frames`."""
+    _require()
+    import h5py
+
+    with temporary(path) as part, h5py.File(part, "w") as file:
+        dataset = file.create_dataset("frames", shape, dtype)
+        start = 0
+        for block in blocks:
+            dataset[start : start + len(block)] = block
+            start += len(block)
+        if integration_time is not None:
+            dataset.attrs["integration_time"], dataset.attrs["integration_time_units"] = integration_time, "s"
+        if bit_depth is not None:
+            dataset.attrs["bit_depth"] = bit_depth
+    return [path]

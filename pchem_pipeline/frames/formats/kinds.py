@@ -1,0 +1,87 @@
+"""Which sample types and stack shapes can be frames: one set of refusals for all formats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["check_samples", "full_window", "stack_shape"]
+
+
+def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> bool:
+    """Check that samples can be digital numbers: unsigned, or declared unsigned by ``input.dtype``.
+
+    Args:
+        path: the file, for the message.
+        dtype: type of the stored samples.
+        settings: the section ``input``; its ``dtype`` names the unsigned type that is meant.
+
+    Returns:
+        Whether the samples are signed, to be checked for negative values on reading.
+
+    Raises:
+        InputError: float, complex, boolean, object, 64-bit or undeclared signed samples, or ``input.dtype``
+            says otherwise.
+    """
+    wanted = settings.dtype
+    if dtype.kind == "u" and dtype.itemsize in (1, 2, 4):
+        if wanted is not None and np.dtype(wanted).itemsize != dtype.itemsize:
+            raise InputError(
+                f"{path}: has {dtype.name} samples, input.dtype says {wanted}; correct input.dtype"
+            )
+        return False
+    if dtype.kind == "i" and dtype.itemsize in (1, 2, 4):
+        unsigned = f"uint{8 * dtype.itemsize}"
+        if wanted == unsigned:
+            return True
+        raise InputError(
+            f"{path}: signed samples ({dtype.name}); if they are never negative, set input.dtype: {unsigned}"
+        )
+    if dtype.kind in "fc":
+        raise InputError(
+            f"{path}: floating-point samples ({dtype.name}); raw integer digital numbers (uint8, uint16, "
+            "uint32) are needed, before any correction or averaging"
+        )
+    if dtype.kind in "OV" or dtype.hasobject:
+        raise InputError(
+            f"{path}: holds objects, not numbers; save it as a plain array of uint8, uint16 or uint32"
+        )
+    raise InputError(f"{path}: samples of type {dtype.name}; uint8, uint16 or uint32 are needed")
+
+
+def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[int, int, int]:
+    """Return (frames, rows, columns) of a 2-D or 3-D array; more axes are taken if they have length 1.
+
+    Raises:
+        InputError: too few or too many axes.
+    """
+    sizes = list(shape)
+    if len(sizes) < 2:
+        raise InputError(f"{path}: {what} of shape {tuple(shape)}; frames need (frames, rows, columns)")
+    leading = [size for size in sizes[:-2] if size != 1]
+    if len(leading) > 1:
+        raise InputError(
+            f"{path}: {what} of shape {tuple(shape)} has {len(leading)} axes before rows and columns "
+            "(colours, "
+            "channels?); write one channel as (frames, rows, columns)"
+        )
+    if leading and sizes[-1] in (3, 4) and len(sizes) > 3:
+        raise InputError(
+            f"{path}: {what} of shape {tuple(shape)} looks like colour images; monochrome is needed"
+        )
+    return (leading[0] if leading else 1), sizes[-2], sizes[-1]
+
+
+def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tuple[Any, ...]:
+    """Return the index of frames t0..t1 and rows y0..y1 in an array with further axes of length 1."""
+    window: list[Any] = [slice(0, 1) for _ in full[:-2]]
+    for axis, length in enumerate(full[:-2]):
+        if length != 1:
+            window[axis] = slice(t0, t1)
+    return (*window, slice(y0, y1), slice(None))

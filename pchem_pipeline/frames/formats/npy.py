@@ -1,0 +1,80 @@
+"""NumPy ``.npy`` arrays, read from their offset; pickles are never opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
+from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["NpyReader", "write_frames"]
+
+
+class NpyReader(ContiguousReader):
+    """An array (frames, rows, columns), or one frame (rows, columns), in C order."""
+
+    format_name = "npy"
+    suffixes: ClassVar[tuple[str, ...]] = (".npy",)
+    magic: ClassVar[tuple[bytes, ...]] = (b"\x93NUMPY",)
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        try:
+            with path.open("rb") as stream:
+                version = npy_format.read_magic(stream)
+                read = (
+                    npy_format.read_array_header_1_0
+                    if version == (1, 0)
+                    else npy_format.read_array_header_2_0
+                )
+                shape, fortran, dtype = read(stream)
+                start, size = stream.tell(), path.stat().st_size
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+        except ValueError as error:
+            raise InputError(
+                f"{path}: not a sound npy file, or truncated; write it again by numpy.save"
+            ) from error
+        if dtype.hasobject:
+            raise InputError(
+                f"{path}: an object array, whose pickle is never opened; save a plain array of uint8, "
+                "uint16 or uint32"
+            )
+        signed = check_samples(path, dtype, settings)
+        n, rows, columns = stack_shape(path, shape)
+        if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
+            raise InputError(
+                f"{path}: in Fortran order; save it by numpy.save(..., numpy.ascontiguousarray(frames))"
+            )
+        offsets = start + rows * columns * dtype.itemsize * np.arange(n, dtype=np.int64)
+        reader = cls()
+        reader._set_layout(path, Layout(offsets, rows, columns, dtype, signed=signed), size)
+        return reader
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as one npy array; the format has no place for times and bit depth."""
+    header = {"descr": npy_format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    with temporary(path) as part, part.open("wb") as stream:
+        npy_format.write_array_header_1_0(stream, header)
+        for block in blocks:
+            stream.write(np.ascontiguousarray(block, dtype).data)
+    return [path]

@@ -1,0 +1,168 @@
+"""Zarr arrays (formats 2 and 3) and OME-Zarr images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.choice import choose_dataset
+from pchem_pipeline.frames.formats.contiguous import unsigned_type
+from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
+from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["ZarrReader", "write_frames"]
+
+
+class ZarrReader(FrameReader):
+    """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
+
+    format_name = "zarr"
+    suffixes: ClassVar[tuple[str, ...]] = (".zarr",)
+
+    @classmethod
+    def recognises(cls, path: Path, head: bytes) -> bool:
+        """See `FrameReader.recognises`: a zarr store is a folder with metadata."""
+        return path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        reader = cls()
+        try:
+            reader._inspect(path, settings)
+        except InputError:
+            raise
+        except Exception as error:  # damaged metadata can break the library anywhere
+            raise InputError(f"{path}: not a sound zarr store ({error}); copy it again") from error
+        return reader
+
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
+        import zarr
+
+        node = zarr.open(path, mode="r")
+        if isinstance(node, zarr.Array):
+            array: Any = node
+            self._name, attributes = "", dict(node.attrs)
+        else:
+            self._name = _full_resolution(node, settings) or choose_dataset(
+                path, _shapes(node), settings.dataset
+            )
+            array = node[self._name]
+            attributes = {**node.attrs, **array.attrs}
+        self._signed = check_samples(path, np.dtype(array.dtype), settings)
+        self.paths = (path,)
+        self.shape = stack_shape(path, array.shape, f"array {self._name}".strip())
+        self.dtype = unsigned_type(np.dtype(array.dtype))
+        self._full = tuple(array.shape)
+        self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
+        self._array = array
+        time, depth = attributes.get("integration_time"), attributes.get("bit_depth")
+        if isinstance(time, int | float) and 0 < time < np.inf:
+            self.integration_time = float(time)
+        if isinstance(depth, int) and 1 <= depth <= 32:
+            self.bit_depth = depth
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """See `FrameReader.read_into`."""
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        if buffer.size == 0:
+            return
+        path = self.paths[0]
+        if not path.exists():  # missing chunks would read as the fill value
+            raise changed(path, "the store vanished")
+        try:
+            values = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)])
+        except Exception as error:
+            raise InputError(f"{path}: {self._name} has a damaged chunk ({error}); copy it again") from error
+        if self._signed and int(values.min()) < 0:
+            raise InputError(
+                f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
+            )
+        buffer[...] = values.reshape(buffer.shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the array, which holds the event loop's locks; it is opened again."""
+        return {key: value for key, value in self.__dict__.items() if key != "_array"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        import zarr
+
+        self.__dict__.update(state)
+        try:
+            node: Any = zarr.open(self.paths[0], mode="r")
+            self._array = node[self._name] if self._name else node
+        except Exception as error:
+            raise changed(self.paths[0], "the store vanished or broke") from error
+
+
+def _full_resolution(group: Any, settings: InputSettings) -> str | None:
+    """Return the path of the first level of an OME-Zarr image (0.5 and before), else None."""
+    if settings.dataset is not None:
+        return None
+    record = group.attrs.get("ome", group.attrs)
+    scales = record.get("multiscales") if hasattr(record, "get") else None
+    return str(scales[0]["datasets"][0]["path"]) if scales else None
+
+
+def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(node.shape) for name, node in group.members(max_depth=None) if hasattr(node, "shape")}
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as one zarr array (format 3) in chunks along time; see `frames.writing.write_frames`."""
+    import zarr
+    from zarr.codecs import BloscCodec
+
+    n, rows, columns = shape
+    attributes: dict[str, Any] = {"units": "DN", "long_name": "raw frames"}
+    if integration_time is not None:
+        attributes["integration_time"] = integration_time
+    if bit_depth is not None:
+        attributes["bit_depth"] = bit_depth
+    depth = min(256, n)
+    with temporary(path) as part:
+        array = zarr.create_array(
+            part,
+            shape=shape,
+            dtype=dtype,
+            chunks=(depth, min(128, rows), min(128, columns)),
+            compressors=BloscCodec(cname="lz4", shuffle="bitshuffle", typesize=dtype.itemsize),
+            dimension_names=("frame", "y", "x"),
+            attributes=attributes,
+        )
+        start = 0
+        for block in _regrouped(blocks, depth):
+            array[start : start + len(block)] = block
+            start += len(block)
+    return [path]
+
+
+def _regrouped(blocks: Iterator[NDArray[Any]], depth: int) -> Iterator[NDArray[Any]]:
+    """Cut the stream into blocks of one chunk's frames, so that each chunk is written once."""
+    held: list[NDArray[Any]] = []
+    count = 0
+    for block in blocks:
+        while count + len(block) >= depth:
+            take = depth - count
+            yield np.concatenate([*held, block[:take]])
+            held, count, block = [], 0, block[take:]
+        if len(block):
+            held.append(np.array(block))
+            count += len(block)
+    if held:
+        yield np.concatenate(held)

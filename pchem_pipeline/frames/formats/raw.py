@@ -1,0 +1,168 @@
+"""Raw binary frames, described by a sidecar file or by the settings.
+
+The sidecar lies beside ``frames.raw`` as ``frames.raw.json`` (or ``frames.json``, ``.yaml``, ``.yml``) with
+the keys
+``shape`` ([rows, columns] or [frames, rows, columns]), ``dtype``, ``byte_order``, ``header_bytes``,
+``frame_padding_bytes``, ``bit_shift``,
+``bit_depth``, ``integration_time`` (s). Other keys are left alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["RawReader", "find_sidecar", "write_frames"]
+
+
+class _Sidecar(BaseModel):
+    """What a sidecar can say."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    shape: tuple[int, ...] | None = None
+    dtype: Literal["uint8", "uint16", "uint32"] | None = None
+    byte_order: Literal["little", "big"] | None = None
+    header_bytes: int | None = None
+    frame_padding_bytes: int | None = None
+    bit_shift: int | None = None
+    bit_depth: int | None = None
+    integration_time: float | None = None
+
+
+def find_sidecar(path: Path) -> Path | None:
+    """Return the sidecar of a raw file, or None."""
+    for suffix in (".json", ".yaml", ".yml"):
+        for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def _read_sidecar(path: Path) -> _Sidecar:
+    found = find_sidecar(path)
+    if found is None:
+        return _Sidecar()
+    try:
+        text = found.read_text(encoding="utf-8")
+        if found.suffix == ".json":
+            content = json.loads(text)
+        else:
+            import yaml
+
+            try:
+                content = yaml.safe_load(text)
+            except yaml.YAMLError as error:
+                raise ValueError("not valid YAML") from error
+        return _Sidecar.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{path}: sidecar {found.name}: {where}: {first['msg']}; correct the sidecar"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: sidecar {found.name} cannot be read ({error}); correct the sidecar"
+        ) from error
+
+
+class RawReader(ContiguousReader):
+    """Frames as plain bytes: header, then frames of rows, each followed by padding."""
+
+    format_name = "raw"
+    suffixes: ClassVar[tuple[str, ...]] = (".raw", ".bin", ".dat")
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        side = _read_sidecar(path)
+        facts = {name: getattr(settings, name, None) for name in _Sidecar.model_fields}
+        facts = {name: getattr(side, name) if value is None else value for name, value in facts.items()}
+        if facts["shape"] is None or facts["dtype"] is None:
+            missing = " and ".join(f"input.{name}" for name in ("shape", "dtype") if facts[name] is None)
+            raise InputError(
+                f"{path}: raw frames need {missing}; set it, or write a sidecar {path.name}.json"
+            )
+        reader = cls()
+        reader.bit_shift = facts["bit_shift"] or 0
+        reader.bit_depth = facts["bit_depth"]
+        reader.integration_time = facts["integration_time"]
+        reader._lay_out(path, facts)
+        return reader
+
+    def _lay_out(self, path: Path, facts: dict[str, Any]) -> None:
+        shape, header, padding = facts["shape"], facts["header_bytes"] or 0, facts["frame_padding_bytes"] or 0
+        if len(shape) not in (2, 3) or min(shape) < 1 or header < 0 or padding < 0:
+            raise InputError(
+                f"{path}: shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} make no "
+                "sense; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
+            )
+        order = ">" if facts["byte_order"] == "big" else "<"
+        stored = np.dtype(facts["dtype"]).newbyteorder(order)
+        rows, columns = shape[-2:]
+        frame = rows * columns * stored.itemsize
+        step = frame + padding
+        size = _size(path)
+        whole, rest = divmod(size - header, step) if size >= header else (0, size)
+        if rest == frame:  # the padding of the last frame may be missing
+            whole, rest = whole + 1, 0
+        n = shape[0] if len(shape) == 3 else whole
+        if len(shape) == 2 and (rest or whole == 0):
+            raise InputError(
+                f"{path}: truncated, or not {rows} x {columns} {facts['dtype']}: {size} bytes are a "
+                f"header of {header}, "
+                f"{whole} frames of {step} and {rest} more; copy the file again, or correct input.shape, "
+                "input.dtype, input.header_bytes or input.frame_padding_bytes"
+            )
+        if n < whole:
+            self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
+        offsets = header + step * np.arange(n, dtype=np.int64)
+        self._set_layout(path, Layout(offsets, rows, columns, stored), size)
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as bytes, with a sidecar ``<path>.json``; see `frames.writing.write_frames`."""
+    little = dtype.newbyteorder("<")
+    with temporary(path) as part, part.open("wb") as stream:
+        for block in blocks:
+            stream.write(np.ascontiguousarray(block, little).data)
+    record: dict[str, Any] = {
+        "shape": list(shape),
+        "dtype": dtype.name,
+        "byte_order": "little",
+        "header_bytes": 0,
+    }
+    if integration_time is not None:
+        record["integration_time"] = integration_time
+    if bit_depth is not None:
+        record["bit_depth"] = bit_depth
+    with temporary(path.with_name(path.name + ".json")) as part:
+        part.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    return [path]

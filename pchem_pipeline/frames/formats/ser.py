@@ -1,0 +1,102 @@
+"""SER video of astronomers' cameras: a header of 178 bytes, the frames, and a trailer of times.
+
+The flag for the byte order is written by most programs with the opposite meaning of the format's text: 0 is
+in fact little-endian. So 0 is read as little-endian; ``input.byte_order`` overrides.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["SerReader", "write_frames"]
+
+_HEADER = struct.Struct("<14s7i40s40s40s2q")
+_MAGIC = b"LUCAM-RECORDER"
+#: ticks of 100 ns from year 1 to 1970
+_EPOCH = 621_355_968_000_000_000
+_COLOUR_NAMES = {8: "Bayer", 9: "Bayer", 10: "Bayer", 11: "Bayer", 16: "CMY", 17: "CMY", 18: "CMY", 19: "CMY"}
+
+
+class SerReader(ContiguousReader):
+    """Monochrome SER video, 1 to 16 bits."""
+
+    format_name = "ser"
+    suffixes: ClassVar[tuple[str, ...]] = (".ser",)
+    magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        try:
+            with path.open("rb") as stream:
+                head = stream.read(_HEADER.size)
+            size = path.stat().st_size
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+        if len(head) < _HEADER.size or not head.startswith(_MAGIC):
+            raise InputError(f"{path}: truncated, or not SER video; copy the file again")
+        _, _, colour, flag, columns, rows, depth, n = _HEADER.unpack(head)[:8]
+        if colour != 0:
+            name = _COLOUR_NAMES.get(colour, "RGB")
+            raise InputError(
+                f"{path}: colour video ({name}, ColorID {colour}); monochrome raw frames are needed"
+            )
+        if not 1 <= depth <= 16 or rows < 1 or columns < 1 or n < 0:
+            raise InputError(
+                f"{path}: damaged header ({n} frames, {rows} x {columns}, {depth} bits); copy it again"
+            )
+        order = settings.byte_order or ("big" if flag else "little")
+        stored = np.dtype("u1" if depth <= 8 else (">u2" if order == "big" else "<u2"))
+        offsets = _HEADER.size + rows * columns * stored.itemsize * np.arange(n, dtype=np.int64)
+        reader = cls()
+        reader._set_layout(path, Layout(offsets, rows, columns, stored), size)
+        reader.bit_depth = depth
+        reader._read_times()
+        return reader
+
+    def _read_times(self) -> None:
+        """Read the trailer of times, if it is there."""
+        n = self.shape[0]
+        end = self._layout.end
+        if n == 0 or self._size < end + 8 * n:
+            return
+        ticks = np.fromfile(self.paths[0], "<i8", n, offset=end)
+        if (ticks > 0).all():
+            self.timestamps = (ticks - _EPOCH) * 1e-7
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as SER video (uint8 or uint16) without times; see `frames.writing.write_frames`."""
+    if dtype.itemsize > 2:
+        raise InputError(f"{path}: SER holds at most 16 bits, not {dtype.name}; choose another format")
+    n, rows, columns = shape
+    depth = bit_depth or 8 * dtype.itemsize
+    if (depth > 8) != (dtype.itemsize == 2):
+        raise InputError(
+            f"{path}: SER stores {depth} bits in other samples than {dtype.name}; choose another format"
+        )
+    header = _HEADER.pack(_MAGIC, 0, 0, 0, columns, rows, depth, n, b"", b"", b"", 0, 0)
+    with temporary(path) as part, part.open("wb") as stream:
+        stream.write(header)
+        for block in blocks:
+            stream.write(np.ascontiguousarray(block, dtype.newbyteorder("<")).data)
+    return [path]

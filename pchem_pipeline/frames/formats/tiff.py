@@ -1,0 +1,318 @@
+"""TIFF, BigTIFF, ImageJ and OME-TIFF stacks, and sequences of single-frame files.
+
+Pages are frames whenever all pages share shape and type, whatever the metadata say about series. Uncompressed
+pages are read straight from their offsets; others are decoded strip by strip by tifffile, only the strips
+that
+the wanted rows need.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.frames.formats.contiguous import (
+    ContiguousReader,
+    Layout,
+    OpenedFile,
+    unsigned_type,
+    unstore,
+)
+from pchem_pipeline.frames.formats.kinds import check_samples
+from pchem_pipeline.frames.formats.tiff_facts import (
+    check_chain,
+    images_behind_one_page,
+    stated_bit_depth,
+    stated_channels,
+    stated_time,
+)
+from pchem_pipeline.frames.reader import check_window
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["TiffReader", "write_frames"]
+
+_QUIET = logging.NullHandler()
+
+
+@dataclass(frozen=True)
+class _Segments:
+    """Strips or tiles of the pages of one kind, to be decoded by the library.
+
+    Attributes:
+        offsets: byte offset of each segment, (pages of the file, segments); 0 where there is none.
+        counts: bytes of each segment, likewise.
+        model: for each page, the number of a page that is coded alike.
+        per_row: for each page, segments side by side.
+        height: for each page, rows of a segment.
+    """
+
+    offsets: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    model: NDArray[np.int64]
+    per_row: NDArray[np.int64]
+    height: NDArray[np.int64]
+
+
+class TiffReader(ContiguousReader):
+    """Pages of a TIFF file as frames."""
+
+    format_name = "tiff"
+    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8")
+    magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+    _segments: _Segments | None = None
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        import tifffile
+
+        logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
+        reader = cls()
+        reader._guard = threading.Lock()
+        reader._decoders = {}
+        try:
+            size = path.stat().st_size
+            with tifffile.TiffFile(path) as file:
+                reader._inspect(path, file, size, settings)
+        except InputError:
+            raise
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
+        except Exception as error:  # a damaged file can break the parser anywhere
+            raise InputError(
+                f"{path}: not a sound TIFF file, or truncated ({error}); copy it again"
+            ) from error
+        return reader
+
+    _guard: threading.Lock
+    _decoders: dict[int, Any]
+
+    def _inspect(self, path: Path, file: Any, size: int, settings: InputSettings) -> None:
+        pages = [page for page in file.pages if not page.is_reduced]
+        reduced = len(file.pages) - len(pages)
+        if not pages:
+            raise InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
+        check_chain(path, file, size)
+        notes = [f"{path.name}: {reduced} reduced pages (previews) are left out"] if reduced else []
+        first = pages[0]
+        _check_pages(path, pages)
+        signed = check_samples(path, np.dtype(first.dtype), settings)
+        channels = stated_channels(file)
+        if channels > 1 and len(pages) > 1:
+            notes.append(
+                f"{path.name}: its metadata call the pages {channels} channels; they are read as frames"
+            )
+        self.notes = tuple(notes)
+        stored = np.dtype(first.dtype).newbyteorder(file.byteorder)
+        offsets = _contiguous_offsets(path, file, pages, size)
+        rows, columns = first.shape[-2:]
+        if offsets is not None:
+            self._set_layout(path, Layout(offsets, rows, columns, stored, signed=signed), size)
+        else:
+            self._set_segments(path, pages, size, signed)
+        self.bit_depth = stated_bit_depth(file, first)
+        self.integration_time = stated_time(file, first)
+
+    def _set_segments(self, path: Path, pages: Sequence[Any], size: int, signed: bool) -> None:
+        """Remember where the coded strips or tiles of each page are."""
+        most = max(len(page.dataoffsets) for page in pages)
+        offsets = np.zeros((len(pages), most), np.int64)
+        counts = np.zeros((len(pages), most), np.int64)
+        model = np.zeros(len(pages), np.int64)
+        alike: dict[Any, int] = {}
+        for i, page in enumerate(pages):
+            offsets[i, : len(page.dataoffsets)] = page.dataoffsets
+            counts[i, : len(page.databytecounts)] = page.databytecounts
+            model[i] = alike.setdefault(_coding(page), page.index)
+        broken = np.flatnonzero(((offsets + counts) > size).any(axis=1))
+        if broken.size:
+            raise InputError(
+                f"{path}: truncated: {broken.size} of {len(pages)} pages end behind the end of the file "
+                f"({size} bytes); copy the file again"
+            )
+        first = pages[0]
+        rows, columns = first.shape
+        height = np.array([page.chunks[0] for page in pages], np.int64)
+        width = np.array([page.chunks[1] for page in pages], np.int64)
+        self.paths = (path,)
+        self.shape = (len(pages), rows, columns)
+        self.dtype = unsigned_type(np.dtype(first.dtype))
+        self._size = size
+        self._signed = signed
+        self.rows_per_read = min(rows, int(height.max()))
+        self._segments = _Segments(offsets, counts, model, -(-columns // width), height)
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """See `FrameReader.read_into`."""
+        if self._segments is None:
+            super().read_into(buffer, t0, t1, y0, y1)
+            return
+        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
+        if buffer.size == 0:
+            return
+        with OpenedFile(self.paths[0], self._size) as file:
+            for t in range(t0, t1):
+                self._decode(file, buffer[t - t0], t, y0, y1)
+        if self._signed:
+            unstore(buffer, self.dtype, biased=False, signed=True, path=self.paths[0])
+
+    def _decode(self, file: OpenedFile, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
+        """Decode the segments of page t that touch rows y0..y1 into ``frame``."""
+        table = self._segments
+        assert table is not None
+        page = self._page(int(table.model[t]))
+        per_row, rows = int(table.per_row[t]), int(table.height[t])
+        for row in range(y0 // rows, (y1 - 1) // rows + 1):
+            for number in range(row * per_row, (row + 1) * per_row):
+                count = int(table.counts[t, number])
+                data = file.read_bytes(int(table.offsets[t, number]), count) if count else None
+                try:
+                    segment, (_, _, top, left, _), (_, height, width, _) = page.decode(
+                        data, number, jpegtables=page.jpegtables
+                    )
+                except Exception as error:
+                    raise InputError(
+                        f"{self.paths[0]}: page {t} cannot be decoded ({error}); copy the file again"
+                    ) from error
+                low, high = max(y0, top), min(y1, top + height)
+                target = frame[low - y0 : high - y0, left : left + width]
+                if segment is None:
+                    target[...] = page.nodata
+                else:
+                    target[...] = segment[0, low - top : high - top, : target.shape[1], 0]
+
+    def _page(self, index: int) -> Any:
+        """Return the library's page that knows how to decode its kind."""
+        import tifffile
+
+        with self._guard:
+            if index not in self._decoders:
+                try:
+                    with tifffile.TiffFile(self.paths[0]) as file:
+                        page = file.pages[index]
+                        page.decode  # noqa: B018 - built on first use, from tags that may need the open file
+                        page.jpegtables  # noqa: B018
+                except Exception as error:
+                    raise InputError(
+                        f"{self.paths[0]}: the file changed while it was being read ({error}); restore it "
+                        "and start again"
+                    ) from error
+                self._decoders[index] = page
+            return self._decoders[index]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the lock and the library's pages: they are made again where the reader is unpickled."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_guard", "_decoders")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._guard = threading.Lock()
+        self._decoders = {}
+
+
+def _coding(page: Any) -> tuple[Any, ...]:
+    """Return what two pages must share to be decoded alike."""
+    return (
+        int(page.compression),
+        int(page.predictor),
+        int(page.fillorder),
+        page.chunks,
+        page.bitspersample,
+        page.rowsperstrip,
+        page.jpegtables,
+    )
+
+
+def _check_pages(path: Path, pages: Sequence[Any]) -> None:
+    """Refuse colour, and pages of different shape or type."""
+    first = pages[0]
+    for number, page in enumerate(pages):
+        if page.dtype is None:
+            raise InputError(
+                f"{path}: page {number} has samples of an unknown type; write it as uint8 or uint16"
+            )
+        if (page.shape, page.dtype) != (first.shape, first.dtype):
+            raise InputError(
+                f"{path}: page {number} is {_words(page)}, page 0 is {_words(first)}; frames must be alike"
+            )
+    photometric = first.photometric.name if hasattr(first.photometric, "name") else str(first.photometric)
+    planes = first.samplesperpixel
+    separate = planes > 1 and int(first.planarconfig) == 2 and photometric.startswith("MINIS")
+    if photometric not in ("MINISBLACK", "MINISWHITE") or (planes > 1 and not separate):
+        raise InputError(
+            f"{path}: colour or multi-channel images ({photometric}, {planes} samples a pixel); "
+            "monochrome raw frames are needed"
+        )
+    if planes > 1 and len(pages) > 1:
+        raise InputError(f"{path}: {len(pages)} pages of {planes} planes each; write one frame a page")
+
+
+def _words(page: Any) -> str:
+    return f"{' x '.join(str(size) for size in page.shape)} {page.dtype.name}"
+
+
+def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) -> NDArray[np.int64] | None:
+    """Return the offset of each frame if all are stored plainly, else None."""
+    first = pages[0]
+    dtype = np.dtype(first.dtype)
+    if any(int(page.compression) != 1 or int(page.fillorder) != 1 for page in pages):
+        return None
+    if any(
+        page.bitspersample != 8 * dtype.itemsize or page.is_tiled or page.predictor != 1 for page in pages
+    ):
+        return None
+    rows, columns = first.shape[-2:]
+    frame = rows * columns * dtype.itemsize
+    planes = first.samplesperpixel
+    offsets = []
+    for page in pages:
+        if not page.is_contiguous and not _adjoining(page, frame * planes):
+            return None
+        start = int(page.dataoffsets[0])
+        offsets += [start + plane * frame for plane in range(planes)]
+    if len(pages) == 1 and planes == 1:
+        offsets = [offsets[0] + i * frame for i in range(images_behind_one_page(file))]
+    return np.asarray(offsets, np.int64)
+
+
+def _adjoining(page: Any, total: int) -> bool:
+    """Tell whether the strips of a page follow each other without a gap and make up the whole page."""
+    offsets, counts = page.dataoffsets, page.databytecounts
+    ends = [offset + count for offset, count in zip(offsets, counts, strict=True)]
+    return bool(sum(counts) == total and list(offsets[1:]) == ends[:-1])
+
+
+def write_frames(
+    path: Path,
+    blocks: Iterator[NDArray[Any]],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+) -> list[Path]:
+    """Write frames as pages of one file, BigTIFF above 2 GiB; see `frames.writing.write_frames`."""
+    import tifffile
+
+    facts = {"integration_time": integration_time, "bit_depth": bit_depth}
+    with temporary(path) as part:
+        tifffile.imwrite(
+            part,
+            (frame for block in blocks for frame in np.ascontiguousarray(block, dtype)),
+            shape=shape,
+            dtype=dtype,
+            bigtiff=int(np.prod(shape)) * dtype.itemsize > 1 << 31,
+            photometric="minisblack",
+            metadata={key: value for key, value in facts.items() if value is not None},
+        )
+    return [path]

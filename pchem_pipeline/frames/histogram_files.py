@@ -1,0 +1,281 @@
+"""Ready-made histograms: many laboratories keep only those.
+
+A file holds digital numbers and counts: CSV (two columns ``DN, count`` or ``Energy, Count``; more count
+columns are
+more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN 0), or npz
+(``dn`` and ``counts``). Each channel becomes a pixel of a sensor of one row.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.identity import content_identity
+from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES, resolve_files
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["HistogramInput", "is_histogram_input", "read_histograms"]
+
+#: more bins than any ADC of interest has codes; a wider span is a mistake in the file
+_MOST_BINS = 1 << 24
+
+
+@dataclass(frozen=True)
+class HistogramInput:
+    """Histograms of all channels on one common axis.
+
+    Attributes:
+        counts: events per bin, (1, channels, bins), uint32, or uint64 where a count needs it.
+        origin: DN of bin 0 of each channel, (1, channels), int32.
+        names: name of each channel: the file's stem, with the column's name if a file has several.
+        paths: the files, in reading order.
+        notes: remarks, such as gaps that were filled with zeros.
+    """
+
+    counts: NDArray[np.unsignedinteger[Any]]
+    origin: NDArray[np.int32]
+    names: tuple[str, ...]
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the sensor whose pixels are the channels."""
+        return 1, len(self.names)
+
+    def identity(self) -> dict[str, Any]:
+        """Return names, sizes and content hashes of the files; for JSON."""
+        return content_identity(self.paths)
+
+
+@dataclass
+class _Channel:
+    """One histogram with its leading and trailing zeros cut off."""
+
+    name: str
+    origin: int
+    counts: NDArray[np.int64]
+    notes: list[str] = field(default_factory=list)
+
+
+def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
+    """Tell whether the input is ready-made histograms: by ``input.format``, or CSV and npz with auto.
+
+    Raises:
+        InputError: a path is missing, or frames and histograms are mixed.
+    """
+    if settings.format != "auto":
+        return settings.format == "histogram"
+    names = [Path(entry) for entry in settings.files]
+    if any((base_dir / name).is_dir() for name in names):
+        return False
+    kinds = {path.suffix.lower() in (".csv", ".npz") for path in resolve_files(settings, base_dir)}
+    if len(kinds) > 1:
+        raise InputError("input.files: camera files and ready-made histograms are mixed; read them apart")
+    return kinds == {True}
+
+
+def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
+    """Read all histograms of ``input.files`` onto axes of equal length.
+
+    Args:
+        settings: the section ``input``.
+        base_dir: folder to which relative paths refer.
+
+    Raises:
+        InputError: files that cannot be read, or that are no histograms, all in one message.
+    """
+    paths = resolve_files(settings, base_dir)
+    channels: list[_Channel] = []
+    problems: list[str] = []
+    used: list[Path] = []
+    for path in paths:
+        try:
+            if path in used:
+                raise InputError(f"{path}: is named twice in input.files")
+            channels += _read(path)
+            used.append(path)
+        except InputError as error:
+            problems.append(str(error))
+    if problems and (settings.on_bad_file == "error" or not channels):
+        cure = "" if len(paths) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
+        raise InputError("; ".join(problems) + cure)
+    left_out = [f"left out (input.on_bad_file: skip): {problem}" for problem in problems]
+    return _assemble(channels, used, left_out)
+
+
+def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequence[str]) -> HistogramInput:
+    bins = max(channel.counts.size for channel in channels)
+    largest = max(int(channel.counts.max()) for channel in channels)
+    counts = np.zeros((1, len(channels), bins), np.uint32 if largest < 1 << 32 else np.uint64)
+    for i, channel in enumerate(channels):
+        counts[0, i, : channel.counts.size] = channel.counts
+    origin = np.asarray([[channel.origin for channel in channels]], np.int32)
+    remarks = (*notes, *(note for channel in channels for note in channel.notes))
+    return HistogramInput(counts, origin, tuple(channel.name for channel in channels), tuple(paths), remarks)
+
+
+def _read(path: Path) -> list[_Channel]:
+    """Read the channels of one file."""
+    suffix = path.suffix.lower()
+    if suffix not in HISTOGRAM_SUFFIXES:
+        raise InputError(f"{path}: histograms are read from .csv, .txt, .npy and .npz files; convert it")
+    try:
+        if suffix in (".npy", ".npz"):
+            dn, columns, names = _read_numpy(path)
+        else:
+            dn, columns, names = _read_text(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
+    if len(names) == 1:
+        names = [path.stem]
+    else:
+        names = [f"{path.stem}:{name}" for name in names]
+    return [_channel(path, name, dn, column) for name, column in zip(names, columns, strict=True)]
+
+
+def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]:
+    """Read npy or npz: DN, the counts of each channel, and names of the channels."""
+    try:
+        with path.open("rb") as stream:
+            loaded = np.load(stream, allow_pickle=False)
+            dn, table = (
+                _split_npz(path, loaded) if path.suffix.lower() == ".npz" else _split_npy(path, loaded)
+            )
+    except (ValueError, EOFError, KeyError) as error:
+        raise InputError(
+            f"{path}: not a sound {path.suffix[1:]} file of plain numbers (pickles are never opened); "
+            "save it again"
+        ) from error
+    except Exception as error:  # a damaged zip archive raises its own kind
+        if isinstance(error, OSError | InputError):
+            raise
+        raise InputError(f"{path}: damaged ({error}); copy it again") from error
+    if dn.ndim != 1 or table.ndim != 2 or table.shape[1] != dn.size:
+        raise InputError(
+            f"{path}: dn {dn.shape} and counts {table.shape} do not fit; counts is (channels, bins)"
+        )
+    return dn, list(table), [str(i) for i in range(len(table))]
+
+
+def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return DN and counts (channels, bins) of an archive of named arrays."""
+    held = set(getattr(archive, "files", ()))
+    if not {"dn", "counts"} <= held:
+        listed = ", ".join(sorted(held)) or "nothing"
+        raise InputError(f"{path}: needs the arrays dn and counts, holds {listed}; save it with these names")
+    return archive["dn"], np.atleast_2d(archive["counts"])
+
+
+def _split_npy(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Tell two columns (DN, count) from channels x bins."""
+    if array.ndim == 1:
+        return np.arange(array.size), array[None]
+    if array.ndim != 2:
+        raise InputError(
+            f"{path}: an array of shape {array.shape}; histograms are (bins, 2) or (channels, bins)"
+        )
+    if array.shape[1] == 2:
+        return array[:, 0], array[None, :, 1]
+    return np.arange(array.shape[1]), array
+
+
+def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]:
+    """Read CSV, or columns parted by semicolons, tabs or blanks: DN, counts of each channel, their names."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file; histograms as CSV have columns DN, count") from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        raise InputError(f"{path}: holds no histogram; leave it out")
+    mark = next((sign for sign in (",", ";", "\t") if sign in lines[0]), " ")
+    rows = [
+        [cell.strip() for cell in row]
+        for row in csv.reader(io.StringIO("\n".join(lines)), delimiter=mark, skipinitialspace=True)
+    ]
+    rows = [row[:-1] if len(row) > 2 and not row[-1] else row for row in rows]  # a comma at the end of lines
+    header = None if _is_number(rows[0][0]) else rows.pop(0)
+    width = len(header or rows[0])
+    if width < 2:
+        raise InputError(f"{path}: needs two columns or more, DN and count; write it so")
+    table = np.empty((len(rows), width))
+    for number, row in enumerate(rows, 1 + (header is not None)):
+        if len(row) != width or not all(_is_number(cell) for cell in row):
+            raise InputError(
+                f"{path}: row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it"
+            )
+        table[number - 1 - (header is not None)] = [float(cell) for cell in row]
+    names = (
+        [name or str(i) for i, name in enumerate(header[1:])]
+        if header
+        else [str(i) for i in range(width - 1)]
+    )
+    return table[:, 0], list(table[:, 1:].T), names
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _Channel:
+    """Check one histogram, and put it on an axis without gaps and empty ends."""
+    where = f"{path}: " if name == path.stem else f"{path}: channel {name.split(':', 1)[1]}: "
+    axis = _integers(where, "DN", dn)
+    values = _integers(where, "count", counts)
+    if axis.size == 0:
+        raise InputError(f"{where}holds no bins; leave it out")
+    if (values < 0).any():
+        raise InputError(f"{where}negative counts (first at DN {axis[values < 0][0]}); counts are 0 or more")
+    steps = np.diff(axis)
+    if (steps == 0).any():
+        raise InputError(f"{where}DN {axis[:-1][steps == 0][0]} occurs twice; add up its counts")
+    if (steps < 0).any():
+        raise InputError(f"{where}the DN are not in rising order (at DN {axis[1:][steps < 0][0]}); sort them")
+    if not values.any():
+        raise InputError(f"{where}all counts are zero; leave it out")
+    filled = np.flatnonzero(values)
+    first, last = filled[0], filled[-1]
+    low, high = int(axis[first]), int(axis[last])
+    if high - low >= _MOST_BINS or not -(2**31) <= low <= high < 2**31:
+        raise InputError(f"{where}DN from {low} to {high} span more than any ADC; correct the DN column")
+    full = np.zeros(high - low + 1, np.int64)
+    full[axis[first : last + 1] - low] = values[first : last + 1]
+    missing = full.size - (last - first + 1)
+    notes = (
+        [f"{path.name}: {missing} DN that are not listed between {low} and {high} count 0"] if missing else []
+    )
+    return _Channel(name, low, full, notes)
+
+
+def _integers(where: str, what: str, values: NDArray[Any]) -> NDArray[np.int64]:
+    """Return values as integers; refuse NaN, fractions and other types."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{where}{what} column of type {array.dtype}; numbers are needed")
+    if array.dtype.kind == "f":
+        if not np.isfinite(array).all():
+            raise InputError(f"{where}{what} column holds NaN or infinity; correct it")
+        broken = array != np.rint(array)
+        if broken.any():
+            raise InputError(
+                f"{where}{what} {array[broken][0]} is not a whole number; give raw DN and raw counts"
+            )
+        if (np.abs(array) >= 2.0**53).any():
+            raise InputError(f"{where}{what} column holds numbers too large to be exact; correct it")
+    elif array.size and int(array.max()) > np.iinfo(np.int64).max:
+        raise InputError(f"{where}{what} column holds numbers above 2**63; correct it")
+    return array.astype(np.int64)

@@ -1,0 +1,139 @@
+"""What every reader of a camera format offers.
+
+A reader is one file: a class derived from `FrameReader`, with its name, its suffixes and its magic bytes.
+Readers from elsewhere come through the entry point group ``pchem_pipeline.readers``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.identity import content_identity, quick_identity
+from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = ["FrameReader", "check_window"]
+
+
+class FrameReader(ABC):
+    """Frames of one file (or of many, see `open_frames`), read by blocks of frames and bands of rows.
+
+    Reading is safe from several threads at once, and a reader can be pickled into another process: it
+    holds where things are in the file, and opens the file when it reads.
+
+    Attributes:
+        format_name: name of the format, as in ``input.format``.
+        suffixes: file suffixes, lower case, with the dot.
+        magic: first bytes that tell the format.
+        paths: the files behind the reader, in the order of their frames.
+        shape: (number of frames, rows, columns).
+        dtype: native unsigned type of the samples that `read_into` delivers.
+        bit_depth: bits of the ADC, where the file says so.
+        bit_shift: bits by which the samples are left-justified, where the file says so.
+        integration_time: s, where the file says so.
+        timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
+        notes: remarks for the user on what was left out or assumed.
+        rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
+            any rows can be read alone.
+    """
+
+    format_name: ClassVar[str] = ""
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    magic: ClassVar[tuple[bytes, ...]] = ()
+
+    paths: tuple[Path, ...]
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    bit_depth: int | None = None
+    bit_shift: int = 0
+    integration_time: float | None = None
+    timestamps: NDArray[np.float64] | None = None
+    notes: tuple[str, ...] = ()
+    rows_per_read: int = 1
+
+    @classmethod
+    @abstractmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """Open one file; raise InputError with one line (what, where, the cure) if that cannot be."""
+
+    @classmethod
+    def recognises(cls, path: Path, head: bytes) -> bool:
+        """Tell from the first bytes (at most 64; none for a folder) whether this reader is for the file."""
+        return any(head.startswith(magic) for magic in cls.magic)
+
+    @abstractmethod
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """Fill ``buffer`` with frames t0..t1 and rows y0..y1 (ends excluded), all columns.
+
+        Args:
+            buffer: C-contiguous, (t1 - t0, y1 - y0, columns), of ``self.dtype``.
+            t0: first frame.
+            t1: end of the frames.
+            y0: first row.
+            y1: end of the rows; None means to the last.
+
+        Raises:
+            InputError: the file vanished, changed or cannot be decoded.
+        """
+
+    def read(self, t0: int = 0, t1: int | None = None, y0: int = 0, y1: int | None = None) -> NDArray[Any]:
+        """Return frames t0..t1 and rows y0..y1 as a new array (frame, y, x)."""
+        t1 = self.shape[0] if t1 is None else t1
+        y1 = self.shape[1] if y1 is None else y1
+        buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
+        self.read_into(buffer, t0, t1, y0, y1)
+        return buffer
+
+    def identity(self) -> dict[str, Any]:
+        """Return name, size and xxh3_128 content hash of every file, and one digest over all; for JSON."""
+        return content_identity(self.paths)
+
+    def quick_identity(self) -> dict[str, Any]:
+        """Return name, size and time of change of every file, without reading them; for JSON."""
+        return quick_identity(self.paths)
+
+    def close(self) -> None:  # noqa: B027 - most readers hold nothing open
+        """Release what the reader holds open."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def check_window(
+    reader: FrameReader, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int | None
+) -> tuple[int, int]:
+    """Check the arguments of `FrameReader.read_into`; return (y0, y1) with y1 filled in.
+
+    Raises:
+        ValueError: a programming mistake: window outside of the stack, or a buffer that does not fit.
+    """
+    n, ny, nx = reader.shape
+    y1 = ny if y1 is None else y1
+    if not (0 <= t0 <= t1 <= n and 0 <= y0 <= y1 <= ny):
+        raise ValueError(f"window frames {t0}..{t1}, rows {y0}..{y1} is outside of the stack {reader.shape}")
+    if (
+        buffer.shape != (t1 - t0, y1 - y0, nx)
+        or buffer.dtype != reader.dtype
+        or not buffer.flags.c_contiguous
+    ):
+        raise ValueError(
+            f"buffer {buffer.shape} {buffer.dtype} does not fit {(t1 - t0, y1 - y0, nx)} {reader.dtype}, "
+            "C order"
+        )
+    return y0, y1
+
+
+def changed(path: Path, what: str) -> InputError:
+    """Return the error for a file that is no longer as it was when it was opened."""
+    return InputError(f"{path}: {what} while it was being read; restore the file and start again")

@@ -1,0 +1,1 @@
+"""Statistical checks on many pixels: residuals, multiple testing, shrinkage, differences between runs."""

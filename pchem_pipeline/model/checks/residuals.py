@@ -1,0 +1,145 @@
+"""How well a prediction agrees with a histogram: residuals, RMSE and the noise that no model can beat."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.maps.pixels import FloatArray
+
+__all__ = [
+    "ChiSquare",
+    "central_window",
+    "chi_square",
+    "counting_variance",
+    "noise_floor",
+    "normalised_residuals",
+    "rmse",
+]
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """Sum of squared normalised residuals.
+
+    Attributes:
+        value: chi-square.
+        dof: bins that entered it.
+    """
+
+    value: float
+    dof: int
+
+
+def central_window(counts: NDArray[np.integer[Any]], coverage: float) -> slice:
+    """Find the bins that hold the central part of the data.
+
+    A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
+    the length of the axis. This window does not.
+
+    Args:
+        counts: samples in each bin, shape (n,), not all zero.
+        coverage: part of the samples to hold, 0..1; each tail left out holds at most half of the rest.
+
+    Returns:
+        The bins as a slice.
+    """
+    cumulative = np.cumsum(counts)
+    tail = 0.5 * (1.0 - coverage) * cumulative[-1]
+    first = int(np.searchsorted(cumulative, tail, side="right"))
+    last = int(np.searchsorted(cumulative, cumulative[-1] - tail, side="left"))
+    return slice(first, max(last, first) + 1)
+
+
+def rmse(data: FloatArray, model: FloatArray, window: slice = slice(None)) -> float:
+    """Root mean square difference between two densities on the same bins.
+
+    Args:
+        data: density of the data, 1/unit, shape (n,).
+        model: predicted density, same unit and shape.
+        window: the bins to compare.
+
+    Returns:
+        RMSE in the unit of the densities.
+    """
+    return math.sqrt(float(np.mean((data[window] - model[window]) ** 2)))
+
+
+def counting_variance(
+    total: FloatArray, total_square: FloatArray, n_pixels: int, n_frames: int, width: float = 1.0
+) -> FloatArray:
+    """Variance of the density of an ensemble histogram, the pixels given.
+
+    A pixel of probability p_p for a bin puts a binomial number of its m frames there, independently of the
+    other pixels. Over the m P samples and bins of width w the density has variance
+    ``sum_p m p_p (1 - p_p) / (m P w)^2``.
+
+    Args:
+        total: sum over pixels of p_p, shape (n,).
+        total_square: sum over pixels of p_p squared, shape (n,).
+        n_pixels: P.
+        n_frames: m.
+        width: w, in the unit of the axis.
+
+    Returns:
+        Variance of the density of each bin, shape (n,).
+    """
+    return np.maximum(total - total_square, 0.0) / (n_frames * (n_pixels * width) ** 2)
+
+
+def noise_floor(variance: FloatArray, window: slice = slice(None)) -> float:
+    """Root of the expected mean square difference between data and their own true density.
+
+    Args:
+        variance: variance of the density of each bin, shape (n,), see :func:`counting_variance`.
+        window: the bins to compare.
+
+    Returns:
+        The RMSE that counting alone causes.
+    """
+    return math.sqrt(float(np.mean(variance[window])))
+
+
+def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArray) -> FloatArray:
+    """Differences in units of their standard deviation.
+
+    Args:
+        data: density of the data, shape (n,).
+        model: predicted density, shape (n,).
+        variance: variance of the data's density, shape (n,).
+
+    Returns:
+        ``(data - model) / sqrt(variance)``; NaN where the variance is zero.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(variance > 0, (data - model) / np.sqrt(variance), np.nan)
+
+
+def chi_square(
+    data: FloatArray,
+    model: FloatArray,
+    variance: FloatArray,
+    counts: NDArray[np.integer[Any]],
+    least: int = 10,
+) -> ChiSquare:
+    """Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
+
+    Bins are taken where there are enough samples. The bins of one pixel are slightly
+    anticorrelated, so the sum is not exactly chi-square; with many bins the difference is small.
+
+    Args:
+        data: density of the data, shape (n,).
+        model: predicted density, shape (n,).
+        variance: variance of the data's density, shape (n,).
+        counts: samples in each bin, shape (n,).
+        least: samples below which a bin is left out.
+
+    Returns:
+        Chi-square and the number of bins.
+    """
+    use = (counts >= least) & (variance > 0)
+    return ChiSquare(float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum()))

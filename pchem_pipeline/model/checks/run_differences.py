@@ -1,0 +1,200 @@
+"""How two runs differ: value by value, and map by map in units of the standard errors.
+
+Whether a difference of two measurements is chance is judged by order statistics, which a few odd pixels do
+not move; all limits are five standard errors (false alarm 6e-7 each).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.maps.maps import summarise
+from pchem_pipeline.model.maps.pixels import FloatArray
+
+__all__ = [
+    "FAR",
+    "LIMIT",
+    "BlockDifference",
+    "MapDifference",
+    "Reasons",
+    "compare_blocks",
+    "compare_maps",
+    "reasons_of_change",
+]
+
+#: Standard errors beyond which a statistic of all pixels counts as changed.
+LIMIT = 5.0
+#: Standard errors beyond which a single pixel counts as changed.
+FAR = 5.0
+#: Share of pixels that may lie beyond: errors of fits have longer tails than the normal law.
+_TAIL = 1e-4
+#: By how much the standard errors of the fits themselves may be wrong.
+_TRUST = 0.1
+
+
+@dataclass(frozen=True)
+class BlockDifference:
+    """What differs between two blocks of values.
+
+    Attributes:
+        n_values: values compared.
+        n_different: values that are not equal; NaN equals NaN.
+        n_beyond: values that differ by more than rounding, NaN against a number included.
+        largest: largest absolute difference of two numbers, in their unit.
+    """
+
+    n_values: int
+    n_different: int
+    n_beyond: int
+    largest: float
+
+    def __add__(self, other: BlockDifference) -> BlockDifference:
+        """Return both blocks together."""
+        return BlockDifference(
+            self.n_values + other.n_values,
+            self.n_different + other.n_different,
+            self.n_beyond + other.n_beyond,
+            max(self.largest, other.largest),
+        )
+
+
+def compare_blocks(
+    one: NDArray[np.generic], other: NDArray[np.generic], *, scale: float, tolerance: float
+) -> BlockDifference:
+    """Compare two blocks value by value.
+
+    Args:
+        one: integers or floats.
+        other: the same of the other run, of the same shape.
+        scale: largest absolute value of the whole array: rounding is relative to it, since many values are
+            differences of large ones.
+        tolerance: relative difference that counts as rounding; 0 for integers.
+    """
+    if one.dtype.kind not in "fc" and other.dtype.kind not in "fc":
+        apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
+        unequal = one != other
+        n = int(np.count_nonzero(unequal))
+        return BlockDifference(one.size, n, n, float(np.max(apart, initial=0.0, where=unequal)))
+    a, b = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(a - b)
+    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    close = same | (apart <= tolerance * scale)
+    known = ~same & np.isfinite(apart)
+    largest = float(np.max(apart, initial=0.0, where=known))
+    return BlockDifference(a.size, int((~same).sum()), int((~close).sum()), largest)
+
+
+@dataclass(frozen=True)
+class MapDifference:
+    """Two maps of one quantity, pixel by pixel.
+
+    Attributes:
+        difference: other minus one, in the unit of the map, shape (ny, nx); NaN where either has no value.
+        z: the same in standard errors.
+        n_both: pixels with a value in both.
+        n_only_one, n_only_other: pixels with a value in one of them alone.
+        median: median of the difference.
+        median_stderr: its standard error.
+        median_z: median of ``z`` over the pixels that count.
+        spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
+        n_counted: pixels that count: good fits in both.
+        n_far: pixels beyond ``FAR`` among them.
+        largest_z: largest absolute value of ``z`` among them.
+    """
+
+    difference: FloatArray
+    z: FloatArray
+    n_both: int
+    n_only_one: int
+    n_only_other: int
+    median: float
+    median_stderr: float
+    median_z: float
+    spread_z: float
+    n_counted: int
+    n_far: int
+    largest_z: float
+
+
+def compare_maps(
+    one: tuple[FloatArray, FloatArray],
+    other: tuple[FloatArray, FloatArray],
+    good: NDArray[np.bool_],
+    *,
+    same_data: bool,
+) -> MapDifference:
+    """Compare a map of two runs.
+
+    Args:
+        one: values and standard errors, each (ny, nx); NaN where there is no value.
+        other: the same of the other run.
+        good: pixels with a good fit in both, (ny, nx).
+        same_data: both are fits of the same frames: the errors are then not independent, and the unit is the
+            standard error of one fit, ``sqrt((s1^2 + s2^2) / 2)``; else it is ``sqrt(s1^2 + s2^2)``.
+    """
+    difference = other[0] - one[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
+        z = np.where(unit > 0, difference / unit, np.nan)
+    known_one, known_other = np.isfinite(one[0]), np.isfinite(other[0])
+    counted = z[good & np.isfinite(z)]
+    whole, core = summarise(difference), summarise(counted)
+    return MapDifference(
+        difference=difference,
+        z=z,
+        n_both=int((known_one & known_other).sum()),
+        n_only_one=int((known_one & ~known_other).sum()),
+        n_only_other=int((known_other & ~known_one).sum()),
+        median=whole.median,
+        median_stderr=whole.median_stderr,
+        median_z=core.median,
+        spread_z=core.robust_sd,
+        n_counted=counted.size,
+        n_far=int((np.abs(counted) > FAR).sum()),
+        largest_z=float(np.max(np.abs(counted), initial=0.0)),
+    )
+
+
+@dataclass(frozen=True)
+class Reasons:
+    """Why two measurements of a map differ by more than chance; all False where they do not.
+
+    Attributes:
+        shifted: the median of ``z`` is not 0.
+        spread: ``z`` scatters more than its standard errors allow.
+        pixels: too many single pixels lie far off.
+    """
+
+    shifted: bool
+    spread: bool
+    pixels: bool
+
+    def __bool__(self) -> bool:
+        """Tell whether there is any."""
+        return self.shifted or self.spread or self.pixels
+
+
+def reasons_of_change(found: MapDifference) -> Reasons:
+    """Judge two independent measurements of a map.
+
+    Under the null ``z`` is N(0, 1): its median has standard error ``sqrt(pi / 2 n)``, its robust standard
+    deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust Statistics*, 2019, Sec. 2.5), to which a tenth is
+    added since the standard errors are estimates; of n pixels, 1e-4 n and five standard deviations of the
+    count may lie beyond five standard errors.
+
+    Args:
+        found: of two runs on different frames.
+    """
+    n = found.n_counted
+    if n < 2:
+        return Reasons(False, False, False)
+    allowed = _TAIL * n
+    return Reasons(
+        shifted=bool(abs(found.median_z) > LIMIT * np.sqrt(np.pi / (2.0 * n))),
+        spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),
+        pixels=bool(found.n_far > allowed + LIMIT * np.sqrt(max(allowed, 1.0))),
+    )

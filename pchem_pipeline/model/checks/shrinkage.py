@@ -1,0 +1,188 @@
+"""What the pixels of a sensor, taken together, say about each one's read noise, and so about its fit.
+
+Whether a fit can be trusted depends on the true read noise: the peaks fade as ``exp(-2 pi^2 s_e^2)``, and
+with them go what tells the bias from its neighbours and the sharpness of the standard errors. A pixel knows
+its read noise only to a standard error, though. Where most pixels of a sensor are ambiguous, those that come
+out quiet by chance look clear, and they are the very ones whose estimates are off: no rule that looks at one
+pixel alone can tell, because a really quiet pixel may hold the same histogram.
+
+All pixels together can. Their scatter beyond their standard errors says how much the true read noises differ,
+and an estimate is drawn towards the middle by as much as it is likely to be chance (James and Stein 1961;
+Efron and Morris 1973). A pixel is :attr:`~pchem_pipeline.model.fit.status.FitStatus.WEAKLY_IDENTIFIED` if,
+with the read noise found so, its likelihood gap would be too small, its read noise too high, or its standard
+errors rough. On a sensor whose pixels differ more than their errors this changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.errors.fisher import propagate
+from pchem_pipeline.model.fit.pchem import FitResult
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
+
+__all__ = ["LOOSEST", "Judged", "NoisePool", "judge_together", "noise_of"]
+
+FloatArray = NDArray[np.float64]
+
+#: Largest change of the logarithm of a pixel's information over one standard error of its read noise. Beyond,
+#: the likelihood is no parabola, and 'estimate -+ 2 standard errors' holds the truth in 90 % instead of 95 %.
+LOOSEST = 0.9
+
+_LOOSEST_ALONE = 2.0  # the same of a pixel by itself: far beyond its like, it is on a wrong maximum
+_FEWEST = 30  # pixels that make a pool
+# Squared standard errors below which the scatter of estimates is taken for chance: where it matters they are
+# known to some 15 %, and the scatter has heavy tails.
+_CHANCE = 1.3
+_LEAST_GAP = 0.3  # nats: a smaller gap says nothing of its slope
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Where the truths of a sensor's pixels lie: their middle, and the variance of what they differ by."""
+
+    centre: float
+    variance: float
+
+    @classmethod
+    def of(cls, values: FloatArray, errors: FloatArray) -> _Prior:
+        centre = float(np.median(values))
+        scatter = _MAD * float(np.median(np.abs(values - centre)))
+        return cls(centre, max(0.0, scatter**2 - _CHANCE * float(np.median(errors)) ** 2))
+
+    def shrunk(self, values: FloatArray, errors: FloatArray) -> FloatArray:
+        """Return the values that are likely, given the estimates."""
+        share = self.variance / np.maximum(self.variance + errors**2, np.finfo(np.float64).tiny)
+        return self.centre + share * (values - self.centre)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What the judgement looks at, of n pixels, NaN where there is no value.
+
+    Attributes:
+        noise: s_e, e-, shape (n,).
+        stderr: its standard error, e-, shape (n,).
+        gap: likelihood gap, nats, shape (n,).
+    """
+
+    noise: FloatArray
+    stderr: FloatArray
+    gap: FloatArray
+
+    @classmethod
+    def join(cls, parts: Sequence[Judged]) -> Judged:
+        """Return the pixels of several parts."""
+        return cls(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls)))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which pixels have all three, shape (n,)."""
+        return np.isfinite(self.noise) & np.isfinite(self.gap) & (self.noise > 0) & (self.stderr > 0)
+
+    def of(self, pixels: NDArray[np.bool_] | slice) -> Judged:
+        """Return some of the pixels."""
+        return Judged(self.noise[pixels], self.stderr[pixels], self.gap[pixels])
+
+    def looseness(self) -> tuple[FloatArray, FloatArray]:
+        """Return the logarithm of ``8 pi^2 s_e stderr(s_e)``, and its standard error.
+
+        The information goes as ``exp(-4 pi^2 s_e^2)``, so this is how much its logarithm changes over one
+        standard error; which grows itself as ``exp(2 pi^2 s_e^2)``.
+        """
+        slope = 2.0 / self.noise + 4.0 * np.pi**2 * self.noise
+        return np.log(8.0 * np.pi**2 * self.noise * self.stderr), slope * self.stderr
+
+
+@dataclass(frozen=True)
+class NoisePool:
+    """What the pixels of a sensor have in common.
+
+    Attributes:
+        noise: where their read noises lie, e-.
+        looseness: where the logarithms of their looseness lie.
+        gap_slope: change of the logarithm of the likelihood gap with the read noise, 1/e-, not positive.
+    """
+
+    noise: _Prior
+    looseness: _Prior
+    gap_slope: float
+
+    @classmethod
+    def of(cls, pixels: Judged) -> NoisePool | None:
+        """Return the pool of these pixels; None where fewer than 30 have a value."""
+        some = pixels.of(pixels.known)
+        if some.noise.size < _FEWEST:
+            return None
+        noise = _Prior.of(some.noise, some.stderr)
+        near = np.abs(some.noise - noise.centre) <= 3.0 * _MAD * np.median(np.abs(some.noise - noise.centre))
+        return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
+
+    def weak(self, pixels: Judged, settings: FitSettings) -> NDArray[np.bool_]:
+        """Tell which pixels are weakly identified, shape (n,); False for those without a value.
+
+        Args:
+            pixels: to be judged.
+            settings: their ``gap_threshold`` and ``read_noise_limit`` are the limits.
+        """
+        weak = np.zeros(pixels.noise.size, np.bool_)
+        known = pixels.known
+        some = pixels.of(known)
+        noise = self.noise.shrunk(some.noise, some.stderr)
+        log_gap = np.log(np.maximum(some.gap, 1e-12)) + self.gap_slope * (noise - some.noise)
+        looseness, error = some.looseness()
+        loose = self.looseness.shrunk(looseness, error) > np.log(LOOSEST)
+        loose |= looseness > np.log(_LOOSEST_ALONE)
+        ambiguous = log_gap < np.log(max(settings.gap_threshold, 1e-12))
+        weak[known] = loose | ambiguous | (noise > settings.read_noise_limit)
+        return weak
+
+
+def _slope(pixels: Judged, centre: float) -> float:
+    """Return the regression of the log gap on the read noise; between none and that of the peaks' contrast.
+
+    The neighbours of a bias are told apart by the contrast of the peaks, whose square goes as
+    ``exp(-4 pi^2 s_e^2)``, and with few electrons by the shape of the whole histogram.
+    """
+    off = pixels.noise - pixels.noise.mean()
+    square = float(off @ off)
+    if square == 0.0:
+        return 0.0
+    slope = float(off @ np.log(np.maximum(pixels.gap, _LEAST_GAP))) / square
+    return min(0.0, max(slope, -8.0 * np.pi**2 * centre))
+
+
+def noise_of(gain: FloatArray, sigma: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return s_e = g sigma and its standard error by the delta method, e-, shape (n,).
+
+    Args:
+        gain: g, e-/DN, shape (n,).
+        sigma: DN, shape (n,).
+        covariance: of (H, g, mu, sigma), shape (n, 4, 4).
+    """
+    nothing = np.zeros_like(gain)
+    with np.errstate(invalid="ignore"):
+        stderr = propagate(covariance, np.stack([nothing, sigma, nothing, gain], axis=-1))
+    return gain * sigma, stderr
+
+
+def judge_together(fit: FitResult, settings: FitSettings | None = None) -> FitResult:
+    """Return the fit of a sensor's pixels with the word of those that are weakly identified.
+
+    Args:
+        fit: of all pixels of a sensor, or of many that are alike.
+        settings: of the fit; the defaults if None.
+    """
+    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, fit.covariance)
+    pixels = Judged(noise, stderr, fit.likelihood_gap)
+    pool = NoisePool.of(pixels)
+    if pool is None:
+        return fit
+    word = np.where(pool.weak(pixels, settings or FitSettings()), int(FitStatus.WEAKLY_IDENTIFIED), 0)
+    return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))

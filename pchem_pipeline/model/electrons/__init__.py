@@ -1,0 +1,1 @@
+"""Electron numbers of samples under the fitted law of their pixel."""

@@ -1,0 +1,1 @@
+"""The distribution of all pixels' samples, predicted from the parameter maps."""

@@ -1,0 +1,214 @@
+"""Moments of the ensemble and widths of its components.
+
+Hendrickson et al. 2023, appendices sec:ensemble_dist_moments (A) and sec:ensemble_peak_resolution (B).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+
+__all__ = [
+    "COMPONENT_CASES",
+    "Components",
+    "EnsembleMoments",
+    "MomentErrors",
+    "component_widths",
+    "moment_errors",
+    "predicted_moments",
+    "sample_moments",
+]
+
+_SYMBOLS = ("H", "g", "mu", "sigma2")
+
+#: Parameters held constant in each of the sixteen cases of Appendix B, from none to all four.
+COMPONENT_CASES: tuple[tuple[str, ...], ...] = tuple(
+    sorted(
+        (tuple(s for bit, s in enumerate(_SYMBOLS) if word >> bit & 1) for word in range(16)),
+        key=lambda case: (len(case), [_SYMBOLS.index(symbol) for symbol in case]),
+    )
+)
+
+
+@dataclass(frozen=True)
+class EnsembleMoments:
+    """Moments of the ensemble and the terms that they consist of (Appendix A).
+
+    Attributes:
+        mean: E(E), DN.
+        variance: Var(E), DN^2.
+        nuced_mean: E(E'), e-.
+        nuced_variance: Var(E'), e-^2.
+        variance_of_bias: Var(mu), DN^2.
+        variance_of_signal: Var(H/g), DN^2.
+        mean_read_variance: E(sigma^2), DN^2.
+        mean_shot_variance: E(H/g^2), DN^2.
+        bias_signal_covariance: Cov(mu, H/g), DN^2; it enters the variance twice.
+    """
+
+    mean: float
+    variance: float
+    nuced_mean: float
+    nuced_variance: float
+    variance_of_bias: float
+    variance_of_signal: float
+    mean_read_variance: float
+    mean_shot_variance: float
+    bias_signal_covariance: float
+
+
+@dataclass(frozen=True)
+class MomentErrors:
+    """Standard errors of the sample moments from a finite number of frames, the pixels given.
+
+    Attributes:
+        mean: of the sample mean, DN.
+        variance: of the sample variance, DN^2.
+        nuced_mean: of the mean of the NUCed data, e-.
+        nuced_variance: of the variance of the NUCed data, e-^2.
+    """
+
+    mean: float
+    variance: float
+    nuced_mean: float
+    nuced_variance: float
+
+
+@dataclass(frozen=True)
+class Components:
+    """Mean and width of the components ``E | K_e = k`` (Appendix B).
+
+    Attributes:
+        mean: E(E|K_e=k), DN, shape (n_k,).
+        variance: Var(E|K_e=k), DN^2, shape (16, n_k), rows in the order of ``COMPONENT_CASES``.
+        nuced_variance: Var(E'|K_e=k), e-^2, shape (n_k,).
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    nuced_variance: FloatArray
+
+
+def predicted_moments(pixels: PixelParameters) -> EnsembleMoments:
+    """Mean and variance of the EPCD and the NUCed EPCD from the parameters.
+
+    Hendrickson et al. 2023, Appendix A: ``E(E) = E(mu) + E(H/g)`` and ``Var(E) = Var(mu) + Var(H/g) +
+    E(sigma^2) + E(H/g^2) + 2 Cov(mu, H/g)``; for the NUCed ensemble ``E(H)`` and ``Var(H) + E(H) +
+    E(sigma_e-^2)``.
+
+    Args:
+        pixels: the pixels.
+
+    Returns:
+        The moments and their terms.
+    """
+    exposure, gain, bias, sigma = pixels.columns()
+    signal = exposure / gain
+    covariance = float(np.mean((bias - bias.mean()) * (signal - signal.mean())))
+    terms = (float(bias.var()), float(signal.var()), float(np.mean(sigma**2)), float(np.mean(signal / gain)))
+    return EnsembleMoments(
+        mean=float(bias.mean() + signal.mean()),
+        variance=sum(terms) + 2.0 * covariance,
+        nuced_mean=float(exposure.mean()),
+        nuced_variance=float(exposure.var() + exposure.mean() + np.mean(pixels.read_noise_e**2)),
+        variance_of_bias=terms[0],
+        variance_of_signal=terms[1],
+        mean_read_variance=terms[2],
+        mean_shot_variance=terms[3],
+        bias_signal_covariance=covariance,
+    )
+
+
+def moment_errors(pixels: PixelParameters, n_frames: int | NDArray[np.integer[Any]]) -> MomentErrors:
+    """Standard errors of the sample moments of the ensemble, the pixels given.
+
+    A pixel's samples have variance v = sigma^2 + H/g^2, third central moment H/g^3 and fourth 3 v^2 + H/g^4.
+    About the ensemble mean, from which the pixel lies off by d, ``Var((X - m)^2) = 3 v^2 + H/g^4 - v^2 +
+    4 d H/g^3 + 4 d^2 v``. Frames are independent, so both add over samples.
+
+    Args:
+        pixels: the pixels.
+        n_frames: frames of each pixel: a number, or shape (n,) where pixels differ and each counts the same.
+
+    Returns:
+        Standard errors of mean and variance, raw and NUCed.
+    """
+    exposure, gain, bias, sigma = pixels.columns()
+    errors = []
+    for step, offset, noise in ((1.0 / gain, bias, sigma), (1.0, 0.0, pixels.read_noise_e)):
+        v = noise**2 + exposure * step**2
+        centre = offset + exposure * step
+        d = centre - centre.mean()
+        of_square = 2 * v**2 + exposure * step**4 + 4 * d * exposure * step**3 + 4 * d**2 * v
+        errors += [float(np.sqrt(np.mean(part / n_frames) / len(pixels))) for part in (v, of_square)]
+    return MomentErrors(*errors)
+
+
+def sample_moments(counts: NDArray[np.integer[Any]], dn: NDArray[np.integer[Any]]) -> tuple[float, float]:
+    """Mean and variance of a histogram of integers, without cancellation.
+
+    Args:
+        counts: samples at each DN, shape (n_dn,), not all zero.
+        dn: the DN, shape (n_dn,).
+
+    Returns:
+        Mean (DN) and variance (DN^2, divided by the number of samples).
+    """
+    total = int(counts.sum())
+    mean = float(dn[0]) + float(np.dot(counts, dn - dn[0])) / total
+    return mean, float(np.dot(counts, (dn - mean) ** 2)) / total
+
+
+def component_widths(pixels: PixelParameters, n_k: int) -> Components:
+    """Mean and variance of the components of the EPCD, in the sixteen cases of Appendix B.
+
+    Under the weights ``e^{-H} H^k`` (eq. EPCD_alt_form), ``Var(E|K_e=k) = E(sigma^2) + Var(mu) + 2 k
+    Cov(mu, 1/g) + k^2 Var(1/g)``. Holding g, mu or sigma^2 at the mean of its map removes its terms
+    (sigma^2 leaves its mean); holding H makes the weights equal. So two sets of weighted moments a k
+    serve all cases.
+
+    Args:
+        pixels: the pixels; where all have H = 0 there is no component k > 0, and its moments are NaN.
+        n_k: number of components, k = 0 .. n_k - 1.
+
+    Returns:
+        Means, variances and NUCed variances.
+    """
+    exposure, gain, bias, sigma = pixels.columns()
+    step = 1.0 / gain
+    centres = (float(bias.mean()), float(step.mean()))
+    mu, a = bias - centres[0], step - centres[1]
+    table = np.stack([sigma**2, mu, a, mu * mu, mu * a, a * a, pixels.read_noise_e**2])
+    constant_h = table.mean(axis=1)
+    mean, nuced, variance = np.empty(n_k), np.empty(n_k), np.empty((len(COMPONENT_CASES), n_k))
+    with np.errstate(divide="ignore"):
+        log_exposure = np.log(exposure)
+    for k in range(n_k):
+        log_weight = (k * log_exposure if k else 0.0) - exposure
+        largest = log_weight.max()
+        weight = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
+        weighted = table @ weight / weight.sum()
+        mean[k] = centres[0] + weighted[1] + k * (centres[1] + weighted[2])
+        nuced[k] = weighted[6]
+        for row, case in enumerate(COMPONENT_CASES):
+            chosen = constant_h if "H" in case else weighted
+            variance[row, k] = _case_variance(chosen, case, k, float(constant_h[0]))
+    return Components(mean, variance, nuced)
+
+
+def _case_variance(moments: FloatArray, case: tuple[str, ...], k: int, mean_variance: float) -> float:
+    """Put Var(E|K_e=k) together from weighted moments, without the terms of what is held constant."""
+    read, mu, a, mu_mu, mu_a, a_a = (float(value) for value in moments[:6])
+    total = mean_variance if "sigma2" in case else read
+    if "mu" not in case:
+        total += mu_mu - mu * mu
+    if "g" not in case:
+        total += k * k * (a_a - a * a)
+        if "mu" not in case:
+            total += 2 * k * (mu_a - mu * a)
+    return total

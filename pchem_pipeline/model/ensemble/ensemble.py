@@ -1,0 +1,272 @@
+"""The ensemble of pixels: exact mean of the pixels' PCDs, and the data on the same axes.
+
+The ensemble PCD is ``f_E(x) = E_theta f_X(x | theta)`` (Hendrickson et al. 2023, eq. full_ensemble_dist).
+With one parameter vector per pixel that expectation is the mean over the pixels; nothing need be binned.
+The binned forms of the paper are in :mod:`pchem_pipeline.model.ensemble.ensemble_binned`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.ensemble import ensemble_numba
+from pchem_pipeline.model.errors import information_numba
+from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+
+__all__ = [
+    "DnAxis",
+    "EnsembleSums",
+    "NucedAxis",
+    "Tally",
+    "curve_errors",
+    "electron_pmf",
+    "ensemble_sums",
+    "epcd_exact",
+    "nuced_axis",
+    "tally",
+]
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class DnAxis:
+    """Consecutive integer DN.
+
+    Attributes:
+        start: first DN.
+        size: number of DN.
+    """
+
+    start: int
+    size: int
+
+    @property
+    def dn(self) -> IntArray:
+        """The DN, shape (size,)."""
+        return np.arange(self.start, self.start + self.size, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class NucedAxis:
+    """Equal bins of the NUCed value ``(x - mu) g``; bin j is centred on ``(start + j) width``.
+
+    Attributes:
+        width: bin width, e-.
+        start: index of the first bin; bin 0 is centred on 0 e-.
+        size: number of bins.
+    """
+
+    width: float
+    start: int
+    size: int
+
+    @property
+    def electrons(self) -> FloatArray:
+        """Centres of the bins, e-, shape (size,)."""
+        return np.arange(self.start, self.start + self.size, dtype=np.float64) * self.width
+
+
+@dataclass(frozen=True)
+class EnsembleSums:
+    """Sums over pixels of the predicted mass of each bin, and of its square.
+
+    Attributes:
+        n_pixels: number of pixels in the sums.
+        raw: sum of f_X at the integer DN, 1/DN, shape (n_dn,).
+        raw_square: sum of its square.
+        nuced: sum of the mass in the bins of the NUCed axis, shape (n_bins,).
+        nuced_square: sum of its square.
+    """
+
+    n_pixels: int
+    raw: FloatArray
+    raw_square: FloatArray
+    nuced: FloatArray
+    nuced_square: FloatArray
+
+
+@dataclass(frozen=True)
+class Tally:
+    """The data of a set of pixels on the axes of the ensemble.
+
+    Attributes:
+        raw: samples at each DN, shape (n_dn,).
+        nuced: samples in each bin of the NUCed axis, shape (n_bins,).
+        outside: samples beyond the DN axis.
+        nuced_outside: samples beyond the NUCed axis.
+        nuced_sum: sum of the NUCed values of all samples, e-.
+        nuced_sum_square: sum of their squares, e-^2.
+    """
+
+    raw: IntArray
+    nuced: IntArray
+    outside: int
+    nuced_outside: int
+    nuced_sum: float
+    nuced_sum_square: float
+
+
+def nuced_axis(
+    pixels: PixelParameters, dn: DnAxis, *, width: float | None = None, steps: int = 1
+) -> NucedAxis:
+    """Choose the bins of the NUCed histogram.
+
+    A pixel's NUCed values lie on a lattice of pitch g. A bin of width w holds ``floor(w/g)`` or one more
+    of its points, and their jitter from pixel to pixel is noise on the histogram that no number of frames
+    removes. It is smallest where w is a whole multiple of the typical g, hence the default.
+
+    Args:
+        pixels: the pixels.
+        dn: axis of the raw data; the NUCed axis reaches no further than it does for the median pixel's
+            neighbours (1st to 99th percentile of g and mu), so that one strange gain cannot stretch it.
+        width: bin width, e-; None: ``steps`` times the median g.
+        steps: DN per bin where ``width`` is None.
+
+    Returns:
+        The axis.
+    """
+    gain, bias = pixels.conversion_gain, pixels.bias
+    pitch = float(np.median(gain))
+    bin_width = steps * pitch if width is None else width
+    tail = 10.0 * float(np.percentile(pixels.read_noise_e, 99))
+    largest_gain = float(np.percentile(gain, 99))
+    lowest = max(-tail, (dn.start - float(np.percentile(bias, 99))) * largest_gain)
+    highest = (dn.start + dn.size - float(np.percentile(bias, 1))) * largest_gain
+    start = math.floor(lowest / bin_width)
+    return NucedAxis(bin_width, start, max(math.ceil(highest / bin_width) - start, 1))
+
+
+def ensemble_sums(pixels: PixelParameters, dn: DnAxis, nuced: NucedAxis | None = None) -> EnsembleSums:
+    """Sum the pixels' PCDs at the integer DN, and the same masses sorted into NUCed bins.
+
+    The sorted masses are what the NUCed data must show, lattice and all: each DN of a pixel lies at ``(x
+    - mu) g`` and falls into one bin as a whole (Hendrickson et al. 2023, eq. partial_ensemble_dist,
+    before the lattice is smoothed over).
+
+    Args:
+        pixels: the pixels.
+        dn: axis of the raw prediction; it should hold all of the data.
+        nuced: axis of the NUCed prediction, or None for none.
+
+    Returns:
+        The sums; divide by ``n_pixels`` for the means.
+    """
+    raw, raw_square = np.zeros((2, dn.size))
+    bins, bins_square = np.zeros((2, nuced.size if nuced else 0))
+    ensemble_numba.sum_pcd_pixels(
+        *pixels.columns(),
+        dn.start,
+        raw,
+        raw_square,
+        nuced.width if nuced else 0.0,
+        nuced.start if nuced else 0,
+        bins,
+        bins_square,
+    )
+    return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square)
+
+
+def epcd_exact(pixels: PixelParameters, dn: DnAxis) -> FloatArray:
+    """Ensemble PCD as the mean over the pixels (Hendrickson et al. 2023, eq. full_ensemble_dist).
+
+    Args:
+        pixels: the pixels.
+        dn: where to evaluate it.
+
+    Returns:
+        f_E, 1/DN, shape (n_dn,). For pixels narrower than 1 DN it is the mass of the DN cell.
+    """
+    return ensemble_sums(pixels, dn).raw / len(pixels)
+
+
+def curve_errors(
+    pixels: PixelParameters, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
+) -> tuple[FloatArray, FloatArray]:
+    """Sum the pixels' variances of the two predicted densities that the errors of their parameters cause.
+
+    By the delta method, pixels being independent; the standard error of a mean over n pixels is
+    ``sqrt(sum) / n``. After correction only H and sigma_e- matter.
+
+    Args:
+        pixels: n pixels.
+        covariance: of (H, g, mu, sigma), shape (n, 4, 4); entries that are not known count as 0.
+        dn: axis of the raw prediction.
+        nuced: axis of the NUCed prediction.
+
+    Returns:
+        Sums of the variances of f_X, 1/DN^2, shape (n_dn,), and of the NUCed density, 1/e-^2, shape
+        (n_bins,).
+    """
+    raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
+    plain = np.stack(pixels.columns(), axis=1)
+    information_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
+    ones, zeros = np.ones(len(pixels)), np.zeros(len(pixels))
+    corrected = np.stack([pixels.quanta_exposure, ones, zeros, pixels.read_noise_e], axis=1)
+    slope = np.zeros((len(pixels), 4, 4))
+    slope[:, 0, 0] = 1.0
+    slope[:, 3, 1], slope[:, 3, 3] = pixels.read_noise_dn, pixels.conversion_gain
+    known = np.where(np.isfinite(covariance), covariance, 0.0)
+    moved = slope @ known @ np.swapaxes(slope, 1, 2)
+    information_numba.curve_variance(corrected, moved, nuced.start * nuced.width, nuced.width, bins)
+    return raw, bins
+
+
+def tally(
+    counts: NDArray[np.integer[Any]],
+    origin: NDArray[np.integer[Any]],
+    pixels: PixelParameters,
+    dn: DnAxis,
+    nuced: NucedAxis,
+) -> Tally:
+    """Sort the histograms of pixels onto the axes of the ensemble.
+
+    Args:
+        counts: samples per bin, shape (n, n_bins), integer.
+        origin: DN of bin 0, shape (n,).
+        pixels: parameters of the same n pixels, which give the two-point NUC ``(x - mu) g``.
+        dn: axis of the raw histogram.
+        nuced: axis of the NUCed histogram.
+
+    Returns:
+        The tally; what falls beyond an axis is counted, not lost in silence.
+    """
+    raw = np.zeros(dn.size, dtype=np.int64)
+    bins = np.zeros(nuced.size, dtype=np.int64)
+    sums = np.zeros((len(pixels), 2))
+    outside, nuced_outside = ensemble_numba.tally_counts(
+        counts,
+        np.asarray(origin, dtype=np.int64),
+        pixels.conversion_gain,
+        pixels.bias,
+        dn.start,
+        raw,
+        nuced.width,
+        nuced.start,
+        bins,
+        sums,
+    )
+    return Tally(raw, bins, int(outside), int(nuced_outside), math.fsum(sums[:, 0]), math.fsum(sums[:, 1]))
+
+
+def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:
+    """Probability mass of the ensemble electron number (Hendrickson et al. 2023, eq. K_ensemble_pmf).
+
+    Args:
+        quanta_exposure: H of each pixel, or of each bin of the map's histogram, e-, shape (n,).
+        n_k: number of masses, for k = 0 .. n_k - 1.
+        share: part of the pixels that each H stands for, shape (n,), adding up to 1; None: equal parts.
+
+    Returns:
+        p_Ke(k), shape (n_k,).
+    """
+    exposure = np.ascontiguousarray(quanta_exposure, dtype=np.float64)
+    weights = np.full(exposure.size, 1.0 / exposure.size) if share is None else share
+    out = np.zeros(n_k)
+    ensemble_numba.sum_poisson(weights, exposure, out)
+    return out

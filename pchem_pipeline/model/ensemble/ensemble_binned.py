@@ -1,0 +1,252 @@
+"""Ensemble PCD from histograms of the parameter maps, dependent and independent.
+
+The paper approximates the joint density of the parameters by a 4-D histogram (dependent) or by the product of
+four histograms (independent) and replaces the integral of eq. full_ensemble_dist by a sum (Hendrickson
+et al. 2023, Sec. IV-C). Bins are equally wide over the central part of each map, with one more bin at each
+end for the rest. What stands for a cell is its centre, as in a plain histogram, or the mean of the
+pixels in it, which removes the error of first order in the bin width.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.ensemble import ensemble_numba
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_pmf
+from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+
+__all__ = [
+    "Cells",
+    "HistogramChoice",
+    "electron_pmf_binned",
+    "epcd_dependent",
+    "epcd_independent",
+    "joint_cells",
+    "nuced_dependent",
+    "nuced_independent",
+]
+
+#: Analog noise (DN) to which narrower cells are widened in the inversion.
+_NARROWEST = 0.05
+#: Longest signal (DN) that the inversion keeps from wrapping round; only a pixel of absurd gain is beyond.
+_LONGEST = 65536.0
+
+
+@dataclass(frozen=True)
+class HistogramChoice:
+    """How parameter maps are binned.
+
+    Attributes:
+        bins: bins of each parameter over the central part of its map.
+        span: ``"full"``, minimum to maximum, or ``"central"``, the 1st to 99th percentile and half of that
+            distance beyond on either side, but not beyond the extremes.
+        representative: ``"mean"`` of the pixels in a cell, or its ``"centre"`` (the cells beyond the
+            bins have no centre and always use the mean).
+    """
+
+    bins: int = 64
+    span: Literal["central", "full"] = "central"
+    representative: Literal["mean", "centre"] = "mean"
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Occupied cells of a histogram of d parameters.
+
+    Attributes:
+        share: part of the pixels in each cell, shape (n_cells,), adding up to 1.
+        values: parameters that stand for each cell, shape (d, n_cells).
+    """
+
+    share: FloatArray
+    values: FloatArray
+
+
+def joint_cells(columns: Sequence[FloatArray], choice: HistogramChoice) -> Cells:
+    """Histogram pixels in d dimensions and keep the occupied cells only.
+
+    Args:
+        columns: d parameters, each of shape (n,).
+        choice: the bins.
+
+    Returns:
+        At most n cells.
+    """
+    index: NDArray[np.int64] = np.zeros(columns[0].size, dtype=np.int64)
+    coordinates, edges = [], []
+    for column in columns:
+        edge = _edges(column, choice)
+        place = np.searchsorted(edge, column, side="right") - 1
+        place[column == edge[-1]] = edge.size - 2  # the last bin is closed
+        edges.append(edge)
+        coordinates.append(place)
+        index = index * (edge.size + 1) + place + 1
+    _, first, inverse, occupants = np.unique(
+        index, return_index=True, return_inverse=True, return_counts=True
+    )
+    values = np.empty((len(columns), occupants.size))
+    for d, column in enumerate(columns):
+        values[d] = np.bincount(inverse, weights=column) / occupants
+        if choice.representative == "centre":
+            place = coordinates[d][first]
+            inner = (place >= 0) & (place < edges[d].size - 1)
+            values[d, inner] = 0.5 * (edges[d][place[inner]] + edges[d][place[inner] + 1])
+    return Cells(occupants / columns[0].size, values)
+
+
+def _edges(column: FloatArray, choice: HistogramChoice) -> FloatArray:
+    low, high = float(column.min()), float(column.max())
+    if choice.span == "central":
+        first, last = np.percentile(column, [1.0, 99.0])
+        beyond = 0.5 * (last - first)
+        low, high = max(low, float(first - beyond)), min(high, float(last + beyond))
+    if not high > low:  # a constant map: one bin that holds it
+        return np.array([low, np.nextafter(low, np.inf)])
+    return np.linspace(low, high, choice.bins + 1)
+
+
+def epcd_dependent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
+    """Ensemble PCD with the joint density of (H, g, mu, sigma^2) from a 4-D histogram.
+
+    Hendrickson et al. 2023, eq. full_ensemble_dist with integrals replaced by sums, dependent parameters.
+
+    Args:
+        pixels: the pixels.
+        dn: where to evaluate it.
+        choice: the bins.
+
+    Returns:
+        f_E, 1/DN, shape (n_dn,).
+    """
+    exposure, gain, bias, sigma = pixels.columns()
+    cells = joint_cells((exposure, gain, bias, sigma**2), choice)
+    out = np.zeros(dn.size)
+    values = cells.values
+    ensemble_numba.sum_pcd_cells(
+        cells.share, values[0], values[1], values[2], np.sqrt(values[3]), dn.start, out
+    )
+    return out
+
+
+def epcd_independent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
+    """Ensemble PCD with the joint density as the product of four histograms.
+
+    The product of B bins each has B^4 cells, too many to visit. Its characteristic function factors
+    instead: ``E_{g,H} exp(H (e^{it/g} - 1)) * E_mu e^{it mu} * E_sigma exp(-sigma^2 t^2 / 2)``
+    (Hendrickson et al. 2023, eqs. EPCD_RV_definition and full_ensemble_dist, independent parameters). It
+    falls off as a Gaussian, so the trapezoidal rule inverts it to rounding error.
+
+    Args:
+        pixels: the pixels.
+        dn: where to evaluate it.
+        choice: the bins.
+
+    Returns:
+        f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute.
+    """
+    exposure, gain, bias, sigma = pixels.columns()
+    exposures, gains, biases, variances = (
+        joint_cells((column,), choice) for column in (exposure, gain, bias, sigma**2)
+    )
+    period, origin = _period(exposures, gains, biases, variances, dn)
+    narrow = variances.values[0] < ensemble_numba.NARROW**2
+    spread = np.where(narrow, np.maximum(variances.values[0] - 1 / 12, _NARROWEST**2), variances.values[0])
+    n_frequencies = math.ceil(period * ensemble_numba.REACH / (2 * np.pi * math.sqrt(spread.min())))
+    folded = np.zeros(period, dtype=np.complex128)
+    for start in range(0, n_frequencies + 1, 64):
+        order = np.arange(start, min(start + 64, n_frequencies + 1))
+        t = 2 * np.pi * order / period
+        noise = np.exp(-0.5 * np.multiply.outer(t**2, spread))
+        noise = np.where(narrow, noise * np.sinc(t / (2 * np.pi))[:, None], noise) @ variances.share
+        offset = np.exp(1j * np.multiply.outer(t, biases.values[0] - origin)) @ biases.share
+        product = noise * offset * _electrons_in_dn(t, exposures, gains)
+        # frequencies beyond the sampling of the DN grid fold onto it, and those below zero are conjugates
+        np.add.at(folded, order % period, np.where(order == 0, 0.5, 1.0) * product)
+    density = 2.0 * np.fft.fft(folded).real / period
+    return np.maximum(density[np.asarray(dn.dn - origin)], 0.0)
+
+
+def _electrons_in_dn(t: FloatArray, exposures: Cells, gains: Cells) -> NDArray[np.complex128]:
+    """Return the characteristic function of K/g at ``t`` for independent H and g."""
+    phase = np.exp(1j * np.multiply.outer(t, 1.0 / gains.values[0])) - 1.0
+    by_gain = np.exp(np.multiply.outer(phase, exposures.values[0])) @ exposures.share
+    return np.asarray(by_gain @ gains.share)
+
+
+def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn: DnAxis) -> tuple[int, int]:
+    """Choose the period (DN) of the inversion, longer than the density, and its first DN."""
+    reach = (ensemble_numba.REACH + 1.0) * math.sqrt(variances.values[0].max()) + 1.0
+    steps = _enough_k(exposures.values[0]) / gains.values[0].min()
+    low = min(dn.start, math.floor(biases.values[0].min() - reach))
+    high = max(dn.start + dn.size, math.ceil(biases.values[0].max() + min(steps, _LONGEST) + reach))
+    return high - low, low
+
+
+def nuced_dependent(pixels: PixelParameters, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
+    """NUCed ensemble PCD with the joint density of (H, sigma_e-^2) from a 2-D histogram.
+
+    Hendrickson et al. 2023, eq. partial_ensemble_dist, dependent parameters; each value is the mean of the
+    density over its bin, as in the data.
+
+    Args:
+        pixels: the pixels.
+        axis: bins of the NUCed value.
+        choice: the bins of the parameters.
+
+    Returns:
+        f_E', 1/e-, shape (n_bins,).
+    """
+    cells = joint_cells((pixels.quanta_exposure, pixels.read_noise_e**2), choice)
+    out = np.zeros(axis.size)
+    sigma_e = np.sqrt(cells.values[1])
+    ensemble_numba.sum_nuced_cells(cells.share, cells.values[0], sigma_e, axis.width, axis.start, out)
+    return out / axis.width
+
+
+def nuced_independent(pixels: PixelParameters, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
+    """NUCed ensemble PCD with the joint density as the product of two histograms.
+
+    Hendrickson et al. 2023, eq. partial_ensemble_dist, independent parameters, averaged over each bin.
+
+    Args:
+        pixels: the pixels.
+        axis: bins of the NUCed value.
+        choice: the bins of the parameters.
+
+    Returns:
+        f_E', 1/e-, shape (n_bins,).
+    """
+    mass = electron_pmf_binned(pixels.quanta_exposure, _enough_k(pixels.quanta_exposure), choice)
+    noise = joint_cells((pixels.read_noise_e**2,), choice)
+    out = np.zeros(axis.size)
+    ensemble_numba.sum_nuced_product(mass, noise.share, np.sqrt(noise.values[0]), axis.width, axis.start, out)
+    return out / axis.width
+
+
+def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, choice: HistogramChoice) -> FloatArray:
+    """Mass of the ensemble electron number with the density of H from a histogram of its map.
+
+    Hendrickson et al. 2023, eq. K_ensemble_pmf with the integral replaced by a sum.
+
+    Args:
+        quanta_exposure: H of each pixel, e-, shape (n,).
+        n_k: number of masses, for k = 0 .. n_k - 1.
+        choice: the bins.
+
+    Returns:
+        p_Ke(k), shape (n_k,).
+    """
+    cells = joint_cells((quanta_exposure,), choice)
+    return electron_pmf(cells.values[0], n_k, cells.share)
+
+
+def _enough_k(exposure: FloatArray) -> int:
+    """Return a number of electron numbers beyond which the largest exposure has no mass."""
+    largest = float(exposure.max())
+    return int(largest + 12.0 * np.sqrt(largest) + 40.0)

@@ -1,0 +1,94 @@
+"""Settings of the parameter maps and of the ensemble prediction."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from pchem_pipeline.base.settings import Section
+
+__all__ = ["EnsembleSettings", "MapsSettings"]
+
+
+class MapsSettings(Section):
+    """How the maps are summarised, and which pixels are called misfits; no setting changes a parameter."""
+
+    percentiles: tuple[float, ...] = Field(
+        default=(1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0),
+        description="percentiles in the summary of each map, % of the pixels that have a value",
+    )
+    outlier_sigmas: float = Field(
+        default=6.0,
+        gt=0,
+        description="a pixel is an outlier beyond this many robust standard deviations (1.4826 MAD) "
+        "from the median",
+    )
+
+    false_discovery_rate: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        description="share of false alarms accepted among the pixels whose histograms are said to disagree "
+        "with the model (Benjamini and Hochberg)",
+    )
+    worst_pixels: int = Field(
+        default=6, ge=0, le=16, description="pixels of the poorest fit that are listed and drawn"
+    )
+
+    @field_validator("percentiles")
+    @classmethod
+    def _within_0_100(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if any(not 0 <= p <= 100 for p in value):
+            raise ValueError("every percentile lies in 0..100")
+        if list(value) != sorted(set(value)):
+            raise ValueError("percentiles increase, none twice")
+        return value
+
+
+class EnsembleSettings(Section):
+    """The ensemble histogram and its three predictions."""
+
+    frames: int | Literal["all"] = Field(
+        default=250,
+        description="number of frames in the ensemble histogram, or all; a shorter run gives what it has",
+    )
+    first_frame: int = Field(default=0, ge=0, description="first of the frames in the ensemble histogram")
+    parameter_bins: int = Field(
+        default=64,
+        ge=2,
+        le=200,
+        description="bins of each parameter in the 4-D, 2-D and 1-D histograms of the parameter maps",
+    )
+    parameter_range: Literal["central", "full"] = Field(
+        default="central",
+        description="what the equal-width bins span: the 1st to 99th percentile of each map and half of that "
+        "beyond on either side, with one more bin at each end for the rest; or minimum to maximum, "
+        "which a single hot pixel can stretch",
+    )
+    cell_representative: Literal["mean", "centre"] = Field(
+        default="mean",
+        description="parameters that stand for a bin: mean of the pixels in it, or its centre",
+    )
+    nuced_bin_width: float | None = Field(
+        default=None,
+        ge=1e-3,
+        description="bin width of the NUCed histogram, e-; null: median conversion gain times "
+        "nuced_bin_steps, which keeps the number of DN per bin the same from bin to bin",
+    )
+    nuced_bin_steps: int = Field(
+        default=1, ge=1, le=100, description="DN per bin of the NUCed histogram when nuced_bin_width is null"
+    )
+    rmse_coverage: float = Field(
+        default=0.999,
+        gt=0,
+        le=1,
+        description="RMSE and its noise floor are taken over the DN that hold this central part of the data",
+    )
+
+    @field_validator("frames")
+    @classmethod
+    def _at_least_one(cls, value: int | str) -> int | str:
+        if isinstance(value, int) and value < 1:
+            raise ValueError("at least one frame, or all")
+        return value

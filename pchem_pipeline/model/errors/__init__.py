@@ -1,0 +1,1 @@
+"""Fisher and observed information: standard errors and bounds."""

@@ -1,0 +1,254 @@
+"""The score of single samples: what sandwich errors, the calibration of chi-square and curves are made of.
+
+The score of a sample x is the posterior mean of the complete-data score (Louis 1982): it is ``E[k] - H``,
+``E[k e]/s2``, ``E[e]/s2`` and ``-1/2 + E[e^2]/(2 s2)`` in (log H, 1/g, mu, log s2), ``e = x - mu - k/g``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+_REACH = 8.0  # standard deviations around a sample in which components count
+_FAR = 700.0  # exponents below minus this are 0
+_SMALLEST_EXPECTATION = 5.0
+
+
+@nb.njit(nogil=True, cache=True)
+def log_poisson(exposure: float, size: int) -> NDArray[np.float64]:
+    """Return log P(K = k) of k = 0 .. size - 1."""
+    out = np.empty(size)
+    out[0] = -exposure
+    step = math.log(exposure)
+    for k in range(1, size):
+        out[k] = out[k - 1] + step - math.log(k)
+    return out
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def sample_score(
+    x: float,
+    parameters: NDArray[np.float64],
+    log_weights: NDArray[np.float64],
+    score: NDArray[np.float64],
+) -> float:
+    """Fill the score of one sample with respect to (H, g, mu, sigma) and return its log-density.
+
+    Args:
+        x: DN.
+        parameters: (H, g, mu, sigma).
+        log_weights: log P(K = k), at least as far as x reaches.
+        score: out, shape (4,).
+
+    Returns:
+        ``log f_X(x)``; -inf and a score of 0 where the density vanishes.
+    """
+    exposure, gain, bias, sigma = parameters[0], parameters[1], parameters[2], parameters[3]
+    step, inverse = 1.0 / gain, 1.0 / (sigma * sigma)
+    nearest = max(0, math.floor((x - bias) * gain + 0.5))
+    noise = sigma * gain
+    half = math.ceil(_REACH * noise) + 2
+    if noise > 0.4:  # the Poisson factor moves the largest term away from the nearest component
+        half += math.ceil(noise * noise * abs(math.log(exposure / (nearest + 1.0))))
+    low, high = max(0, nearest - half), min(log_weights.size - 1, nearest + half)
+    low = min(low, high)
+    top = -math.inf
+    for k in range(low, high + 1):
+        e = x - bias - k * step
+        top = max(top, log_weights[k] - 0.5 * e * e * inverse)
+    s0 = s1 = s2 = s3 = s4 = 0.0
+    for k in range(low, high + 1):
+        e = x - bias - k * step
+        exponent = log_weights[k] - 0.5 * e * e * inverse - top
+        if exponent < -40.0:
+            continue
+        term = math.exp(exponent)
+        s0 += term
+        s1 += k * term
+        s2 += k * e * term
+        s3 += e * term
+        s4 += e * e * term
+    score[0] = s1 / s0 / exposure - 1.0
+    score[1] = -s2 / s0 * inverse * step * step
+    score[2] = s3 / s0 * inverse
+    score[3] = (s4 / s0 * inverse - 1.0) / sigma
+    return top + math.log(s0) - math.log(sigma) - 0.9189385332046727
+
+
+@nb.njit(nogil=True, cache=True)
+def _size(exposure: float, gain: float, reach: float) -> int:
+    """Return how many electron numbers matter for values up to ``reach`` DN above the bias."""
+    return int(max(exposure + 12.0 * math.sqrt(exposure), max(reach, 0.0) * gain) + 40.0)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def outer_scores(
+    counts: NDArray[np.generic],
+    origin: NDArray[np.int64],
+    parameters: NDArray[np.float64],
+    floor: float,
+    out: NDArray[np.float64],
+) -> None:
+    """Fill the sums of outer products of the samples' scores, the middle of the sandwich.
+
+    Args:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4); NaN where there is none.
+        floor: of the tail guard; samples that it leaves out do not count.
+        out: out, shape (n, 4, 4); NaN without parameters.
+    """
+    score = np.empty(4)
+    for p in range(counts.shape[0]):
+        out[p] = math.nan
+        if not math.isfinite(parameters[p].sum()):
+            continue
+        out[p] = 0.0
+        n = 0.0
+        reach = float(origin[p]) - parameters[p, 2]
+        for b in range(counts.shape[1]):
+            n += float(counts[p, b])
+            if counts[p, b] > 0:
+                reach = float(origin[p] + b) - parameters[p, 2]
+        weights = log_poisson(parameters[p, 0], _size(parameters[p, 0], parameters[p, 1], reach))
+        for b in range(counts.shape[1]):
+            if counts[p, b] == 0:
+                continue
+            c = float(counts[p, b])
+            logged = sample_score(float(origin[p] + b), parameters[p], weights, score)
+            if floor > 0.0 and logged < math.log(floor / n):
+                continue
+            for i in range(4):
+                for j in range(4):
+                    out[p, i, j] += c * score[i] * score[j]
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def grouped_trace(
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    frames: NDArray[np.float64],
+    parameters: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Fill how many of the fitted parameters the groups of the chi-square test determine.
+
+    The trace of the groups' Fisher information times the covariance of the estimates: 4 where grouping
+    loses nothing, 0 where the groups say nothing. Groups are those of
+    :func:`~pchem_pipeline.model.fit.goodness_numba.pearson`.
+
+    Args:
+        first: first occupied DN, shape (n,).
+        last: last occupied DN, shape (n,).
+        frames: samples fitted, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4); NaN where there is none.
+        covariance: of the estimates, shape (n, 4, 4); NaN for what a bound holds.
+        out: out, shape (n,); NaN without parameters.
+    """
+    score, held, rest = np.empty(4), np.empty(4), np.empty(4)
+    for p in range(first.size):
+        out[p] = math.nan
+        if not math.isfinite(parameters[p].sum()):
+            continue
+        reach = float(last[p]) - parameters[p, 2]
+        weights = log_poisson(parameters[p, 0], _size(parameters[p, 0], parameters[p, 1], reach))
+        expected, remaining, trace = 0.0, frames[p], 0.0
+        held[:] = 0.0
+        rest[:] = 0.0
+        for x in range(first[p], last[p] + 1):
+            logged = sample_score(float(x), parameters[p], weights, score)
+            mass = frames[p] * math.exp(max(logged, -_FAR))
+            expected += mass
+            for i in range(4):
+                held[i] += mass * score[i]
+            if expected >= _SMALLEST_EXPECTATION and remaining - expected >= _SMALLEST_EXPECTATION:
+                trace += _form(held, covariance[p]) / expected
+                remaining -= expected
+                for i in range(4):
+                    rest[i] -= held[i]
+                    held[i] = 0.0
+                expected = 0.0
+        # the scores of all groups add up to 0, those outside the window included
+        if remaining > 0.0:
+            trace += _form(rest, covariance[p]) / remaining
+        out[p] = trace
+
+
+@nb.njit(nogil=True, cache=True)
+def _form(vector: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
+    """Return ``vector' matrix vector`` over the entries of the matrix that are known."""
+    found = 0.0
+    for i in range(4):
+        for j in range(4):
+            if math.isfinite(matrix[i, j]):
+                found += vector[i] * matrix[i, j] * vector[j]
+    return found
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def curve_variance(
+    parameters: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    x0: float,
+    pitch: float,
+    out: NDArray[np.float64],
+) -> None:
+    """Add every pixel's variance of its density at ``x0 + i pitch`` by the delta method to ``out[i]``.
+
+    ``d f = f S' d theta`` with the score S of a sample there, so the variance is ``f^2 S' C S``.
+
+    Args:
+        parameters: (H, g, mu, sigma), shape (n, 4); all known.
+        covariance: of the estimates, shape (n, 4, 4); entries that are NaN count as 0.
+        x0: first place, in the unit of the bias.
+        pitch: between places.
+        out: in and out, shape (m,).
+    """
+    score = np.empty(4)
+    for p in range(parameters.shape[0]):
+        exposure, gain = parameters[p, 0], parameters[p, 1]
+        bias, sigma = parameters[p, 2], parameters[p, 3]
+        spread = 9.0 * math.sqrt(exposure) + 9.0
+        low = bias + max(exposure - spread, 0.0) / gain - 9.0 * sigma
+        high = bias + (exposure + spread) / gain + 9.0 * sigma
+        start = max(0, math.floor((low - x0) / pitch))
+        stop = min(out.size - 1, math.ceil((high - x0) / pitch))
+        if start > stop:
+            continue
+        weights = log_poisson(exposure, _size(exposure, gain, x0 + stop * pitch - bias))
+        for i in range(start, stop + 1):
+            logged = sample_score(x0 + i * pitch, parameters[p], weights, score)
+            if logged > -40.0:
+                out[i] += math.exp(2.0 * logged) * _form(score, covariance[p])
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def trim_tile(
+    counts: NDArray[np.generic],
+    origin: NDArray[np.int64],
+    parameters: NDArray[np.float64],
+    floor: float,
+    out: NDArray[np.generic],
+) -> None:
+    """Copy the histograms of shape (n, B) without the samples that the tail guard leaves out."""
+    score = np.empty(4)
+    for p in range(counts.shape[0]):
+        n, last = 0.0, 0
+        for b in range(counts.shape[1]):
+            out[p, b] = counts[p, b]
+            n += float(counts[p, b])
+            if counts[p, b] > 0:
+                last = b
+        if not (math.isfinite(parameters[p].sum()) and n > 0.0):
+            continue
+        reach = float(origin[p] + last) - parameters[p, 2]
+        weights = log_poisson(parameters[p, 0], _size(parameters[p, 0], parameters[p, 1], reach))
+        for b in range(counts.shape[1]):
+            if counts[p, b] > 0:
+                logged = sample_score(float(origin[p] + b), parameters[p], weights, score)
+                if logged < math.log(floor / n):
+                    out[p, b] = 0

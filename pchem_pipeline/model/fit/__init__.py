@@ -1,0 +1,1 @@
+"""Maximum likelihood of a pixel's parameters from its histograms."""

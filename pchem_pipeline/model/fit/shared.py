@@ -1,0 +1,318 @@
+"""Maximum likelihood of the pixels' four parameters together with parameters that all pixels share.
+
+Scoring steps (Fisher 1935) with a damping (Levenberg 1944) on the exact masses of the codes
+(:func:`~pchem_pipeline.model.fit.grown.marginal_mass`); derivatives in what the pixels share are differences
+of masses, so any law will do. The information matrix has an arrow shape, a 4 x 4 block per pixel and one
+border for what they share, so a step costs no more than the pixels' own.
+
+Codes may be left out, pixel by pixel: the likelihood is then conditional on the other codes, so that what is
+not understood in one place (a cut, a contamination) does not bend the parameters found in another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit.grown import marginal_mass, marginal_slopes
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = ["SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared", "to_parameters", "to_theta"]
+
+FloatArray = NDArray[np.float64]
+#: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
+Law = Callable[[FloatArray, FloatArray], MarginalModel]
+
+_ROUNDING = 1.0 / 12.0
+_LEAST_MASS = 1e-60
+_STEP = 1e-5  # of the differences, in units of the parameters' natural scale
+_REACH_EXPOSURE, _REACH_STEP = 2.0, 0.3  # logarithms
+_LOG_16 = float(np.log(16.0))  # a read noise of a quarter of a step
+_LOWEST_LOG_VARIANCE = float(np.log(1e-4))
+_FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e8
+
+
+@dataclass(frozen=True)
+class SharedProblem:
+    """Histograms and the law that they are to follow.
+
+    Attributes:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        kept: codes that count, shape (n, B).
+        law: from shared and own parameters to the law of the pixels.
+        bounds: lowest and highest value of each shared parameter, shape (d, 2).
+        scale: natural scale of each shared parameter, shape (d,).
+    """
+
+    counts: NDArray[np.integer]
+    origin: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+    law: Law
+    bounds: FloatArray
+    scale: FloatArray
+
+    @property
+    def n_shared(self) -> int:
+        """Number of shared parameters."""
+        return int(self.scale.size)
+
+    def masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
+        """Return the mass of every code, those left out included, shape (n, B)."""
+        own = to_parameters(theta)
+        codes = self.origin[:, None] + np.arange(self.counts.shape[1])
+        return marginal_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
+
+    def log_masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
+        """Return the logarithm of the mass given that the code is kept, shape (n, B); 0 where it is not."""
+        mass = np.where(self.kept, self.masses(theta, shared), 0.0)
+        inside = np.maximum(mass.sum(axis=1, keepdims=True), _LEAST_MASS)
+        return np.where(self.kept, np.log(np.maximum(mass, _LEAST_MASS) / inside), 0.0)
+
+    def log_likelihood(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
+        """Return the log-likelihood of each pixel, nats, shape (n,); -inf where the law refuses."""
+        try:
+            found = (self.counts * self.log_masses(theta, shared)).sum(axis=1)
+        except ValueError:  # fields that do not go together
+            return np.full(theta.shape[0], -np.inf)
+        return np.where(np.isfinite(found), found, -np.inf)
+
+
+@dataclass(frozen=True)
+class SharedFit:
+    """Estimates.
+
+    Attributes:
+        theta: (log H, log 1/g, mu, log sigma_R^2) of the pixels, shape (n, 4).
+        shared: shared parameters, shape (d,).
+        own_covariance: of the pixels' parameters, the shared ones taken as known, shape (n, 4, 4).
+        covariance: of the shared parameters, shape (d, d), from the information; NaN for one at its bound.
+        log_likelihood: nats, shape (n,).
+        converged: whether the rise that a further step promises is below the tolerance.
+    """
+
+    theta: FloatArray
+    shared: FloatArray
+    own_covariance: FloatArray
+    covariance: FloatArray
+    log_likelihood: FloatArray
+    converged: bool
+
+    @property
+    def parameters(self) -> FloatArray:
+        """(H, g, mu, sigma) of the pixels, shape (n, 4); e-, e-/DN, DN, DN."""
+        return to_parameters(self.theta)
+
+
+def to_parameters(theta: FloatArray) -> FloatArray:
+    """Return (H, g, mu, sigma), shape (n, 4), of (log H, log 1/g, mu, log sigma_R^2)."""
+    variance = np.exp(theta[:, 3]) + _ROUNDING
+    return np.stack([np.exp(theta[:, 0]), np.exp(-theta[:, 1]), theta[:, 2], np.sqrt(variance)], axis=1)
+
+
+def to_theta(parameters: FloatArray) -> FloatArray:
+    """Return (log H, log 1/g, mu, log sigma_R^2), shape (n, 4), of (H, g, mu, sigma)."""
+    h, g, mu, sigma = parameters.T
+    analog = np.maximum(sigma**2 - _ROUNDING, 0.05 * sigma**2)
+    return np.stack([np.log(np.maximum(h, 1e-6)), -np.log(g), mu, np.log(analog)], axis=1)
+
+
+def fit_shared(
+    problem: SharedProblem,
+    parameters: FloatArray,
+    shared: FloatArray,
+    *,
+    max_steps: int = 60,
+    tolerance: float = 1e-3,
+) -> SharedFit:
+    """Climb the likelihood from a start.
+
+    Without shared parameters the pixels are independent, and each has a damping of its own.
+
+    Args:
+        problem: histograms and law.
+        parameters: start of (H, g, mu, sigma), shape (n, 4), finite.
+        shared: start of the shared parameters, shape (d,).
+        max_steps: scoring steps at most.
+        tolerance: converged where a step promises a smaller rise, nats.
+    """
+    theta = to_theta(parameters)
+    limits = _limits(theta)
+    shared = np.clip(np.asarray(shared, np.float64), problem.bounds[:, 0], problem.bounds[:, 1])
+    loglik = problem.log_likelihood(theta, shared)
+    together = problem.n_shared > 0
+    damping = np.full(theta.shape[0], _FIRST_DAMPING)
+    promised, slopes = np.full(theta.shape[0], np.inf), None
+    for _ in range(max_steps):
+        slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
+        step, shared_step, promised = slopes.step(damping)
+        active = promised >= tolerance
+        if together:
+            active[:] = promised.sum() >= tolerance
+        active &= damping < _LARGEST_DAMPING
+        if not active.any():
+            break
+        trial = np.where(active[:, None], np.clip(theta + step, *limits), theta)
+        reach = np.abs(shared) + problem.scale
+        shared_trial = shared + np.clip(shared_step, -reach, reach)
+        shared_trial = np.clip(shared_trial, problem.bounds[:, 0], problem.bounds[:, 1])
+        found = problem.log_likelihood(trial, shared_trial)
+        better = np.full(theta.shape[0], found.sum() > loglik.sum()) if together else found > loglik
+        better &= active
+        damping = np.where(better, damping / 10.0, np.where(active, damping * 6.0, damping))
+        if better.any():
+            theta, loglik = np.where(better[:, None], trial, theta), np.where(better, found, loglik)
+            shared = shared_trial if together else shared
+            slopes = None
+    slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
+    fine = bool(promised.sum() < tolerance) if together else bool((promised < tolerance).all())
+    own, common = slopes.covariance()
+    return SharedFit(theta, shared, own, common, loglik, fine)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """The law at a point, to first order.
+
+    Attributes:
+        problem: histograms and law.
+        log_masses: given that the code is kept, shape (n, B); 0 where it is not.
+        derivatives: of the log masses, own parameters first, shape (n, 4 + d, B).
+        shared: shared parameters, shape (d,).
+    """
+
+    problem: SharedProblem
+    log_masses: FloatArray
+    derivatives: FloatArray
+    shared: FloatArray
+
+    @classmethod
+    def at(cls, problem: SharedProblem, theta: FloatArray, shared: FloatArray) -> Tangent:
+        """Evaluate at a point."""
+        base = problem.log_masses(theta, shared)
+        return cls(problem, base, _differences(problem, theta, shared, base), shared)
+
+    @property
+    def masses(self) -> FloatArray:
+        """Mass of each code given that it is kept, shape (n, B)."""
+        return np.where(self.problem.kept, np.exp(self.log_masses), 0.0)
+
+    def slopes(self, counts: NDArray[np.integer]) -> Slopes:
+        """Return score and information of histograms, shape (n, B)."""
+        seen = np.where(self.problem.kept, counts, 0).astype(np.float64)
+        score = np.einsum("nab,nb->na", self.derivatives, seen)
+        weighted = self.derivatives * (self.masses * seen.sum(axis=1)[:, None])[:, None, :]
+        information = weighted @ self.derivatives.transpose(0, 2, 1)
+        shared_score = score[:, 4:].sum(axis=0)
+        low, high = self.problem.bounds[:, 0] >= self.shared, self.problem.bounds[:, 1] <= self.shared
+        return Slopes(
+            information[:, :4, :4],
+            information[:, :4, 4:],
+            information[:, 4:, 4:].sum(axis=0),
+            score[:, :4],
+            shared_score,
+            ~((low & (shared_score < 0)) | (high & (shared_score > 0))),
+        )
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Score and information at a point.
+
+    Attributes:
+        own, border, common: blocks of the information: (n, 4, 4), (n, 4, d), (d, d).
+        score, shared_score: gradients, shapes (n, 4) and (d,).
+        free: shared parameters that may move, shape (d,).
+    """
+
+    own: FloatArray
+    border: FloatArray
+    common: FloatArray
+    score: FloatArray
+    shared_score: FloatArray
+    free: NDArray[np.bool_]
+
+    def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the steps of own and shared parameters, and the rise promised in each pixel, nats."""
+        inverse = np.asarray(np.linalg.inv(_damped(self.own, damping)), np.float64)
+        own = np.einsum("nab,nb->na", inverse, self.score)
+        shared = np.zeros(self.free.size)
+        if self.free.any():
+            through, schur = self._reduced(inverse, float(damping.max()))
+            right = self.shared_score[self.free] - np.einsum("nad,na->d", through, self.score)
+            shared[self.free] = np.linalg.lstsq(schur, right, rcond=1e-12)[0]
+            own -= np.einsum("nad,d->na", through, shared[self.free])
+        promised = 0.5 * (own * self.score).sum(axis=1)
+        promised += 0.5 * float(shared @ np.where(self.free, self.shared_score, 0.0)) / promised.size
+        return own, shared, promised
+
+    def covariance(self) -> tuple[FloatArray, FloatArray]:
+        """Return covariances of own, (n, 4, 4), and of shared parameters, (d, d), NaN for those at bounds.
+
+        That of the own parameters takes the shared ones as known.
+        """
+        still = np.zeros(self.own.shape[0])
+        inverse = np.asarray(np.linalg.inv(_damped(self.own, still)), np.float64)
+        found = np.full((self.free.size, self.free.size), np.nan)
+        if self.free.any():
+            found[np.ix_(self.free, self.free)] = np.linalg.pinv(
+                np.asarray(self._reduced(inverse, 0.0)[1]), rcond=1e-15
+            )
+        return inverse, found
+
+    def _reduced(self, inverse: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Eliminate the own parameters: return their answer to the shared ones, and the information left."""
+        border = self.border[:, :, self.free]
+        through = np.einsum("nab,nbd->nad", inverse, border)
+        common = self.common[np.ix_(self.free, self.free)]
+        schur = common * (1.0 + damping * np.eye(common.shape[0])) - np.einsum("nad,nae->de", border, through)
+        return through, schur
+
+
+def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:
+    diagonal = np.einsum("naa->na", information)
+    more = damping[:, None] * diagonal + 1e-12 * (1.0 + diagonal)
+    return np.asarray(information + more[:, :, None] * np.eye(information.shape[1]))
+
+
+def _limits(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far the own parameters may go from a start: not to another electron number, (n, 4) each.
+
+    Beyond, the law would need ever more electron numbers, and each step ever more time.
+    """
+    step = np.exp(theta[:, 1])
+    reach = np.stack(
+        [np.full_like(step, _REACH_EXPOSURE), np.full_like(step, _REACH_STEP), 1.2 * step], axis=1
+    )
+    low = np.concatenate([theta[:, :3] - reach, np.full((step.size, 1), _LOWEST_LOG_VARIANCE)], axis=1)
+    widest = np.maximum(2.0 * theta[:, 1:2] - _LOG_16, theta[:, 3:] + 1.0)
+    high = np.concatenate([theta[:, :3] + reach, widest], axis=1)
+    low[:, 0] -= _REACH_EXPOSURE
+    return low, np.maximum(high, theta)
+
+
+def _differences(
+    problem: SharedProblem, theta: FloatArray, shared: FloatArray, base: FloatArray
+) -> FloatArray:
+    """Return the derivatives of the log masses, own parameters first, shape (n, 4 + d, B)."""
+    n, width = base.shape
+    slopes = np.zeros((n, 4 + problem.n_shared, width))
+    own = to_parameters(theta)
+    mass, found = marginal_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
+    found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
+    kept = problem.kept[:, None, :]
+    inside = np.where(problem.kept, mass, 0.0).sum(axis=1)
+    change = np.where(kept, found, 0.0).sum(axis=2) / np.maximum(inside, _LEAST_MASS)[:, None]
+    relative = found / np.maximum(mass, _LEAST_MASS)[:, None, :] - change[:, :, None]
+    slopes[:, :4] = np.where(kept & (mass > _LEAST_MASS)[:, None, :], relative, 0.0)
+    for index in range(problem.n_shared):
+        moved = shared.copy()
+        step = _STEP * problem.scale[index]
+        if moved[index] + step > problem.bounds[index, 1]:
+            step = -step
+        moved[index] += step
+        slopes[:, 4 + index] = (problem.log_masses(theta, moved) - base) / step
+    return slopes

@@ -1,0 +1,232 @@
+"""Per-pixel histograms of a stack of frames, in one pass and in memory that does not grow with it.
+
+Every pixel has ``bins`` counts (the same number for the whole sensor) and an origin of its own, the DN of bin
+0. While the range of a pixel fits into the window, the window follows it, and nothing is lost. A pixel with
+a larger range keeps the window where it is, and what lies outside is counted exactly as under or over.
+
+The result does not depend on how the frames are cut into blocks (but for the first one, of
+``window_frames``) nor on which rows are done together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.model.histogram.count_numba import (
+    count_frames,
+    place_windows,
+    recentre,
+    update_extremes,
+    update_range,
+)
+
+__all__ = [
+    "MINIMUM_BINS",
+    "HistogramAccumulator",
+    "RangeAccumulator",
+    "RowHistograms",
+    "choose_bins",
+    "counts_dtype",
+    "histogram_frames",
+]
+
+#: Smallest number of bins.
+MINIMUM_BINS = 32
+#: A window of so many bins is always allowed (if ``max_bins`` is), for the sake of hot pixels ...
+_GENEROUS_BINS = 512
+#: ... and up to this many times the window that half of the pixels need.
+_HOT_FACTOR = 4
+#: Samples left out at either end of a pixel's range where there are enough frames: glitches.
+_TRIM = 3
+_FRAMES_PER_TRIM = 64
+#: DN above are no camera's, and squares of them would overflow the exact sums.
+_LARGEST_DN = (1 << 24) - 1
+
+_Frames = NDArray[np.unsignedinteger[Any]]
+
+
+def counts_dtype(n_frames: int) -> np.dtype[Any]:
+    """Return the type of counts that cannot overflow: uint16, or uint32 above 65,535 frames."""
+    return np.dtype(np.uint16 if n_frames <= np.iinfo(np.uint16).max else np.uint32)
+
+
+@dataclass(frozen=True)
+class RowHistograms:
+    """Histograms of the pixels of some rows.
+
+    Attributes:
+        counts: number of frames with DN = origin + bin, (y, x, bin).
+        origin: DN of bin 0, (y, x).
+        under: number of frames below bin 0, (y, x).
+        over: number of frames above the last bin, (y, x).
+        minimum: smallest DN seen, (y, x).
+        maximum: largest DN seen, (y, x).
+    """
+
+    counts: NDArray[np.unsignedinteger[Any]]
+    origin: NDArray[np.int32]
+    under: NDArray[np.uint32]
+    over: NDArray[np.uint32]
+    minimum: NDArray[np.int32]
+    maximum: NDArray[np.int32]
+
+
+class HistogramAccumulator:
+    """Histograms of the pixels of some rows, while the frames come in."""
+
+    def __init__(self, shape: tuple[int, int], bins: int, n_frames: int) -> None:
+        """Begin with no frames.
+
+        Args:
+            shape: rows and columns.
+            bins: number of bins of every pixel, see `choose_bins`.
+            n_frames: number of frames to come, at most; it decides the type of the counts.
+        """
+        self._counts = np.zeros((*shape, bins), counts_dtype(n_frames))
+        self._origin = np.zeros(shape, np.int32)
+        self._under = np.zeros(shape, np.uint32)
+        self._over = np.zeros(shape, np.uint32)
+        self._minimum = np.full(shape, np.iinfo(np.int32).max, np.int32)
+        self._maximum = np.full(shape, -1, np.int32)
+        self._fixed = np.zeros(shape, np.bool_)
+        self._first = True
+
+    @classmethod
+    def resumed(cls, held: RowHistograms, n_frames: int) -> HistogramAccumulator:
+        """Go on after the frames of finished histograms, as if it had never stopped.
+
+        Args:
+            held: what `finish` returned.
+            n_frames: number of frames in the end, those of ``held`` included.
+        """
+        self = cls(held.counts.shape[:2], held.counts.shape[2], n_frames)
+        for name, values in vars(held).items():
+            getattr(self, f"_{name}")[...] = values
+        # a window stays where it is for good once the range was too large for it
+        self._fixed[...] = self._maximum.astype(np.int64) - self._minimum >= held.counts.shape[2]
+        self._first = False
+        return self
+
+    def add(self, frames: _Frames) -> None:
+        """Count a block of frames, (frame, y, x).
+
+        The first block of a stack places the windows of pixels that do not fit: let it always have the same
+        number of frames.
+
+        Raises:
+            InputError: a DN has more than 24 bits.
+        """
+        if frames.shape[0] == 0:
+            return
+        low, high = frames[0].copy(), frames[0].copy()
+        update_range(frames, low, high)
+        if frames.dtype.itemsize > 2 and int(high.max()) > _LARGEST_DN:
+            raise InputError(
+                f"the frames hold DN of {int(high.max())}, more than 24 bits; "
+                "correct input.dtype, input.byte_order or input.bit_shift"
+            )
+        place_windows(
+            frames,
+            low,
+            high,
+            self._minimum,
+            self._maximum,
+            self._counts,
+            self._origin,
+            self._fixed,
+            self._first,
+        )
+        self._first = False
+        count_frames(frames, self._origin, self._counts, self._under, self._over)
+
+    def finish(self) -> RowHistograms:
+        """Return the histograms; no frames can be added any more."""
+        recentre(self._counts, self._origin, self._minimum, self._maximum, self._fixed)
+        return RowHistograms(
+            self._counts, self._origin, self._under, self._over, self._minimum, self._maximum
+        )
+
+
+class RangeAccumulator:
+    """How many pixels need how wide a window, from the first frames of a stack."""
+
+    def __init__(self, shape: tuple[int, int], dtype: np.dtype[Any], n_frames: int) -> None:
+        """Begin with no frames.
+
+        Args:
+            shape: rows and columns.
+            dtype: type of the frames.
+            n_frames: number of frames to come; the more, the more glitches are left out.
+        """
+        depth = 1 + min(_TRIM, n_frames // _FRAMES_PER_TRIM)
+        self._low = np.full((depth, *shape), np.iinfo(dtype).max, dtype)
+        self._high = np.zeros((depth, *shape), dtype)
+
+    def add(self, frames: _Frames) -> None:
+        """Look at a block of frames, (frame, y, x)."""
+        update_extremes(frames, self._low, self._high)
+
+    def finish(self, max_bins: int) -> NDArray[np.int64]:
+        """Return the number of pixels by range in DN; the last element is for all above ``max_bins``.
+
+        The sum over all rows of the sensor goes to `choose_bins`; its order does not matter.
+        """
+        widths = self._high[-1].astype(np.int64) - self._low[-1].astype(np.int64) + 1
+        return np.bincount(np.clip(widths, 1, max_bins + 1).ravel(), minlength=max_bins + 2)
+
+
+def choose_bins(pixels_by_range: NDArray[np.int64], max_bins: int) -> int:
+    """Return the number of bins that suits a sensor: the typical pixels, and the hot ones within reason.
+
+    A pixel of range r in the first frames needs ``2 r + 16`` bins: of the range of some hundred frames, its
+    extremes left out, the range of a million frames is less than twice as much. The widest need counts, but
+    not the wild ones: above ``max_bins``, or above both 512 and four times the need of the median pixel.
+
+    Args:
+        pixels_by_range: number of pixels by range in DN, (max_bins + 2,), see `RangeAccumulator.finish`.
+        max_bins: upper limit.
+
+    Returns:
+        A multiple of 16, from 32 to ``max_bins``.
+    """
+    needs = [_needed(width) for width in range(pixels_by_range.size)]
+    median = int(np.searchsorted(np.cumsum(pixels_by_range), 0.5 * pixels_by_range.sum()))
+    limit = min(max_bins, max(_GENEROUS_BINS, _HOT_FACTOR * needs[median]))
+    if needs[median] > limit:
+        return max_bins
+    return max(needs[width] for width in np.flatnonzero(pixels_by_range).tolist() if needs[width] <= limit)
+
+
+def _needed(width: int) -> int:
+    return max(MINIMUM_BINS, -(-(2 * width + 16) // 16) * 16)
+
+
+def histogram_frames(
+    frames: _Frames, *, bins: int | None = None, max_bins: int = 1024, window_frames: int = 256
+) -> RowHistograms:
+    """Return the histograms of a stack of frames that is in memory.
+
+    Args:
+        frames: (frame, y, x) of an unsigned type.
+        bins: number of bins; by default what `choose_bins` finds in the first frames.
+        max_bins: upper limit of it.
+        window_frames: number of first frames that decide the windows.
+
+    Raises:
+        InputError: a DN has more than 24 bits.
+    """
+    n_frames, *shape = frames.shape
+    head = frames[:window_frames]
+    if bins is None:
+        ranges = RangeAccumulator((shape[0], shape[1]), frames.dtype, head.shape[0])
+        ranges.add(head)
+        bins = choose_bins(ranges.finish(max_bins), max_bins)
+    histograms = HistogramAccumulator((shape[0], shape[1]), bins, n_frames)
+    for t in range(0, n_frames, window_frames):
+        histograms.add(frames[t : t + window_frames])
+    return histograms.finish()

@@ -1,0 +1,184 @@
+"""Loops of :mod:`pchem_pipeline.model.histogram.count`.
+
+``frames`` is always (frame, y, x) of an unsigned type. The inner loops run over x, so that the compiler can
+use vector instructions, and the histograms of one row stay in the cache while all frames pass.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = [
+    "count_frames",
+    "densest_origin",
+    "place_windows",
+    "recentre",
+    "shift_counts",
+    "update_extremes",
+    "update_range",
+]
+
+_Array = NDArray[Any]
+
+
+@njit(nogil=True, cache=True)
+def update_range(frames: _Array, low: _Array, high: _Array) -> None:
+    """Lower ``low`` and raise ``high`` (y, x) to the smallest and largest DN of each pixel."""
+    n_frames, ny, nx = frames.shape
+    for t in range(n_frames):
+        for y in range(ny):
+            row, row_low, row_high = frames[t, y], low[y], high[y]
+            for x in range(nx):
+                row_low[x] = min(row_low[x], row[x])
+            for x in range(nx):
+                row_high[x] = max(row_high[x], row[x])
+
+
+@njit(nogil=True, cache=True)
+def update_extremes(frames: _Array, low: _Array, high: _Array) -> None:
+    """Update the smallest and largest DN of each pixel, (depth, y, x), sorted, the most extreme first."""
+    n_frames, ny, nx = frames.shape
+    moved = np.empty(nx, frames.dtype)
+    for t in range(n_frames):
+        for y in range(ny):
+            moved[:] = frames[t, y]
+            for j in range(low.shape[0]):
+                kept = low[j, y]
+                for x in range(nx):
+                    smaller, larger = min(kept[x], moved[x]), max(kept[x], moved[x])
+                    kept[x] = smaller
+                    moved[x] = larger
+            moved[:] = frames[t, y]
+            for j in range(high.shape[0]):
+                kept = high[j, y]
+                for x in range(nx):
+                    smaller, larger = min(kept[x], moved[x]), max(kept[x], moved[x])
+                    kept[x] = larger
+                    moved[x] = smaller
+
+
+@njit(nogil=True, cache=True)
+def count_frames(frames: _Array, origin: _Array, counts: _Array, under: _Array, over: _Array) -> None:
+    """Add frames to ``counts`` (y, x, bin), or to ``under`` or ``over`` if they lie outside of the window."""
+    n_frames, ny, nx = frames.shape
+    bins = np.uint32(counts.shape[2])
+    for y in range(ny):
+        row_counts, row_origin = counts[y], origin[y]
+        for t in range(n_frames):
+            row = frames[t, y]
+            for x in range(nx):
+                # a DN below the origin wraps round to a huge number: one comparison serves both ends
+                k = np.uint32(row[x] - row_origin[x])
+                if k < bins:
+                    row_counts[x, k] += 1
+                elif row[x] < row_origin[x]:
+                    under[y, x] += 1
+                else:
+                    over[y, x] += 1
+
+
+@njit(nogil=True, cache=True)
+def shift_counts(counts: _Array, shift: int) -> None:
+    """Move the counts of one pixel (bin,) down by ``shift`` bins (up if negative); what falls off is zero."""
+    bins = counts.shape[0]
+    if shift > 0:
+        for k in range(bins - shift):
+            counts[k] = counts[k + shift]
+        counts[max(0, bins - shift) :] = 0
+    elif shift < 0:
+        for k in range(bins - 1, -shift - 1, -1):
+            counts[k] = counts[k + shift]
+        counts[: min(bins, -shift)] = 0
+
+
+@njit(nogil=True, cache=True)
+def _centred(low: int, high: int, bins: int) -> int:
+    """Return the origin of the window of ``bins`` DN with ``low..high`` in its middle; not below 0."""
+    return max(0, low - (bins - (high - low + 1)) // 2)
+
+
+@njit(nogil=True, cache=True)
+def densest_origin(values: _Array, bins: int) -> int:
+    """Return the origin of a window of ``bins`` DN that holds most of the values, these in its middle."""
+    ordered = np.sort(values)
+    best, best_start, best_end = 0, 0, 0
+    end = 0
+    for start in range(ordered.size):
+        while end < ordered.size and np.int64(ordered[end]) - np.int64(ordered[start]) < bins:
+            end += 1
+        if end - start > best:
+            best, best_start, best_end = end - start, start, end
+    origin: int = _centred(np.int64(ordered[best_start]), np.int64(ordered[best_end - 1]), bins)
+    return origin
+
+
+@njit(nogil=True, cache=True)
+def place_windows(
+    frames: _Array,
+    low: _Array,
+    high: _Array,
+    minimum: _Array,
+    maximum: _Array,
+    counts: _Array,
+    origin: _Array,
+    fixed: _Array,
+    first: bool,
+) -> None:
+    """Put each pixel's window where it holds these frames and all before, before they are counted.
+
+    A pixel whose range outgrows the window is ``fixed`` for good: its window stays in the middle of the range
+    seen before the frame that was too much, or, on the first call, where it holds most of the frames.
+
+    Args:
+        frames: frames that come next, (frame, y, x).
+        low: their smallest DN, (y, x).
+        high: their largest DN, (y, x).
+        minimum: smallest DN of all frames before, (y, x); updated.
+        maximum: largest DN of all frames before, (y, x); updated.
+        counts: histograms of all frames before, (y, x, bin); shifted with the window.
+        origin: DN of bin 0, (y, x); updated.
+        fixed: whether the window may no longer move, (y, x); updated.
+        first: there were no frames before.
+    """
+    _, ny, nx = frames.shape
+    bins = counts.shape[2]
+    for y in range(ny):
+        for x in range(nx):
+            a, b = np.int64(minimum[y, x]), np.int64(maximum[y, x])
+            new_a, new_b = min(a, np.int64(low[y, x])), max(b, np.int64(high[y, x]))
+            minimum[y, x], maximum[y, x] = new_a, new_b
+            start = np.int64(origin[y, x])
+            if fixed[y, x] or (not first and start <= new_a and new_b < start + bins):
+                continue
+            if new_b - new_a < bins:
+                target = _centred(new_a, new_b, bins)
+            elif first:
+                fixed[y, x] = True
+                target = densest_origin(frames[:, y, x], bins)
+            else:
+                fixed[y, x] = True
+                for t in range(frames.shape[0]):
+                    value = np.int64(frames[t, y, x])
+                    if max(b, value) - min(a, value) >= bins:
+                        break
+                    a, b = min(a, value), max(b, value)
+                target = _centred(a, b, bins)
+            if not first:
+                shift_counts(counts[y, x], target - start)
+            origin[y, x] = target
+
+
+@njit(nogil=True, cache=True)
+def recentre(counts: _Array, origin: _Array, minimum: _Array, maximum: _Array, fixed: _Array) -> None:
+    """Centre the windows of all pixels that fit, so that they do not depend on the way that led there."""
+    ny, nx, bins = counts.shape
+    for y in range(ny):
+        for x in range(nx):
+            if not fixed[y, x]:
+                target = _centred(np.int64(minimum[y, x]), np.int64(maximum[y, x]), bins)
+                shift_counts(counts[y, x], target - np.int64(origin[y, x]))
+                origin[y, x] = target

@@ -1,0 +1,43 @@
+"""The YAML section of the histogram stage."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pchem_pipeline.base.settings import Section
+
+__all__ = ["HistogramSettings"]
+
+
+class HistogramSettings(Section):
+    """How frames are turned into per-pixel histograms and summaries."""
+
+    block_frames: int = Field(
+        default=512,
+        ge=2,
+        le=16384,
+        description="frames in a time block of the summaries (block sums, covariances within blocks)",
+    )
+    window_frames: int = Field(
+        default=256,
+        ge=1,
+        le=16384,
+        description="frames that are read at a time; the first of them decide the number of bins",
+    )
+    max_bins: int = Field(
+        default=1024,
+        ge=32,
+        le=65536,
+        multiple_of=16,
+        description="largest number of bins of a pixel, DN; what lies outside is counted as under or over",
+    )
+    summaries: bool = Field(
+        default=True,
+        description="keep what histograms lose: sums over time blocks, rows and columns, lag-1 and neighbour "
+        "covariances",
+    )
+    band_memory: int = Field(
+        default=640,
+        ge=16,
+        description="memory of a worker, MiB; decides the rows that it takes at a time, never the result",
+    )

@@ -1,0 +1,237 @@
+"""What histograms lose, kept in compact form: order in time, and neighbours in space.
+
+All sums are of integers, and exact. Time is cut into blocks; covariances are taken within blocks (about each
+block's own mean) and averaged over them, so that slow drifts do not enter. Rows are cut into groups of
+`ROW_GROUP`; nothing crosses the border of a group, so that bands of whole groups can be done apart and
+every frame is read once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.histogram.count_numba import update_range
+from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
+
+__all__ = [
+    "ROW_GROUP",
+    "BlockSums",
+    "CovarianceMaps",
+    "LineSums",
+    "OpenSums",
+    "SummaryAccumulator",
+    "block_starts",
+    "frame_statistics",
+    "line_sums",
+]
+
+#: Rows in a group: column sums are taken over it, and neighbour products stay inside.
+ROW_GROUP = 64
+
+_Frames = NDArray[np.unsignedinteger[Any]]
+
+
+@dataclass(frozen=True)
+class LineSums:
+    """Sums along the lines of each frame.
+
+    Attributes:
+        row_sum: DN, (frame, y).
+        row_sum_square: DN^2, (frame, y).
+        column_sum: DN, sums over `ROW_GROUP` rows, (frame, row_group, x).
+    """
+
+    row_sum: NDArray[np.int64]
+    row_sum_square: NDArray[np.int64]
+    column_sum: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class BlockSums:
+    """Sums of each pixel over a block of frames.
+
+    Attributes:
+        block_sum: DN, (y, x).
+        block_sum_square: DN^2, (y, x).
+    """
+
+    block_sum: NDArray[np.int64]
+    block_sum_square: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class CovarianceMaps:
+    """Covariances within blocks, averaged over the blocks, DN^2; NaN where there is no pair.
+
+    Attributes:
+        lag1_covariance: with the next frame, (y, x); unbiased (zero) for independent frames.
+        neighbour_covariance_x: with the pixel at x + 1, (y, x); NaN in the last column.
+        neighbour_covariance_y: with the pixel at y + 1, (y, x); NaN in the last row of each group.
+    """
+
+    lag1_covariance: NDArray[np.float64]
+    neighbour_covariance_x: NDArray[np.float64]
+    neighbour_covariance_y: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OpenSums:
+    """The sums of a time block that is not whole yet, and of the covariances so far.
+
+    Attributes:
+        sums: of d = DN - reference: d, d^2, d times that of the frame before, of x + 1, of y + 1; then the
+            reference and the DN of the last frame; (7, y, x).
+        covariances: sums over the closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
+    """
+
+    sums: NDArray[np.int64]
+    covariances: NDArray[np.float64]
+
+
+def line_sums(frames: _Frames) -> LineSums:
+    """Return the sums along rows and columns of each frame.
+
+    Args:
+        frames: (frame, y, x), whole groups of rows from the top (the last one of the sensor may be smaller).
+    """
+    n_frames, ny, nx = frames.shape
+    row_sum = np.empty((n_frames, ny), np.int64)
+    row_sum_square = np.empty((n_frames, ny), np.int64)
+    column_sum = np.zeros((n_frames, -(-ny // ROW_GROUP), nx), np.int32)
+    sum_lines(frames, ROW_GROUP, row_sum, row_sum_square, column_sum)
+    return LineSums(row_sum, row_sum_square, column_sum)
+
+
+def block_starts(n_frames: int, block_frames: int) -> NDArray[np.int64]:
+    """Return the first frame of each time block; the last block may be shorter than ``block_frames``."""
+    return np.arange(0, n_frames, block_frames, dtype=np.int64)
+
+
+def frame_statistics(
+    row_sum: NDArray[np.int64], row_sum_square: NDArray[np.int64], columns: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and variance over the pixels of each frame, from its sums along rows.
+
+    Args:
+        row_sum: DN, (frame, y), all rows of the sensor.
+        row_sum_square: DN^2, (frame, y).
+        columns: pixels in a row.
+
+    Returns:
+        Mean, DN, and variance (divided by the number of pixels), DN^2; both (frame,).
+    """
+    row_mean = row_sum / columns
+    mean = row_mean.mean(axis=1)
+    # within rows and between rows apart, so that a large mean does not drown a small variance
+    within = (row_sum_square / columns - row_mean**2).mean(axis=1)
+    between = ((row_mean - mean[:, None]) ** 2).mean(axis=1)
+    return mean, within + between
+
+
+class SummaryAccumulator:
+    """Block sums and covariances of the pixels of some rows, while the frames come in."""
+
+    def __init__(self, shape: tuple[int, int], block_frames: int) -> None:
+        """Begin with no frames.
+
+        Args:
+            shape: rows (from the top of a group) and columns.
+            block_frames: frames in a time block.
+        """
+        self._block_frames = block_frames
+        self._in_block = 0
+        self._reference = np.zeros(shape, np.int32)
+        self._before = np.zeros(shape, np.int32)
+        self._sums = np.zeros((5, *shape), np.int64)
+        self._covariances = np.zeros((3, *shape))
+        self._freedom = 0
+
+    @classmethod
+    def resumed(cls, state: OpenSums, n_frames: int, block_frames: int) -> SummaryAccumulator:
+        """Go on after ``n_frames`` frames, as if it had never stopped.
+
+        Args:
+            state: what `open_sums` returned after these frames.
+            n_frames: number of frames so far.
+            block_frames: frames in a time block.
+        """
+        self = cls(state.sums.shape[1:], block_frames)
+        closed, self._in_block = divmod(n_frames, block_frames)
+        self._freedom = closed * (block_frames - 1)
+        self._sums[...], self._covariances[...] = state.sums[:5], state.covariances
+        self._reference[...], self._before[...] = state.sums[5:]
+        return self
+
+    def open_sums(self) -> OpenSums:
+        """Return all that is needed to go on later; to be taken before `finish`."""
+        ends = np.stack([self._reference, self._before]).astype(np.int64)
+        covariances = self._covariances.copy()
+        covariances[2, ROW_GROUP - 1 :: ROW_GROUP] = covariances[2, -1] = 0.0  # no pair across the border
+        return OpenSums(np.concatenate([self._sums, ends]), covariances)
+
+    def add(self, frames: _Frames) -> list[BlockSums]:
+        """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""
+        done = []
+        start = 0
+        while start < frames.shape[0]:
+            end = min(frames.shape[0], start + self._block_frames - self._in_block)
+            self._add_part(frames[start:end])
+            if self._in_block == self._block_frames:
+                done.append(self._close_block())
+            start = end
+        return done
+
+    def finish(self) -> tuple[list[BlockSums], CovarianceMaps]:
+        """Return the last block, if it was incomplete, and the covariances over all blocks."""
+        done = [self._close_block()] if self._in_block else []
+        lag, right, down = self._covariances / self._freedom if self._freedom else self._covariances * np.nan
+        right[:, -1] = np.nan
+        down[ROW_GROUP - 1 :: ROW_GROUP] = np.nan
+        down[-1] = np.nan
+        return done, CovarianceMaps(lag, right, down)
+
+    def _add_part(self, frames: _Frames) -> None:
+        """Add frames that all belong to the open block."""
+        if self._in_block == 0:
+            self._reference[:] = frames[0]
+            self._before[:] = frames[0]
+        narrow = self._is_narrow(frames)
+        columns = frames.shape[2]
+        for chosen, dtype in ((narrow, np.int32), (~narrow, np.int64)):
+            if chosen.any():
+                work = np.zeros((7, columns + 1), dtype)
+                add_products(frames, self._before, self._reference, ROW_GROUP, chosen, work, self._sums)
+        self._before[:] = frames[-1]
+        self._in_block += frames.shape[0]
+
+    def _is_narrow(self, frames: _Frames) -> NDArray[np.bool_]:
+        """Tell for each row whether sums of products over the frames fit into 32 bits, (y,)."""
+        low, high = self._before.astype(frames.dtype), self._before.astype(frames.dtype)
+        update_range(frames, low, high)
+        reach = np.maximum(high - self._reference, self._reference - low).max(axis=1).astype(np.float64)
+        largest = np.maximum(reach, np.append(reach[1:], 0))
+        narrow: NDArray[np.bool_] = frames.shape[0] * reach * largest < np.iinfo(np.int32).max
+        return narrow
+
+    def _close_block(self) -> BlockSums:
+        """Turn the sums of the open block into block sums and covariances, and begin the next."""
+        n = self._in_block
+        plain, square, lag, right, down = self._sums.astype(np.float64)
+        last = self._before.astype(np.float64) - self._reference
+        # sum over t of (d_t - m)(d_(t-1) - m), m = plain / n; the first d is 0 by the choice of the reference
+        lag_centred = lag - plain * (2 * plain - last) / n + (n - 1) * (plain / n) ** 2
+        # independent frames would give -(n - 1) / n of the variance, on average: add it
+        self._covariances[0] += lag_centred + (square - plain**2 / n) / n
+        self._covariances[1, :, :-1] += right[:, :-1] - plain[:, :-1] * plain[:, 1:] / n
+        self._covariances[2, :-1] += down[:-1] - plain[:-1] * plain[1:] / n
+        self._freedom += n - 1
+        reference = self._reference.astype(np.int64)
+        total = self._sums[0] + n * reference
+        squares = self._sums[1] + 2 * reference * self._sums[0] + n * reference**2
+        self._sums[:] = 0
+        self._in_block = 0
+        return BlockSums(total, squares)

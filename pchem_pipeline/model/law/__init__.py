@@ -1,0 +1,1 @@
+"""The law of a pixel's samples: density, masses of codes, scores."""

@@ -1,0 +1,56 @@
+"""Histograms of pixels that follow the PCD exactly, drawn without drawing frames."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.model.law.pcd import QUANTISATION_VARIANCE, pcd_mass
+
+__all__ = ["DrawnHistograms", "draw_histograms"]
+
+
+class DrawnHistograms(NamedTuple):
+    """Counts (n, B), DN of bin 0 (n,), and the true (H, g, mu, sigma), shape (n, 4)."""
+
+    counts: NDArray[np.uint32]
+    origin: NDArray[np.int64]
+    truth: NDArray[np.float64]
+
+
+def draw_histograms(
+    rng: np.random.Generator,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    read_noise_e: ArrayLike,
+    n_frames: int,
+) -> DrawnHistograms:
+    """Draw a histogram of every pixel from the exact mass of eq. (PCD_RV_definition), rounding included.
+
+    Args:
+        rng: source of random numbers.
+        quanta_exposure: H >= 0, e-, scalar or shape (n,); the parameters broadcast.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        read_noise_e: s_e with quantisation, e-; at least that of the rounding, g / sqrt(12).
+        n_frames: frames per pixel.
+
+    Raises:
+        ValueError: the read noise is below that of the rounding.
+    """
+    given = [np.asarray(a, np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_e)]
+    exposure, gain, offset, noise = (np.ravel(a) for a in np.broadcast_arrays(*given))
+    variance = noise**2 - QUANTISATION_VARIANCE * gain**2
+    if (variance < 0).any():
+        raise ValueError("the read noise is below that of rounding to whole DN")
+    origin = np.floor(offset - 9 * noise / gain).astype(np.int64) - 1
+    width = np.ceil((exposure + 11 * np.sqrt(exposure) + 12 * (exposure > 0) + 18 * noise) / gain) + 3
+    x = origin[:, None] + np.arange(int(width.max()))
+    mass = pcd_mass(x, exposure[:, None], gain[:, None], offset[:, None], np.sqrt(variance)[:, None])
+    counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
+    return DrawnHistograms(
+        counts.astype(np.uint32), origin, np.stack([exposure, gain, offset, noise / gain], axis=1)
+    )

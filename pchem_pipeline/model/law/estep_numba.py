@@ -1,0 +1,399 @@
+"""One evaluation of a pixel's likelihood: E-step sums, score and Louis' observed information.
+
+Internal parameters ``theta = (log H, a, m, log sigma^2)`` with ``a = 1/g`` and ``m = mu - centre`` (DN); the
+values are counted from an integer ``centre`` near the pixel's mean, so that no moment cancels.
+
+For the values nearest to component ``j``, with ``d = y - m - j a``, the components ``j + l`` weigh in as
+``(P_{j+l} / P_j) exp(-l^2 a^2 / 2 sigma^2) r^l`` with ``r = exp(d a / sigma^2)``: a polynomial in ``r``, and
+``r`` is a geometric sequence over successive DN. The posterior moments of ``l`` up to the fourth give the
+score and ``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
+
+First `_fill` lays the values out in a table, a column for each DN, with the polynomial's coefficients; then
+one loop without branches or calls runs over the columns, eight side by side (:mod:`.lanes_numba`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, lanes_exp, lanes_log
+from pchem_pipeline.model.law.simd_numba import (
+    LANES,
+    counting,
+    exponent_of,
+    fused,
+    least,
+    load_lanes,
+    most,
+    scaled,
+    store_lanes,
+    sum_lanes,
+)
+from pchem_pipeline.model.law.workspace_numba import (
+    CAPACITY,
+    LOGLIK,
+    MAX_COMPONENTS,
+    Histogram,
+    Workspace,
+)
+
+_DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
+_LARGEST_RATIO = 333.0  # logarithm; keeps r^2 finite when the peaks are needles
+_SMALLEST = -700.0  # logarithm of what counts as 0 beside 1
+_NOTHING = -60.0  # logarithm of a density that no number of frames makes visible
+
+# rows of the table; the coefficients follow
+_WEIGHT, _OFFSET, _NEAREST, _LEVEL, _COEFFICIENT = range(5)
+# places in `totals`: the log-likelihood; the sums over c of low and low^2 (low: the lowest component); with i
+# counted from it, the offset d from it and w = d - a low, sums of c times E[i], E[i^2], low E[i], d E[i] and
+# low d; then of c times var(i), cov(i, i^2) and var(i^2) times powers of d and w
+_LOW, _LOW2, _M1, _M2, _LOW_M1, _D_M1, _LOW_D = range(1, 8)
+_V11, _V11W, _V11D, _V11WW, _V11DW, _V11DD, _V12, _V12W, _V12D, _V22 = range(8, 18)
+_N_TOTALS = 18
+
+# rows of `Workspace.rows`
+_EXPECTED, _TOTALS, _POWERS, _RISE, _FALL, _LOG_RISE = range(6)
+
+LOG_2PI = math.log(2.0 * math.pi)
+
+
+def _table_kernel(width: int) -> Callable[..., Any]:
+    """Make the loop over the columns for a fixed number of components (0: given at run time)."""
+
+    @nb.njit(nogil=True, cache=True, error_model="numpy")
+    def table_sums(
+        table: NDArray[np.float64],
+        columns: int,
+        components: int,
+        a: float,
+        inverse: float,
+        totals: NDArray[np.float64],
+    ) -> None:
+        terms = width if width > 0 else components
+        half = float(terms // 2)
+        loglik = sum_m1 = sum_m2 = sum_low_m1 = sum_d_m1 = sum_low_d = counting() * 0.0
+        v11 = v11w = v11d = v11ww = v11dw = v11dd = v12 = v12w = v12d = v22 = loglik
+        for i in range(0, columns, LANES):
+            c, offset = load_lanes(table, _WEIGHT, i), load_lanes(table, _OFFSET, i)
+            place = load_lanes(table, _NEAREST, i)
+            low = most(place - half, 0.0)
+            d = fused(place - low, a, offset)
+            ratio = lanes_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+            power = ratio
+            term = load_lanes(table, _COEFFICIENT + 1, i) * power
+            s0 = load_lanes(table, _COEFFICIENT, i) + term
+            s1 = s2 = s3 = s4 = term
+            for k in range(2, terms):
+                power = power * ratio
+                term = load_lanes(table, _COEFFICIENT + k, i) * power
+                number = float(k)
+                s0 = s0 + term
+                s1 = fused(term, number, s1)
+                s2 = fused(term, number * number, s2)
+                s3 = fused(term, number * number * number, s3)
+                s4 = fused(term, number * number * number * number, s4)
+            # log(s0) as in `lanes_log`, its division shared with 1 / s0
+            exponent = exponent_of(s0 * ROOT2)
+            fraction = scaled(s0, 0.0 - exponent)
+            above = fraction + 1.0
+            shared = 1.0 / (s0 * above)
+            each, q = shared * above, (fraction - 1.0) * (shared * s0)
+            logged = fused(q + q, artanh_series(q * q), load_lanes(table, _LEVEL, i))
+            logged = fused(offset * (0.0 - inverse), fused(offset, -0.5, d), fused(exponent, LN2, logged))
+            loglik = fused(c, logged, loglik)
+            m1, m2, share = s1 * each, s2 * each, c * each
+            c1, c2, minus = c * m1, c * m2, 0.0 - m1
+            sum_m1, sum_m2, sum_low_d = sum_m1 + c1, sum_m2 + c2, fused(c * low, d, sum_low_d)
+            sum_low_m1, sum_d_m1 = fused(c1, low, sum_low_m1), fused(c1, d, sum_d_m1)
+            c11, c12, c22 = fused(c1, minus, c2), fused(c2, minus, share * s3), share * s4 - c2 * m2
+            w = fused(low, 0.0 - a, d)
+            c11w, c11d = c11 * w, c11 * d
+            v11, v12, v22 = v11 + c11, v12 + c12, v22 + c22
+            v11w, v11d = v11w + c11w, v11d + c11d
+            v11ww, v11dw, v11dd = fused(c11w, w, v11ww), fused(c11d, w, v11dw), fused(c11d, d, v11dd)
+            v12w, v12d = fused(c12, w, v12w), fused(c12, d, v12d)
+        totals[LOGLIK] += sum_lanes(loglik)
+        first = (sum_m1, sum_m2, sum_low_m1, sum_d_m1, sum_low_d)
+        second = (v11, v11w, v11d, v11ww, v11dw, v11dd, v12, v12w, v12d, v22)
+        for number_of, value in enumerate(first):
+            totals[_M1 + number_of] += sum_lanes(value)
+        for number_of, value in enumerate(second):
+            totals[_V11 + number_of] += sum_lanes(value)
+
+    kernel: Callable[..., Any] = table_sums
+    return kernel
+
+
+table_sums_3 = _table_kernel(3)
+table_sums_5 = _table_kernel(5)
+table_sums_7 = _table_kernel(7)
+table_sums_9 = _table_kernel(9)
+table_sums_any = _table_kernel(0)
+
+
+@nb.njit(nogil=True, cache=True)
+def _half_width(electron_noise: float, exposure: float, first: int, last: int) -> int:
+    """Return how many components matter on either side of the nearest one."""
+    variance = electron_noise * electron_noise
+    half = max(1, math.ceil(math.sqrt(2.0 * _DROPPED * variance + 0.25) - 0.5))
+    if electron_noise > 0.5:  # the Poisson factor moves the largest term away from the nearest component
+        tilt = max(abs(math.log(exposure / (first + 1.0))), abs(math.log(exposure / (last + 1.0))))
+        half += math.ceil(variance * tilt)
+    return min(half, (MAX_COMPONENTS - 1) // 2)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure: float) -> None:
+    """Fill ``H / k`` of k from ``first`` on, its inverse and its logarithm, by the eight; 1 / k of k = 0."""
+    exposure = math.exp(log_exposure)
+    inverse = 1.0 / exposure
+    for i in range(0, count, LANES):
+        k = most(counting() + float(first + i), 1.0)
+        store_lanes(rows, _RISE, i, exposure / k)
+        store_lanes(rows, _FALL, i, k * inverse)
+        store_lanes(rows, _LOG_RISE, i, log_exposure - lanes_log(k))
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _fill_coefficients(
+    table: NDArray[np.float64],
+    filled: int,
+    n: int,
+    rows: NDArray[np.float64],
+    nearest_one: int,
+    first: int,
+    low: int,
+    width: int,
+) -> None:
+    """Fill the polynomial's coefficients, relative to the nearest component, of ``n`` columns of one cell.
+
+    Neighbours differ by ``H / k`` and by an odd power of ``exp(-a^2/2 sigma^2)``.
+
+    Args:
+        table: out.
+        filled: first of the columns.
+        n: number of columns; they are written by the eight.
+        rows: the powers, and H / k and its inverse.
+        nearest_one: nearest component.
+        first: component with which those rows begin.
+        low: lowest component.
+        width: number of components.
+    """
+    powers, rise, fall = rows[_POWERS], rows[_RISE], rows[_FALL]
+    place, place_of = nearest_one - low, nearest_one - first
+    coefficient = 1.0
+    for step in range(width - place):
+        if step > 0:
+            coefficient *= powers[step] * rise[place_of + step]
+        for i in range(0, n, LANES):
+            store_lanes(table, _COEFFICIENT + place + step, filled + i, coefficient)
+    coefficient = 1.0
+    for step in range(1, place + 1):
+        coefficient *= powers[step] * fall[place_of - step + 1]
+        for i in range(0, n, LANES):
+            store_lanes(table, _COEFFICIENT + place - step, filled + i, coefficient)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _sum_table(
+    table: NDArray[np.float64],
+    filled: int,
+    width: int,
+    a: float,
+    inverse: float,
+    totals: NDArray[np.float64],
+    frames: float,
+    expected: NDArray[np.float64],
+    end: int,
+) -> None:
+    """Fill up the last lanes with columns of no weight, and sum with the loop for this many components.
+
+    With ``frames``, also leave the counts expected of the columns, which end before DN ``end``.
+    """
+    for row in range(_COEFFICIENT + width):
+        store_lanes(table, row, filled, 1.0 if row == _COEFFICIENT else 0.0)
+    if width == 3:
+        table_sums_3(table, filled, 3, a, inverse, totals)
+    elif width == 5:
+        table_sums_5(table, filled, 5, a, inverse, totals)
+    elif width == 7:
+        table_sums_7(table, filled, 7, a, inverse, totals)
+    elif width == 9:
+        table_sums_9(table, filled, 9, a, inverse, totals)
+    else:
+        table_sums_any(table, filled, width, a, inverse, totals)
+    if frames > 0.0:
+        _expect(table, filled, width, a, inverse, frames, expected, end - filled)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _expect(
+    table: NDArray[np.float64],
+    filled: int,
+    width: int,
+    a: float,
+    inverse: float,
+    frames: float,
+    out: NDArray[np.float64],
+    start: int,
+) -> None:
+    """Leave the counts expected of the DN in the table in ``out`` from ``start`` on."""
+    half = float(width // 2)
+    for first in range(0, filled, LANES):
+        offset = load_lanes(table, _OFFSET, first)
+        ratio = lanes_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+        power = ratio
+        density = load_lanes(table, _COEFFICIENT, first)
+        for k in range(1, width):
+            density = fused(load_lanes(table, _COEFFICIENT + k, first), power, density)
+            power = power * ratio
+        shift = least(load_lanes(table, _NEAREST, first), half) * a
+        level = fused(offset * (0.0 - inverse), fused(offset, 0.5, shift), load_lanes(table, _LEVEL, first))
+        level = lanes_exp(most(least(level, -_SMALLEST), _SMALLEST))
+        store_lanes(table, _WEIGHT, first, density * frames * level)
+    for i in range(filled):
+        out[start + i] = table[_WEIGHT, i]
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _finish(
+    histogram: Histogram, theta: NDArray[np.float64], totals: NDArray[np.float64], space: Workspace
+) -> None:
+    """Turn the totals into the E-step's sums, score and observed information.
+
+    With ``S = const + alpha i + beta i^2``, ``alpha = (1, w/s2, -a/s2, -a d/s2)`` and ``beta = (0, -a/s2, 0,
+    a^2/2 s2)``, the conditional covariance of the complete-data score is made of the sums of var(i),
+    cov(i, i^2) and var(i^2) times powers of d and w.
+    """
+    n, total, score, information = histogram.n, space.total, space.score, space.information
+    exposure, a, inverse = math.exp(theta[0]), theta[1], math.exp(-theta[3])
+    t = a * inverse
+    mean = histogram.mean - theta[2]
+    low2, low_d, m2, d_m1 = totals[_LOW2], totals[_LOW_D], totals[_M2], totals[_D_M1]
+    sum_k = totals[_LOW] + totals[_M1]
+    sum_kk = low2 + 2.0 * totals[_LOW_M1] + m2
+    sum_ke = low_d + d_m1 - a * (totals[_LOW_M1] + m2)
+    sum_e = n * mean - a * sum_k
+    sum_ee = n * (histogram.variance + mean * mean) - a * (2.0 * (low_d + d_m1) + a * (low2 - m2))
+    for place, value in enumerate((totals[LOGLIK], sum_k, sum_kk, sum_ke, sum_e, sum_ee)):
+        total[place] = value
+    v11, v12, v22 = totals[_V11], totals[_V12], totals[_V22]
+    cov01 = inverse * totals[_V11W] - t * v12
+    cov03 = 0.5 * a * t * v12 - t * totals[_V11D]
+    cov11 = inverse * (inverse * totals[_V11WW] - 2.0 * t * totals[_V12W]) + t * t * v22
+    cov13 = t * inverse * (0.5 * a * totals[_V12W] - totals[_V11DW])
+    cov13 += t * t * (totals[_V12D] - 0.5 * a * v22)
+    cov33 = t * t * (totals[_V11DD] - a * totals[_V12D] + 0.25 * a * a * v22)
+    score[0] = sum_k - n * exposure
+    score[1] = sum_ke * inverse
+    score[2] = sum_e * inverse
+    score[3] = 0.5 * (sum_ee * inverse - n)
+    information[0, 0] = n * exposure - v11
+    information[0, 1] = -cov01
+    information[0, 2] = t * v11
+    information[0, 3] = -cov03
+    information[1, 1] = sum_kk * inverse - cov11
+    information[1, 2] = sum_k * inverse + t * cov01
+    information[1, 3] = sum_ke * inverse - cov13
+    information[2, 2] = n * inverse - t * t * v11
+    information[2, 3] = sum_e * inverse + t * cov03
+    information[3, 3] = 0.5 * sum_ee * inverse - cov33
+    for row in range(1, 4):
+        for column in range(row):
+            information[row, column] = information[column, row]
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def _fill(
+    table: NDArray[np.float64],
+    filled: int,
+    weights: NDArray[np.float64],
+    start: int,
+    stop: int,
+    offset: float,
+    place: int,
+    level: float,
+) -> None:
+    """Lay out the DN from ``start`` to ``stop``; the first is ``offset`` DN off component ``place``.
+
+    Columns are written by the eight: what that writes too much, the next ones overwrite.
+    """
+    n = stop - start
+    for i in range(n):
+        table[_WEIGHT, filled + i] = weights[start + i]
+    for i in range(0, n, LANES):
+        store_lanes(table, _OFFSET, filled + i, counting() + (offset + i))
+        store_lanes(table, _NEAREST, filled + i, float(place))
+        store_lanes(table, _LEVEL, filled + i, level)
+
+
+@nb.njit(nogil=True, cache=True, error_model="numpy")
+def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace, frames: float) -> float:
+    """Evaluate log-likelihood, E-step sums, score and observed information of one pixel.
+
+    Args:
+        histogram: of the pixel; its moments take part, too.
+        theta: (log H, a, m, log sigma^2).
+        space: scratch; out: sums, score and information.
+        frames: leave the counts of each DN expected in so many frames in ``space.rows[0]``; nothing if 0.
+
+    Returns:
+        The log-likelihood, nats.
+    """
+    weights, cumulative, n_bins, first, _, _, _ = histogram
+    rows, table = space.rows, space.table
+    expected, totals = rows[_EXPECTED], rows[_TOTALS]
+    exposure, a, origin, inverse = math.exp(theta[0]), theta[1], theta[2], math.exp(-theta[3])
+    j = max(0, math.floor((first - origin) / a + 0.5))
+    last = max(j, math.floor((first + n_bins - 1 - origin) / a + 0.5))
+    half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last)
+    width = 2 * half + 1
+    lowest = max(0, j - half)
+    _fill_steps(rows, lowest, max(last, half) + half + 2 - lowest, theta[0])
+    power = math.exp(-0.5 * a * a * inverse)
+    square = power * power
+    for step in range(1, width):
+        rows[_POWERS, step] = power
+        power *= square
+    for i in range(_N_TOTALS):
+        totals[i] = 0.0
+    level = j * theta[0] - exposure - math.lgamma(j + 1.0) - 0.5 * (theta[3] + LOG_2PI)
+    start = n_bins - n_bins  # 0 as a variable, lest a constant have its own compilation
+    filled = start
+    while start < n_bins:
+        end = min(n_bins, math.ceil(origin + (j + 0.5) * a - first))
+        if j == last:
+            end = n_bins
+        held = cumulative[end] - cumulative[start] if end > start else 0.0
+        if end > start and (held > 0.0 or (frames > 0.0 and level > _NOTHING)):
+            low = max(0, j - half)
+            totals[_LOW] += held * low
+            totals[_LOW2] += held * low * low
+            while start < end:
+                stop = min(end, start + CAPACITY)
+                if filled + stop - start > CAPACITY:
+                    _sum_table(table, filled, width, a, inverse, totals, frames, expected, start)
+                    filled = 0
+                offset = first + start - origin - j * a
+                _fill(table, filled, weights, start, stop, offset, j, level)
+                _fill_coefficients(table, filled, stop - start, rows, j, lowest, low, width)
+                filled += stop - start
+                start = stop
+        elif end > start:
+            if frames > 0.0:
+                _sum_table(table, filled, width, a, inverse, totals, frames, expected, start)
+                filled = 0
+                for i in range(start, end):
+                    expected[i] = 0.0
+            start = end
+        j += 1
+        level += rows[_LOG_RISE, j - lowest]
+    _sum_table(table, filled, width, a, inverse, totals, frames, expected, n_bins)
+    _finish(histogram, theta, totals, space)
+    return float(totals[LOGLIK])

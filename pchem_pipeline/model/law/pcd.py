@@ -1,0 +1,182 @@
+"""The photon counting distribution (PCD): density, moments, quantised mass and draws.
+
+A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
+standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
+treats the rounding as additive noise, ``sigma^2 = sigma_R^2/g^2 + 1/12`` (eq. X_density).
+
+All arguments broadcast. Units: H and sigma_R in e-, g in e-/DN, mu, sigma and x in DN.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.model.law import pcd_numba
+
+__all__ = [
+    "QUANTISATION_VARIANCE",
+    "PcdMoments",
+    "analog_read_noise",
+    "draw_pcd",
+    "log_pcd",
+    "pcd",
+    "pcd_mass",
+    "pcd_moments",
+    "total_read_noise",
+]
+
+#: Variance of the rounding to whole DN, DN^2 (sigma_Q^2 in eq. X_density).
+QUANTISATION_VARIANCE = 1.0 / 12.0
+
+_Array = NDArray[np.float64]
+
+
+class PcdMoments(NamedTuple):
+    """Mean (DN) and the second to fourth cumulants (DN^2, DN^3, DN^4) of the PCD."""
+
+    mean: _Array
+    variance: _Array
+    third: _Array
+    fourth: _Array
+
+
+def _flat(*arguments: ArrayLike) -> tuple[list[_Array], tuple[int, ...]]:
+    arrays = np.broadcast_arrays(*[np.asarray(a, dtype=np.float64) for a in arguments])
+    return [np.ascontiguousarray(a).reshape(-1) for a in arrays], arrays[0].shape
+
+
+def log_pcd(
+    x: ArrayLike,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    read_noise_dn: ArrayLike,
+) -> _Array:
+    """Return the log density of the PCD, eq. (X_density), with as many components as matter.
+
+    Exact to rounding everywhere, also deep in the tails, since the terms are summed around the largest.
+
+    Args:
+        x: values, DN, any shape.
+        quanta_exposure: H >= 0, e-.
+        conversion_gain: g > 0, e-/DN.
+        bias: mu, DN.
+        read_noise_dn: sigma > 0, quantisation included, DN.
+
+    Returns:
+        log f_X(x), nats of 1/DN, of the broadcast shape; NaN where a parameter is NaN or not valid.
+    """
+    flat, shape = _flat(x, quanta_exposure, conversion_gain, bias, read_noise_dn)
+    out = np.empty(flat[0].size)
+    pcd_numba.log_densities(*flat, out)
+    return out.reshape(shape)
+
+
+def pcd(
+    x: ArrayLike,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    read_noise_dn: ArrayLike,
+) -> _Array:
+    """Return the density of the PCD, eq. (X_density), in 1/DN; arguments as in :func:`log_pcd`.
+
+    Example:
+        >>> float(round(pcd(0.0, 1.8, 1.0, 0.0, 0.33)[()], 4))
+        0.2035
+    """
+    return np.asarray(np.exp(log_pcd(x, quanta_exposure, conversion_gain, bias, read_noise_dn)))
+
+
+def pcd_mass(
+    x: ArrayLike,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    analog_read_noise_e: ArrayLike,
+) -> _Array:
+    """Return the exact probability of the whole number x, the rounding of eq. (PCD_RV_definition) included.
+
+    Args:
+        x: whole DN, any shape.
+        quanta_exposure: H >= 0, e-.
+        conversion_gain: g > 0, e-/DN.
+        bias: mu, DN.
+        analog_read_noise_e: sigma_R >= 0 before quantisation, e-.
+
+    Returns:
+        P(X = x), of the broadcast shape.
+    """
+    flat, shape = _flat(x, quanta_exposure, conversion_gain, bias, analog_read_noise_e)
+    out = np.empty(flat[0].size)
+    pcd_numba.masses(*flat, out)
+    return out.reshape(shape)
+
+
+def pcd_moments(
+    quanta_exposure: ArrayLike, conversion_gain: ArrayLike, bias: ArrayLike, read_noise_dn: ArrayLike
+) -> PcdMoments:
+    """Return the first four cumulants of the PCD: a Poisson variable scaled by 1/g plus normal noise.
+
+    Arguments as in :func:`log_pcd`.
+
+    Example:
+        >>> mean, variance, *_ = pcd_moments(2.0, 0.5, 10.0, 1.0)
+        >>> float(mean), float(variance)
+        (14.0, 9.0)
+    """
+    exposure, gain, offset, sigma = np.broadcast_arrays(
+        *[np.asarray(a, dtype=np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_dn)]
+    )
+    return PcdMoments(
+        np.asarray(offset + exposure / gain),
+        np.asarray(sigma**2 + exposure / gain**2),
+        np.asarray(exposure / gain**3),
+        np.asarray(exposure / gain**4),
+    )
+
+
+def draw_pcd(
+    rng: np.random.Generator,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    analog_read_noise_e: ArrayLike,
+    size: int | tuple[int, ...] | None = None,
+) -> NDArray[np.int64]:
+    """Draw whole DN from eq. (PCD_RV_definition), rounding included.
+
+    Args:
+        rng: source of random numbers.
+        quanta_exposure: H, e-.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        analog_read_noise_e: sigma_R before quantisation, e-.
+        size: shape of the answer; the broadcast shape of the parameters by default.
+
+    Returns:
+        Draws, DN.
+    """
+    parameters = [np.asarray(a, float) for a in (quanta_exposure, conversion_gain, bias, analog_read_noise_e)]
+    shape = np.broadcast_shapes(*[p.shape for p in parameters]) if size is None else size
+    exposure, gain, offset, noise = parameters
+    electrons = rng.poisson(exposure, shape)
+    signal = electrons + noise * rng.standard_normal(shape)
+    return np.asarray(np.rint(signal / gain + offset), dtype=np.int64)
+
+
+def total_read_noise(analog_read_noise_e: ArrayLike, conversion_gain: ArrayLike) -> _Array:
+    """Return sigma (DN) with quantisation from sigma_R (e-): ``sqrt(sigma_R^2/g^2 + 1/12)``."""
+    gain = np.asarray(conversion_gain, dtype=np.float64)
+    noise = np.asarray(analog_read_noise_e, dtype=np.float64)
+    return np.asarray(np.sqrt((noise / gain) ** 2 + QUANTISATION_VARIANCE))
+
+
+def analog_read_noise(read_noise_dn: ArrayLike, conversion_gain: ArrayLike) -> _Array:
+    """Return sigma_R (e-) without quantisation from sigma (DN); 0 where sigma is below 1/sqrt(12) DN."""
+    gain = np.asarray(conversion_gain, dtype=np.float64)
+    variance = np.asarray(read_noise_dn, dtype=np.float64) ** 2 - QUANTISATION_VARIANCE
+    return np.asarray(gain * np.sqrt(np.where(variance < 0, 0.0, variance)))

@@ -1,0 +1,272 @@
+"""The law of one pixel's samples once the PCD has grown: what replaces Poisson, the comb and the Gaussian.
+
+The PCD is ``x = round(mu + (K + R) / g)`` with Poisson K and Gaussian R (Hendrickson et al. 2023, eq.
+PCD_RV_definition). Effects change the law of K, the levels that it maps to, the noise around them, and the
+codes. A :class:`MarginalModel` says all that for a batch of n pixels; each effect of a run's model adds its
+part with :meth:`~pchem_pipeline.effects.framework.effect.Effect.marginal`, and the fit of (H, g, mu, sigma)
+uses the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["CountLaw", "MarginalModel"]
+
+FloatArray = NDArray[np.float64]
+CountLaw = Literal["poisson", "negative_binomial", "borel"]
+
+
+def _one() -> FloatArray:
+    return np.ones(1)
+
+
+def _zero() -> FloatArray:
+    return np.zeros(1)
+
+
+@dataclass(frozen=True)
+class MarginalModel:
+    """The mass of code x given (H, g, mu, sigma) of a pixel.
+
+    ``P(x) = sum_bj w_b u_j sum_k P(k; H f_b + d_j) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]``
+    with mean ``m = mu + (level_scale k (1 + curvature (k - 1) / 2) + level_shift_e + shift_e_l) / g +
+    shift_dn_l + shift_sigma_l sigma_R``, variance ``s^2 = (width_l sigma_R)^2 + [extra_variance_e2 +
+    variance_per_electron k + variance_per_electron2 k^2] / g^2 + extra_variance_dn2``, where sigma_R^2 =
+    sigma^2 - 1/12 is the analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and
+    code edges ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there. A
+    share of the samples may be outliers, anywhere.
+
+    Attributes:
+        law: law of the electron number; its mean is H whatever the law.
+        dispersion: negative binomial: a in Var K = H + a H^2; borel (generalised Poisson): l in Var K =
+            H / (1 - l)^2 at mean H; no unit.
+        exposure_weights, exposure_factors: discrete mixture of exposures H f_b, shape (m,) each; weights sum
+            to 1 and the mean factor is 1.
+        added_exposure, added_weights: discrete mixture of exposures d_j beside H, e-, >= 0, and its weights
+            u_j, shape (n or 1, j) each; weights sum to 1 along j.
+        level_scale: DN per electron of the comb relative to 1/g, shape (n,) or (1,).
+        level_shift_e: shift of all levels, e-, shape (n,) or (1,).
+        curvature: relative change of the step per electron, no unit.
+        variance_per_electron, variance_per_electron2: e-^2 per electron and per electron squared.
+        extra_variance_e2, extra_variance_dn2: variance that no parameter of the pixel holds, e-^2 and DN^2,
+            shape (n,) or (1,).
+        lobe_weights, lobe_shift_e, lobe_shift_dn, lobe_shift_sigma, lobe_width: components of the noise,
+            shape (n or 1, l) each; weights sum to 1 along l.
+        edge_first, edge_shift: shift of the lower edge of the codes from ``edge_first`` on, DN; 0 elsewhere.
+            The shifts of neighbouring edges must differ by less than 1 DN.
+        clip_low, clip_high: smallest and largest code that comes out, or None.
+        outlier_share, outlier_codes: share of the samples that can be anything, evenly over so many codes:
+            they then count for nothing in the fit (particle hits).
+        free_lobes: amplitudes A, e-, of which one may be found in a pixel, with a weight q of its own; the
+            fit tries each, refines the best, and keeps it where the likelihood rises by enough. Empty: none.
+        free_lobe_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps 1 - q;
+            the weights sum to 1 and q multiplies them. The default is a trap read by correlated double
+            sampling: -A, 0, +A with q/2, 1 - q, q/2.
+        free_lobe_alarm: about the probability that a pixel without such levels is given some.
+    """
+
+    law: CountLaw = "poisson"
+    dispersion: float = 0.0
+    exposure_weights: FloatArray = field(default_factory=_one)
+    exposure_factors: FloatArray = field(default_factory=_one)
+    added_exposure: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    added_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    level_scale: FloatArray = field(default_factory=_one)
+    level_shift_e: FloatArray = field(default_factory=_zero)
+    curvature: float = 0.0
+    variance_per_electron: float = 0.0
+    variance_per_electron2: float = 0.0
+    extra_variance_e2: FloatArray = field(default_factory=_zero)
+    extra_variance_dn2: FloatArray = field(default_factory=_zero)
+    lobe_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    lobe_shift_e: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    lobe_shift_dn: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    lobe_shift_sigma: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    lobe_width: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    edge_first: int = 0
+    edge_shift: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clip_low: int | None = None
+    clip_high: int | None = None
+    outlier_share: float = 0.0
+    outlier_codes: int = 65536
+    free_lobes: tuple[float, ...] = ()
+    free_lobe_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
+    free_lobe_alarm: float = 1e-4
+
+    @property
+    def neutral(self) -> bool:
+        """Whether this is the PCD itself, cells integrated exactly."""
+        mine, plain = _values(self), _values(MarginalModel())
+        return all(np.array_equal(mine[name], plain[name]) for name in plain)
+
+    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> MarginalModel:
+        """Return the law of some of the pixels (an index, a mask or a slice along n)."""
+        return replace(
+            self,
+            **{name: values[pixels] for name in _PER_PIXEL if (values := getattr(self, name)).shape[0] != 1},
+        )
+
+    def with_counts(self, law: CountLaw, dispersion: float) -> MarginalModel:
+        """Return a copy with another law of the electron number."""
+        return replace(self, law=law, dispersion=dispersion)
+
+    def with_exposures(self, weights: ArrayLike, factors: ArrayLike) -> MarginalModel:
+        """Return a copy whose exposure is also mixed over ``factors`` (all products)."""
+        w, f = np.asarray(weights, np.float64), np.asarray(factors, np.float64)
+        return replace(
+            self,
+            exposure_weights=np.outer(self.exposure_weights, w).ravel(),
+            exposure_factors=np.outer(self.exposure_factors, f).ravel(),
+        )
+
+    def with_added_exposure(self, exposure_e: ArrayLike, weights: ArrayLike) -> MarginalModel:
+        """Return a copy whose pixels also get one of several exposures, (n, j) e- each (all sums)."""
+        d, u = (np.atleast_2d(np.asarray(values, np.float64)) for values in (exposure_e, weights))
+        sums = self.added_exposure[:, :, None] + d[:, None, :]
+        products = self.added_weights[:, :, None] * u[:, None, :]
+        return replace(
+            self,
+            added_exposure=np.ascontiguousarray(sums.reshape(sums.shape[0], -1)),
+            added_weights=np.ascontiguousarray(products.reshape(products.shape[0], -1)),
+        )
+
+    def with_noise(
+        self,
+        weights: ArrayLike,
+        *,
+        shift_e: ArrayLike = 0.0,
+        shift_dn: ArrayLike = 0.0,
+        shift_sigma: ArrayLike = 0.0,
+        width: ArrayLike = 1.0,
+    ) -> MarginalModel:
+        """Return a copy whose noise is also mixed over components, (l,) or (n, l) each (all products)."""
+        w = np.atleast_2d(np.asarray(weights, np.float64))
+
+        def like(values: ArrayLike) -> FloatArray:
+            return np.broadcast_to(np.asarray(values, np.float64), w.shape)
+
+        def outer(mine: FloatArray, theirs: FloatArray, *, product: bool) -> FloatArray:
+            both = mine[:, :, None] * theirs[:, None, :] if product else mine[:, :, None] + theirs[:, None, :]
+            return np.ascontiguousarray(both.reshape(both.shape[0], -1))
+
+        return replace(
+            self,
+            lobe_weights=outer(self.lobe_weights, w, product=True),
+            lobe_shift_e=outer(self.lobe_shift_e, like(shift_e), product=False),
+            lobe_shift_dn=outer(self.lobe_shift_dn, like(shift_dn), product=False),
+            lobe_shift_sigma=outer(self.lobe_shift_sigma, like(shift_sigma), product=False),
+            lobe_width=outer(self.lobe_width, like(width), product=True),
+        )
+
+    def with_variance(
+        self,
+        *,
+        dn2: ArrayLike = 0.0,
+        e2: ArrayLike = 0.0,
+        per_electron: float = 0.0,
+        per_electron2: float = 0.0,
+    ) -> MarginalModel:
+        """Return a copy with more variance.
+
+        Args:
+            dn2: DN^2, scalar or (n,).
+            e2: e-^2, scalar or (n,).
+            per_electron: e-^2 per electron.
+            per_electron2: e-^2 per electron squared.
+        """
+        return replace(
+            self,
+            variance_per_electron=self.variance_per_electron + per_electron,
+            variance_per_electron2=self.variance_per_electron2 + per_electron2,
+            extra_variance_dn2=self.extra_variance_dn2 + np.atleast_1d(np.asarray(dn2, np.float64)),
+            extra_variance_e2=self.extra_variance_e2 + np.atleast_1d(np.asarray(e2, np.float64)),
+        )
+
+    def with_levels(
+        self, *, scale: ArrayLike = 1.0, shift_e: ArrayLike = 0.0, curvature: float = 0.0
+    ) -> MarginalModel:
+        """Return a copy with a comb stretched by ``scale``, moved by ``shift_e`` e- and bent.
+
+        Args:
+            scale: factor, scalar or (n,).
+            shift_e: e-, scalar or (n,).
+            curvature: relative change of the step per electron, added to what there is.
+        """
+        return replace(
+            self,
+            curvature=self.curvature + curvature,
+            level_scale=self.level_scale * np.atleast_1d(np.asarray(scale, np.float64)),
+            level_shift_e=self.level_shift_e + np.atleast_1d(np.asarray(shift_e, np.float64)),
+        )
+
+    def with_edges(self, first: int, shift: ArrayLike) -> MarginalModel:
+        """Return a copy whose lower code edges are shifted, on top of what there is.
+
+        Args:
+            first: code of the first shift.
+            shift: DN, shape (m,).
+        """
+        more = np.asarray(shift, np.float64)
+        if self.edge_shift.size == 0:
+            return replace(self, edge_first=first, edge_shift=more)
+        low = min(first, self.edge_first)
+        high = max(first + more.size, self.edge_first + self.edge_shift.size)
+        both = np.zeros(high - low)
+        both[first - low : first - low + more.size] += more
+        both[self.edge_first - low : self.edge_first - low + self.edge_shift.size] += self.edge_shift
+        return replace(self, edge_first=low, edge_shift=both)
+
+    def with_clip(self, low: int | None = None, high: int | None = None) -> MarginalModel:
+        """Return a copy with codes cut to ``low`` .. ``high``, and to the limits that there are."""
+        lows = [c for c in (low, self.clip_low) if c is not None]
+        highs = [c for c in (high, self.clip_high) if c is not None]
+        return replace(
+            self,
+            clip_low=max(lows) if lows else None,
+            clip_high=min(highs) if highs else None,
+        )
+
+    def with_outliers(self, share: float, codes: int = 65536) -> MarginalModel:
+        """Return a copy in which a share of the samples may lie anywhere among so many codes."""
+        return replace(self, outlier_share=share, outlier_codes=codes)
+
+    def with_free_lobes(
+        self,
+        amplitudes_e: Sequence[float],
+        *,
+        pattern: Sequence[tuple[float, float]] | None = None,
+        alarm: float = 1e-4,
+    ) -> MarginalModel:
+        """Return a copy that looks in every pixel for lobes of one of these amplitudes (``free_lobes``)."""
+        return replace(
+            self,
+            free_lobes=tuple(float(a) for a in amplitudes_e),
+            free_lobe_pattern=self.free_lobe_pattern if pattern is None else tuple(pattern),
+            free_lobe_alarm=alarm,
+        )
+
+
+#: Fields that may have one row per pixel.
+_PER_PIXEL = (
+    "added_exposure",
+    "added_weights",
+    "level_scale",
+    "level_shift_e",
+    "extra_variance_e2",
+    "extra_variance_dn2",
+    "lobe_weights",
+    "lobe_shift_e",
+    "lobe_shift_dn",
+    "lobe_shift_sigma",
+    "lobe_width",
+)
+
+
+def _values(model: MarginalModel) -> dict[str, Any]:
+    return {f.name: getattr(model, f.name) for f in fields(model)}

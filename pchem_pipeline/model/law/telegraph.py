@@ -1,0 +1,169 @@
+"""Exposures that blink: the steps and states of a pixel whose exposure is switched between levels.
+
+The samples are those of a hidden Markov model (Baum et al. 1970): each of one or two independent processes
+adds its step to the pixel's own exposure while it is up, the electrons are Poisson, and the comb is that of
+the pixel's fit. Frames that were not observed only let the states forget.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import gammaln
+
+from pchem_pipeline.model.law import telegraph_numba
+
+__all__ = ["Telegraph", "find_telegraph"]
+
+FloatArray = NDArray[np.float64]
+
+# rise of the log-likelihood, nats, that the first and the second process must bring; pixels of constant
+# exposure reach the first by chance in about one of 340
+_RISES = (6.0, 5.0)
+# rise that one of the starts must bring by itself, nats: one pixel in fifty of constant exposure does
+_PROMISING = 2.0
+_LEAST_EXPOSURE = 0.02  # e-
+_LARGEST_STEP = 50.0  # e-
+_LEAST_SHARE = 0.02
+_SHORTEST = 0.5  # frames
+# starts: correlation times (as parts of the run, on a logarithmic scale), shares, and steps in units of the
+# root of the exposure
+_TIMES = (0.2, 0.45, 0.65)
+_SHARES = (0.3, 0.7)
+_STEPS = (0.3, 0.8)
+_REFINED = 2
+
+
+@dataclass(frozen=True)
+class Telegraph:
+    """How the exposure of a pixel blinks.
+
+    Attributes:
+        exposure: with all processes down, e-.
+        step: of each process, e-, shape (d,).
+        share: of the time that each is up, of the law and not of these frames, shape (d,).
+        tau: correlation time of each, frames, shape (d,).
+        rise: of the log-likelihood against a constant exposure, nats.
+        added: exposure added in each state, e-, shape (2 ** d,); the first is 0.
+        weight: part of these frames spent in each state, shape (2 ** d,).
+    """
+
+    exposure: float
+    step: FloatArray
+    share: FloatArray
+    tau: FloatArray
+    rise: float
+    added: FloatArray
+    weight: FloatArray
+
+
+class _Series:
+    """The samples of a pixel, and their law given the exposure."""
+
+    def __init__(self, samples: NDArray[np.integer], frames: NDArray[np.int64], pixel: FloatArray) -> None:
+        exposure, gain, bias, sigma = (float(v) for v in pixel)
+        codes, place = np.unique(samples, return_inverse=True)
+        self.samples = np.ascontiguousarray(place, np.int64)
+        self.gaps = np.diff(frames, prepend=frames[0]).astype(np.int64)
+        self.run = float(frames[-1] - frames[0] + 1)
+        self.mean = exposure
+        most = (float(codes[-1]) - bias) * gain + 8.0 * gain * sigma
+        self.electrons = np.arange(max(int(most), int(2.0 * exposure), 0) + 2.0)
+        z = (codes[:, None] - bias - self.electrons / gain) / sigma
+        self.comb = np.exp(-0.5 * z * z)
+        self.factorial = gammaln(self.electrons + 1.0)
+
+    def emission(self, exposures: FloatArray) -> FloatArray:
+        """Return the relative probability of each code at each exposure, (codes, exposures)."""
+        poisson = np.exp(self.electrons[:, None] * np.log(exposures) - exposures - self.factorial[:, None])
+        # a code that the comb forbids tells nothing of the state
+        found: FloatArray = np.maximum(self.comb @ poisson, 1e-30)
+        return found
+
+    def height(self, theta: FloatArray) -> float:
+        """Return the log-likelihood."""
+        exposure, step, share, tau = unpacked(theta)
+        emission = self.emission(exposure + added_of(step))
+        room = np.empty((0, emission.shape[1]))
+        return float(telegraph_numba.filtered(emission, self.samples, self.gaps, share, tau, room))
+
+    def weights(self, theta: FloatArray) -> FloatArray:
+        """Return the part of the frames spent in each state."""
+        exposure, step, share, tau = unpacked(theta)
+        emission = self.emission(exposure + added_of(step))
+        state = np.empty((self.samples.size, emission.shape[1]))
+        args = (emission, self.samples, self.gaps, share, tau, state)
+        telegraph_numba.filtered(*args)
+        telegraph_numba.smooth(*args)
+        return np.asarray(state.mean(axis=0))
+
+    def climbed(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Return the highest log-likelihood from a start, and where it is."""
+        longest = np.log(max(self.run, 4.0 * _SHORTEST))
+        logit = np.log(1.0 / _LEAST_SHARE - 1.0)
+        process = [
+            (np.log(_LEAST_EXPOSURE), np.log(_LARGEST_STEP)),
+            (-logit, logit),
+            (np.log(_SHORTEST), longest),
+        ]
+        bounds = [(np.log(_LEAST_EXPOSURE), None), *process * (theta.size // 3)]
+        found = minimize(lambda t: -self.height(t), theta, method="L-BFGS-B", bounds=bounds)
+        return -float(found.fun), np.asarray(found.x)
+
+
+def unpacked(theta: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Return exposure, steps, shares and times of (log H, then log A, logit share, log tau of each)."""
+    rest = theta[1:].reshape(-1, 3)
+    return float(np.exp(theta[0])), np.exp(rest[:, 0]), 1.0 / (1.0 + np.exp(-rest[:, 1])), np.exp(rest[:, 2])
+
+
+def added_of(step: FloatArray) -> FloatArray:
+    """Return what each state adds: bit d of its number says whether process d is up."""
+    states = np.arange(1 << step.size)
+    return np.asarray(((states[:, None] >> np.arange(step.size)) & 1) @ step)
+
+
+def find_telegraph(
+    samples: NDArray[np.integer], frames: NDArray[np.int64], pixel: FloatArray
+) -> Telegraph | None:
+    """Return how a pixel's exposure blinks, or None where a constant one explains the samples as well.
+
+    Args:
+        samples: DN, shape (n,).
+        frames: their frame numbers, increasing, shape (n,).
+        pixel: plain (H, g, mu, sigma); H is the mean exposure.
+    """
+    series = _Series(samples, frames, pixel)
+    theta = np.log([series.mean])
+    constant = found = series.height(theta)
+    for rise in _RISES:
+        starts = _starts(series, theta)
+        if not starts or starts[0][0] < found + _PROMISING:
+            break
+        height, best = max((series.climbed(start) for _, start in starts[:_REFINED]), key=lambda f: f[0])
+        if height < found + rise:
+            break
+        found, theta = height, best
+    if theta.size == 1:
+        return None
+    exposure, step, share, tau = unpacked(theta)
+    return Telegraph(exposure, step, share, tau, found - constant, added_of(step), series.weights(theta))
+
+
+def _starts(series: _Series, theta: FloatArray) -> list[tuple[float, FloatArray]]:
+    """Return starts with one process more at the same mean exposure and how high each is, highest first."""
+    exposure = float(np.exp(theta[0]))
+    found = []
+    for time in _TIMES:
+        tau = max(series.run**time, 2.0 * _SHORTEST)
+        for share in _SHARES:
+            for step in np.asarray(_STEPS) * np.sqrt(exposure):
+                own = exposure - share * step
+                if own > 0.1 * exposure:
+                    more = [np.log(step), np.log(share / (1.0 - share)), np.log(tau)]
+                    start = np.array([np.log(own), *theta[1:], *more])
+                    found.append((series.height(start), start))
+    return sorted(found, key=lambda f: f[0], reverse=True)

@@ -1,0 +1,1 @@
+"""Parameter maps and what is derived from them."""

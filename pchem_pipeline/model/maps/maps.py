@@ -1,0 +1,206 @@
+"""Parameter maps: derived quantities with standard errors, quality, robust summaries, display transform."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.maps.pixels import FloatArray
+
+__all__ = [
+    "CAUTION",
+    "GOOD",
+    "NO_VALUE",
+    "QUANTISATION_VARIANCE",
+    "MapSummary",
+    "derived_maps",
+    "display_transform",
+    "quality_map",
+    "status_counts",
+    "summarise",
+]
+
+#: Variance of rounding to integers, DN^2.
+QUANTISATION_VARIANCE = 1.0 / 12.0
+
+GOOD, CAUTION, NO_VALUE = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class MapSummary:
+    """Robust description of a map; a few hot pixels do not move it.
+
+    Attributes:
+        n_valid: pixels with a value.
+        n_missing: pixels without.
+        median: median of the values, in the unit of the map.
+        median_stderr: standard error of the median, from order statistics.
+        robust_sd: 1.4826 MAD, the standard deviation of a normal core.
+        percentiles: percentile (%) to value.
+        minimum, maximum: extremes.
+        n_low, n_high: outliers below and above.
+    """
+
+    n_valid: int
+    n_missing: int
+    median: float
+    median_stderr: float
+    robust_sd: float
+    percentiles: Mapping[float, float]
+    minimum: float
+    maximum: float
+    n_low: int
+    n_high: int
+
+
+def derived_maps(
+    parameters: Mapping[str, FloatArray], covariance: FloatArray, integration_time: float | None
+) -> dict[str, FloatArray]:
+    """Derive dark current and read noise in electrons, with standard errors by the delta method.
+
+    ``sigma_e- = sigma g`` and ``i_d = H / t_int`` (Hendrickson et al. 2023, Sec. IV). The analog read
+    noise is ``sigma_R = g sqrt(sigma^2 - 1/12)`` (below eq. X_density): NaN where the estimate is below
+    rounding alone.
+
+    Args:
+        parameters: the four maps by name (``variables.PARAMETERS``), each of one shape.
+        covariance: covariance of (H, g, mu, sigma), shape (..., 4, 4).
+        integration_time: t_int, s; None leaves out the dark current.
+
+    Returns:
+        ``read_noise_e``, ``analog_read_noise_e``, ``dark_current``, each with ``<name>_stderr``.
+    """
+    gain, sigma = parameters["conversion_gain"], parameters["read_noise_dn"]
+    analog_variance = sigma**2 - QUANTISATION_VARIANCE
+    with np.errstate(invalid="ignore", divide="ignore"):
+        analog = np.sqrt(np.where(analog_variance >= 0, analog_variance, np.nan))
+        slope = np.where(analog > 0, gain * sigma / analog, np.nan)
+    maps = {
+        "read_noise_e": gain * sigma,
+        "read_noise_e_stderr": _delta(sigma, gain, covariance),
+        "analog_read_noise_e": gain * analog,
+        "analog_read_noise_e_stderr": _delta(analog, slope, covariance),
+    }
+    if integration_time is not None:
+        maps["dark_current"] = parameters["quanta_exposure"] / integration_time
+        maps["dark_current_stderr"] = _root(covariance[..., 0, 0]) / integration_time
+    return maps
+
+
+def _delta(by_gain: FloatArray, by_sigma: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the standard error of a function of g and sigma from its two derivatives."""
+    variance = (
+        by_gain**2 * covariance[..., 1, 1]
+        + 2.0 * by_gain * by_sigma * covariance[..., 1, 3]
+        + by_sigma**2 * covariance[..., 3, 3]
+    )
+    return _root(variance)
+
+
+def _root(variance: FloatArray) -> FloatArray:
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
+def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
+    """Grade the pixels: ``GOOD``, ``CAUTION`` (any word in the status) or ``NO_VALUE`` (parameters are NaN).
+
+    Args:
+        fit_status: status words, any shape.
+        conversion_gain: g, same shape; NaN where the fit failed.
+
+    Returns:
+        Quality, same shape.
+    """
+    quality = np.where(fit_status == 0, GOOD, CAUTION).astype(np.uint8)
+    quality[((fit_status & int(FAILED)) != 0) | ~np.isfinite(conversion_gain)] = NO_VALUE
+    return quality
+
+
+def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
+    """Count the pixels that bear each reason; one pixel may bear several.
+
+    Args:
+        fit_status: status words, any shape.
+
+    Returns:
+        Name of the reason, in lower case, to number of pixels; ``"ok"`` first.
+    """
+    counts = {"ok": int(np.count_nonzero(fit_status == 0))}
+    for bit in FitStatus:
+        if bit:
+            counts[str(bit.name).lower()] = int(np.count_nonzero(fit_status & int(bit)))
+    return counts
+
+
+def summarise(
+    values: FloatArray,
+    *,
+    percentiles: tuple[float, ...] = (1, 5, 25, 50, 75, 95, 99),
+    outlier_sigmas: float = 6.0,
+) -> MapSummary:
+    """Describe a map by order statistics alone.
+
+    The standard error of the median is half the distance between the order statistics ``sqrt(n)/2`` ranks to
+    either side: the median's rank has that standard deviation, whatever the distribution.
+
+    Args:
+        values: the map; NaN where there is no value.
+        percentiles: in %.
+        outlier_sigmas: outliers lie beyond so many ``1.4826 MAD`` of the median.
+
+    Returns:
+        The summary; NaN throughout where no pixel has a value.
+    """
+    ordered = np.sort(values[np.isfinite(values)], axis=None)
+    n, missing = ordered.size, values.size - ordered.size
+    if n == 0:
+        nan = float("nan")
+        return MapSummary(0, missing, nan, nan, nan, dict.fromkeys(percentiles, nan), nan, nan, 0, 0)
+    median = float(np.median(ordered))
+    half = 0.5 * np.sqrt(n)
+    ranks = np.arange(n)
+    low, high = np.interp([0.5 * (n - 1) - half, 0.5 * (n - 1) + half], ranks, ordered)
+    robust_sd = 1.4826 * float(np.median(np.abs(ordered - median)))
+    limit = outlier_sigmas * robust_sd
+    return MapSummary(
+        n_valid=n,
+        n_missing=missing,
+        median=median,
+        median_stderr=0.5 * float(high - low) if n > 1 else float("nan"),
+        robust_sd=robust_sd,
+        percentiles=dict(zip(percentiles, map(float, np.percentile(ordered, percentiles)), strict=True)),
+        minimum=float(ordered[0]),
+        maximum=float(ordered[-1]),
+        n_low=int(np.count_nonzero(ordered < median - limit)),
+        n_high=int(np.count_nonzero(ordered > median + limit)),
+    )
+
+
+def display_transform(values: FloatArray) -> FloatArray:
+    """Shape a map's histogram into a Beta(2,2) for display (Hendrickson et al. 2023, Appendix C).
+
+    ``x' = F^-1(F~(x))`` with the empirical distribution function F~ and the quantile function of Beta(2,2),
+    ``F(q) = 3 q^2 - 2 q^3``. Equal values share the middle of their ranks, so that ties stay ties and the
+    transform is symmetric under a change of sign.
+
+    Args:
+        values: the map; NaN where there is no value.
+
+    Returns:
+        Values in 0..1, same shape, in the same order; NaN stays NaN.
+    """
+    shown = np.full(values.shape, np.nan)
+    valid = np.isfinite(values)
+    if not valid.any():
+        return shown
+    _, inverse, counts = np.unique(values[valid], return_inverse=True, return_counts=True)
+    rank = (np.cumsum(counts) - 0.5 * counts) / inverse.size
+    # the root of 3 q^2 - 2 q^3 = p in 0..1, in closed form
+    shown[valid] = (0.5 - np.sin(np.arcsin(1.0 - 2.0 * rank) / 3.0))[inverse]
+    return shown

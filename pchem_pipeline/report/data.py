@@ -1,0 +1,163 @@
+"""What the report is made of: plain arrays and dictionaries, no store.
+
+The stage ``report`` fills a :class:`ReportData`; everything in ``render`` draws from it. A part that a run
+does not have is empty here, and ``missing`` says why in words for the reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS
+from pchem_pipeline.report.inspector.inspector_data import InspectorData
+from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
+
+__all__ = ["FEW_CHANNELS", "MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
+
+FloatArray = NDArray[np.float64]
+
+#: A line of fewer channels than this gets a point for each, no histogram.
+FEW_CHANNELS = 32
+
+#: The maps of Appendix C, in the order of the paper.
+MAP_NAMES = ("dark_current", "conversion_gain", "bias", "read_noise_e")
+
+#: The parts of a report that a run may lack; the keys of ``ReportData.missing``.
+PARTS = ("pixels", "maps", "dark_current", "ensemble", "nuced", "electrons", "components", "truth", "methods")
+
+
+@dataclass(frozen=True)
+class PixelFit:
+    """Histogram and fit of one shown pixel.
+
+    Attributes:
+        label: why the pixel is shown, e.g. ``"low read noise, high exposure"``.
+        y, x: position on the sensor; for ready-made histograms ``y = 0`` and ``x`` is the channel.
+        origin: DN of ``counts[0]``.
+        counts: number of frames at each DN, shape (n_bins,).
+        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN),
+            ``read_noise_dn`` (DN) and ``read_noise_e`` (e-); NaN where the fit failed.
+        stderr: standard errors under the same names; may lack some.
+        status: words of ``fit_status``; empty if all is well.
+        goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
+        channel: whether it is a channel of ready-made histograms.
+        mass: probability of each DN under a model with effects; None where the PCD was fitted.
+    """
+
+    label: str
+    y: int
+    x: int
+    origin: int
+    counts: NDArray[np.integer[Any]]
+    parameters: Mapping[str, float]
+    stderr: Mapping[str, float] = field(default_factory=dict)
+    status: str = ""
+    goodness_p: float = float("nan")
+    channel: bool = False
+    mass: NDArray[np.float64] | None = None
+
+    @property
+    def place(self) -> str:
+        """Where the pixel is, in words."""
+        return f"channel {self.x}" if self.channel else f"pixel y = {self.y}, x = {self.x}"
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that a report shows.
+
+    Attributes:
+        title: heading of the report.
+        shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
+        n_frames: frames per pixel, or None if pixels differ or it is unknown.
+        integration_time: seconds, or None.
+        maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
+        fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
+        status_words: bit of ``fit_status`` to its short sentence, gravest first.
+        failed_mask: bits of ``fit_status`` for which the parameters are NaN.
+        pixels: the shown pixels.
+        ensemble: arrays of group ``ensemble``.
+        ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
+        component_cases: name of each row of ``ensemble["component_variance"]``: the parameters held constant.
+        moments: rows ``{name, quantity, unit, predicted, observed, stderr}`` of Appendix A; the last two are
+            None for terms that data do not show.
+        truth: true maps of simulated data.
+        channel_names: names of the channels of ready-made histograms.
+        percentiles: percentiles of the summaries, %.
+        outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
+        allowed_failed: fraction of pixels without a value that is accepted.
+        config_yaml: the resolved configuration.
+        run: identity of the run: name, started, host, versions, seed, ...
+        inputs: one mapping per input file: name, size, hash, ...
+        stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
+            ``peak_memory_bytes``, ``units``, ``notes``.
+        misfits: what the maps say of the goodness of fit: ``tested``, ``misfits``, ``false_discovery_rate``,
+            ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``, ``p``, ``q``), ``pixels_with_outliers``.
+        worst: the pixels of the poorest fit.
+        intervals: by quantity the ends of its profile intervals, (y, x) each, where they were asked for.
+        interval_level: probability that these cover the truth.
+        missing: part (see ``PARTS``) to the reason why it is absent.
+        discrepancy: what the model is missing, or None where nobody looked.
+        inspector: maps and pixels to look at in the browser, or None.
+        methods: content of ``methods.json``, or None where nobody compared.
+        plan: frames that precisions need, or None where no pixel has a value.
+    """
+
+    title: str
+    shape: tuple[int, int]
+    n_frames: int | None = None
+    integration_time: float | None = None
+    maps: Mapping[str, FloatArray] = field(default_factory=dict)
+    fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})
+    failed_mask: int = int(FAILED)
+    pixels: Sequence[PixelFit] = ()
+    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    ensemble_facts: Mapping[str, Any] = field(default_factory=dict)
+    component_cases: Sequence[str] = ()
+    moments: Sequence[Mapping[str, Any]] = ()
+    truth: Mapping[str, FloatArray] = field(default_factory=dict)
+    channel_names: Sequence[str] = ()
+    percentiles: tuple[float, ...] = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
+    outlier_sigmas: float = 6.0
+    allowed_failed: float = 0.1
+    config_yaml: str = ""
+    run: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Sequence[Mapping[str, Any]] = ()
+    stages: Sequence[Mapping[str, Any]] = ()
+    misfits: Mapping[str, Any] = field(default_factory=dict)
+    worst: Sequence[PixelFit] = ()
+    intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    interval_level: float = 0.6827
+    missing: Mapping[str, str] = field(default_factory=dict)
+    discrepancy: DiscrepancyData | None = None
+    inspector: InspectorData | None = None
+    methods: Mapping[str, Any] | None = None
+    plan: Mapping[str, Any] | None = None
+
+    @property
+    def noun(self) -> str:
+        """What an element of a map is called: ``pixel``, or ``channel`` for ready-made histograms."""
+        return "channel" if self.shape[0] == 1 else "pixel"
+
+    @property
+    def few_channels(self) -> bool:
+        """Tell whether this is a line of so few channels that a histogram over them says nothing."""
+        return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
+
+    @property
+    def unfitted(self) -> NDArray[np.bool_]:
+        """Pixels that no fit has reached yet: neither a value nor a reason; shape ``shape``."""
+        status, gain = self.fit.get("fit_status"), self.maps.get("conversion_gain")
+        if status is None or gain is None:
+            return np.zeros(self.shape, dtype=bool)
+        return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
+
+    def has_values(self, name: str) -> bool:
+        """Tell whether a map exists and at least one pixel has a value in it."""
+        return name in self.maps and bool(np.isfinite(self.maps[name]).any())

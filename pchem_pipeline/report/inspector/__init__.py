@@ -1,0 +1,1 @@
+"""The pixel inspector of the report."""

@@ -1,0 +1,193 @@
+"""The inspector's part of the page: facts as JSON, data in base64, the script and its hash for the policy."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import importlib.resources
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup, escape
+
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
+from pchem_pipeline.report.inspector.packing import pack_counts
+from pchem_pipeline.report.style.style import MAP_COLOURS
+from pchem_pipeline.report.style.wording import unit_text
+
+__all__ = ["PANEL_MAPS", "Embedded", "content_policy", "embedded", "map_facts", "script", "served_page"]
+
+#: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
+_CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
+
+#: Values in the table of a pixel, in its order; the others follow below.
+PANEL_MAPS = (
+    "maps/quanta_exposure",
+    "maps/dark_current",
+    "maps/conversion_gain",
+    "maps/bias",
+    "maps/read_noise_dn",
+    "maps/read_noise_e",
+    "maps/analog_read_noise_e",
+)
+
+#: Heading of each group of maps in the list; others have the name of their group.
+_GROUPS = {
+    "maps": "Parameters",
+    "stderr": "Standard errors",
+    "fit": "Fit",
+    "summary": "Time and neighbours",
+    "histogram": "Range of the data",
+    "discrepancy": "What the model is missing",
+    "truth": "Truth of the simulation",
+}
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """What the page holds for the inspector, ready to stand in it: facts as JSON, data by id, the script."""
+
+    facts: Markup
+    blobs: list[tuple[str, Markup]]
+    script: Markup
+
+
+def embedded(data: ReportData) -> Embedded | None:
+    """Return the inspector's part of the page; None where the run has nothing to inspect."""
+    if data.inspector is None:
+        return None
+    parts = [(name, Markup(text)) for name, text in _blobs(data.inspector)]
+    return Embedded(_json_for_html(_facts(data, data.inspector)), parts, Markup(script()))
+
+
+def script() -> str:
+    """Return the inspector's script."""
+    folder = importlib.resources.files("pchem_pipeline.render") / "templates"
+    return (folder / "inspector.js").read_text(encoding="utf-8")
+
+
+def content_policy(text: str | None = None) -> str:
+    """Return the page's content security policy: no network at all, and no script but this one.
+
+    Args:
+        text: the page's script, or None where it has none.
+    """
+    scripts = ""
+    if text is not None:
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+        scripts = f"script-src 'sha256-{digest}'; "
+    return (
+        f"default-src 'none'; {scripts}{_CONNECT_NOWHERE}; img-src data:; style-src 'unsafe-inline'; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def served_page(page: str) -> str | None:
+    """Return a report as ``pchem view`` serves it: it may ask its own server, and knows that there is one.
+
+    Args:
+        page: a ``report.html``.
+
+    Returns:
+        The page; None where it holds no inspector of this version.
+    """
+    before, found, after = page.partition(str(escape(_CONNECT_NOWHERE)))
+    if not found or 'id="inspector-app"' not in after:
+        return None
+    mark, told = '<meta name="color-scheme"', '<meta name="pchem-view" content="yes">'
+    return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{told}\n{mark}", 1)
+
+
+def _json_for_html(content: Any) -> Markup:
+    """Return JSON that may stand inside a ``script`` element: it cannot end it, nor begin a comment."""
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return Markup(text)
+
+
+def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
+    """Return what the script must know beside the maps."""
+    colours = (mpl.colormaps[MAP_COLOURS](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).round().astype(int)
+    sample = shown.sample
+    return {
+        "shape": list(data.shape),
+        "noun": data.noun,
+        "channels": list(data.channel_names),
+        "samples": "samples" if data.shape[0] == 1 else "frames",
+        "statusWords": {str(bit): text for bit, text in data.status_words.items()},
+        "failedMask": data.failed_mask,
+        "model": data.run.get("model", ""),
+        "command": shown.command,
+        "keptTo": shown.kept_to,
+        "colours": "".join(f"{r:02x}{g:02x}{b:02x}" for r, g, b in colours),
+        "maps": [map_facts(entry) for entry in shown.maps],
+        "panel": list(PANEL_MAPS),
+        "sample": {
+            "n": int(sample.index.size),
+            "exact": list(sample.exact),
+            "deciding": sample.deciding is not None,
+            "masses": len(sample.masses),
+        },
+        "notable": [{"words": words, "pixels": list(where)} for words, where in sample.reasons],
+    }
+
+
+def map_facts(entry: MapEntry) -> dict[str, Any]:
+    """Return what the script must know of a map."""
+    group = entry.path.split("/", 1)[0]
+    found: dict[str, Any] = {
+        "path": entry.path,
+        "group": _GROUPS["stderr"] if entry.kind == "stderr" else _GROUPS.get(group, group),
+        "label": entry.label,
+        "unit": unit_text(entry.unit),
+        "sentence": entry.sentence,
+        "kind": entry.kind,
+        "words": {str(key): text for key, text in entry.words.items()},
+        "here": entry.packed is not None or entry.same_as is not None,
+    }
+    if entry.same_as is not None:
+        found |= {"sameAs": entry.same_as[0], "factor": entry.same_as[1]}
+    if entry.packed is not None:
+        scale = entry.packed.scale
+        found |= {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": entry.packed.n_odd}
+    return found
+
+
+def _blobs(shown: InspectorData) -> list[tuple[str, str]]:
+    """Return the data of the page: element id and base64 of each."""
+    found = [
+        (f"map-{i}", _base64(entry.packed.data))
+        for i, entry in enumerate(shown.maps)
+        if entry.packed is not None
+    ]
+    return [*found, ("inspector-sample", _base64(_sample_bytes(shown.sample)))]
+
+
+def _sample_bytes(sample: PixelSample) -> bytes:
+    """Return gzip of: index, origin, bins (4 bytes each), exact maps, deciding parameters, masses, counts."""
+    origin, bins, counts = pack_counts(sample.origin, sample.counts)
+    columns = [*sample.exact.values(), *(sample.deciding if sample.deciding is not None else ())]
+    # a mass runs over the bins of the cut histogram, as the square root of its value in 16 bits
+    roots = [
+        np.rint(65535.0 * np.sqrt(np.clip(np.nan_to_num(mass), 0.0, 1.0)))[first : first + int(n)]
+        for mass, first, n in zip(sample.masses, origin - sample.origin, bins, strict=False)
+    ]
+    parts = [
+        sample.index.astype("<u4").tobytes(),
+        origin.astype("<i4").tobytes(),
+        bins.astype("<u4").tobytes(),
+        *(np.asarray(column).astype("<f4").tobytes() for column in columns),
+        *(root.astype("<u2").tobytes() for root in roots),
+        counts,
+    ]
+    return gzip.compress(b"".join(parts), 6, mtime=0)
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

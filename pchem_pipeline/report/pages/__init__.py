@@ -1,0 +1,1 @@
+"""The pages: sections, texts, tables, JSON."""

@@ -1,0 +1,142 @@
+"""What a comparison of runs is made of: plain numbers and arrays, no store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.checks.run_differences import MapDifference, Reasons
+
+__all__ = ["ArrayRow", "Comparison", "Pair", "RunFacts", "Setting"]
+
+#: How an array of two runs compares: to the bit; within rounding; not; absent in one of them.
+State = Literal["identical", "equal", "changed", "lost", "new"]
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """One run.
+
+    Attributes:
+        label: A, B, ...
+        name: of its store.
+        shape: rows and columns.
+        n_frames: of each pixel, or None.
+        digest: of the content of its input files.
+        sentence: what its maps say, in words.
+        summary: map to median, its standard error and the robust scatter of the pixels, in the map's unit.
+        ensemble: arrays of the ensemble that are drawn.
+        rmse: RMSE of the predictions of the ensemble.
+        pixels: number of pixels with a good fit, with caution, and without a value.
+    """
+
+    label: str
+    name: str
+    shape: tuple[int, int]
+    n_frames: int | None
+    digest: str
+    summary: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    rmse: Mapping[str, float] = field(default_factory=dict)
+    pixels: tuple[int, int, int] = (0, 0, 0)
+
+    @property
+    def words(self) -> str:
+        """Label and name."""
+        return f"{self.label} ({self.name})"
+
+
+@dataclass(frozen=True)
+class ArrayRow:
+    """One array of the store in two runs.
+
+    Attributes:
+        name: its path in the store.
+        state: how it compares.
+        counts: whether a change of it is a change of the results.
+        dtype: of the first run (of the second where it is new).
+        shape: the same.
+        n_values: values compared.
+        n_different: values that differ at all.
+        n_beyond: values that differ by more than rounding.
+        largest: largest absolute difference, in the array's unit.
+        scale: largest absolute value.
+        sha256: digests of the values of both, empty where there are none.
+        why: in words, where shapes or types differ.
+    """
+
+    name: str
+    state: State
+    counts: bool
+    dtype: str
+    shape: tuple[int, ...]
+    n_values: int = 0
+    n_different: int = 0
+    n_beyond: int = 0
+    largest: float = 0.0
+    scale: float = 0.0
+    sha256: tuple[str, str] = ("", "")
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting or a version that differs: its name, both values in words, and the stages that read it."""
+
+    name: str
+    one: str
+    other: str
+    stages: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A run compared with the first one.
+
+    Attributes:
+        one, other: the runs.
+        same_data: both come from the same frames.
+        arrays: every array of the results; empty where the frames differ.
+        maps: map to its difference; empty where the shapes differ.
+        reasons: map to why it changed, for runs on different frames.
+        transitions: quality (good, caution, no value) of one by quality of the other: numbers of pixels.
+        settings: settings that differ.
+        versions: versions of programs and algorithms that differ.
+        changed: whether anything changed.
+        words: what, one sentence each.
+    """
+
+    one: RunFacts
+    other: RunFacts
+    same_data: bool
+    arrays: Sequence[ArrayRow] = ()
+    maps: Mapping[str, MapDifference] = field(default_factory=dict)
+    reasons: Mapping[str, Reasons] = field(default_factory=dict)
+    transitions: Sequence[Sequence[int]] = ()
+    settings: Sequence[Setting] = ()
+    versions: Sequence[Setting] = ()
+    changed: bool = False
+    words: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs against the first of them.
+
+    Attributes:
+        runs: in the order given.
+        pairs: the first with each of the others.
+        tolerance: relative difference that counts as rounding.
+    """
+
+    runs: Sequence[RunFacts]
+    pairs: Sequence[Pair]
+    tolerance: float
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything changed in any of them."""
+        return any(pair.changed for pair in self.pairs)

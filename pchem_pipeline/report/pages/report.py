@@ -1,0 +1,113 @@
+"""The report: one HTML file without network access, ``report.json`` and the files of the figures."""
+
+from __future__ import annotations
+
+import importlib.resources
+from dataclasses import dataclass, field
+
+import jinja2
+
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.discrepancy_exhibits import discrepancy_exhibits
+from pchem_pipeline.report.figures.exhibits import Exhibit, exhibits
+from pchem_pipeline.report.figures.method_exhibits import method_exhibits, method_tables
+from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits, plan_tables
+from pchem_pipeline.report.inspector.inspector import content_policy, embedded, script
+from pchem_pipeline.report.pages.discrepancy_page import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
+from pchem_pipeline.report.pages.report_json import report_json
+from pchem_pipeline.report.pages.sections import Material, page_sections
+from pchem_pipeline.report.pages.tables import result_tables
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import DrawAll, Picture, draw_picture, longest_first, ready_picture
+
+__all__ = ["RenderedReport", "render_report", "template"]
+
+_FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
+_FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
+
+
+@dataclass(frozen=True)
+class RenderedReport:
+    """The files of a report.
+
+    Attributes:
+        html: the page.
+        json: the numbers.
+        figures: file name to content, for the folder ``figures``.
+        pages: further pages, by file name.
+    """
+
+    html: str
+    json: str
+    figures: dict[str, bytes] = field(default_factory=dict)
+    pages: dict[str, str] = field(default_factory=dict)
+
+
+def render_report(
+    data: ReportData, settings: ReportSettings | None = None, draw: DrawAll | None = None
+) -> RenderedReport:
+    """Draw everything and return the files of the report; nothing is written.
+
+    Args:
+        data: what the run found.
+        settings: section ``report``; None for the defaults.
+        draw: draws all figures at once, for example by several workers; None: one after the other, here.
+    """
+    settings = settings or ReportSettings()
+    figures: dict[str, bytes] = {}
+    shown = [*exhibits(data, settings), *method_exhibits(data), *plan_exhibits(data)]
+    others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
+    drawn = {} if draw is None else draw(longest_first([*shown, *others]), settings)
+
+    def picture(exhibit: Exhibit) -> Picture:
+        if exhibit.name in drawn:
+            return ready_picture(exhibit, drawn[exhibit.name], figures)
+        return draw_picture(exhibit, settings, figures)
+
+    pictures = [picture(exhibit) for exhibit in shown]
+    tables = [*result_tables(data), *method_tables(data), *plan_tables(data)]
+    view: DiscrepancyView[Picture] | None = None
+    if data.discrepancy is not None:
+        view = discrepancy_view(data.discrepancy, picture)
+    inspector = embedded(data)
+    page = template("report.html.j2").render(
+        title=data.title,
+        data=data,
+        flag_words=_FLAG_WORDS,
+        flag_signs=_FLAG_SIGNS,
+        inspector=inspector,
+        policy=content_policy(script() if inspector else None),
+        sections=page_sections(Material(data, settings, pictures, tables, view)),
+    )
+    pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
+    return RenderedReport(page, report_json(data), figures, pages)
+
+
+def _discrepancy_page(data: ReportData, view: DiscrepancyView[Picture]) -> str:
+    about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
+    if data.n_frames:
+        about += f"{', ' if about else ''}{data.n_frames:,} frames"
+    return template("discrepancy.html.j2").render(
+        title=data.title, about=about, view=view, flag_words=_FLAG_WORDS, flag_signs=_FLAG_SIGNS
+    )
+
+
+def template(name: str) -> jinja2.Template:
+    """Return a template of this package's pages."""
+    folder = importlib.resources.files("pchem_pipeline.render") / "templates"
+    environment = jinja2.Environment(
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=jinja2.FunctionLoader(lambda each: (folder / each).read_text(encoding="utf-8")),
+    )
+    environment.filters["together"] = _together
+    return environment.get_template(name)
+
+
+def _together(text: str) -> str:
+    """Keep numbers and their units on one line."""
+    for unit in ("%", "e⁻", "DN", "±"):
+        text = text.replace(f" {unit}", f"\u00a0{unit}")
+    return text.replace("± ", "±\u00a0")

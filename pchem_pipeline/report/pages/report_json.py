@@ -1,0 +1,163 @@
+"""``report.json``: the numbers of the report for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.maps.maps import status_counts
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.findings import headline
+from pchem_pipeline.report.pages.verdict import flags, pixel_counts, sentence, summaries
+from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.report.style.wording import stored_unit
+
+__all__ = ["REPORT_VERSION", "report_json", "report_numbers"]
+
+#: Version of the layout of ``report.json``.
+REPORT_VERSION = 1
+
+
+def report_numbers(data: ReportData) -> dict[str, Any]:
+    """Return the numbers of a report as JSON data; what is not known is None.
+
+    The keys ``summary``, ``ensemble`` (with ``rmse``) and ``fit_status`` are always there.
+    """
+    facts = dict(data.ensemble_facts)
+    rmse = dict(facts.pop("rmse", {}))
+    numbers: dict[str, Any] = _plain(
+        {
+            "report_version": REPORT_VERSION,
+            "title": data.title,
+            "sentence": sentence(data),
+            "flags": [{"level": flag.level, "text": flag.text} for flag in flags(data)],
+            "sensor": {
+                "ny": data.shape[0],
+                "nx": data.shape[1],
+                "n_frames": data.n_frames,
+                "integration_time": data.integration_time,
+            },
+            "summary": _summary(data),
+            "fit_status": _fit_status(data),
+            "goodness_of_fit": _goodness(data),
+            "ensemble": {"rmse": rmse, **facts},
+            "moments": list(data.moments),
+            "electron_numbers": _electron_numbers(data),
+            "truth": _truth(data),
+            "missing": dict(data.missing),
+            "discrepancy": _discrepancy(data),
+            "run": dict(data.run),
+            "inputs": list(data.inputs),
+            "stages": list(data.stages),
+        }
+    )
+    return numbers
+
+
+def report_json(data: ReportData) -> str:
+    """Return ``report.json`` as text: strict JSON (no NaN), sorted as written, ending in a newline."""
+    return json.dumps(report_numbers(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _summary(data: ReportData) -> dict[str, Any]:
+    found = {}
+    for name, summary in summaries(data).items():
+        errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
+        found[name] = {
+            "unit": stored_unit(name),
+            "median": summary.median,
+            "median_stderr": summary.median_stderr,
+            "robust_sd": summary.robust_sd,
+            "pixel_stderr": float(np.median(errors)) if errors.size else None,
+            "percentiles": {f"{p:g}": value for p, value in summary.percentiles.items()},
+            "minimum": summary.minimum,
+            "maximum": summary.maximum,
+            "n_pixels": summary.n_valid,
+            "n_without_value": summary.n_missing,
+            "n_outliers_low": summary.n_low,
+            "n_outliers_high": summary.n_high,
+        }
+    return found
+
+
+def _fit_status(data: ReportData) -> dict[str, Any]:
+    pixels = pixel_counts(data)
+    status = data.fit.get("fit_status")
+    reasons = {} if status is None else status_counts(status)
+    return {
+        "n_pixels": pixels.total,
+        "n_good": pixels.fitted - pixels.caution,
+        "n_caution": pixels.caution,
+        "n_failed": pixels.failed,
+        "n_unfitted": int(data.unfitted.sum()),
+        "reasons": {
+            bit.name.lower(): {
+                "pixels": reasons.get(bit.name.lower(), 0),
+                "meaning": data.status_words.get(int(bit), ""),
+                "failed": bool(int(bit) & data.failed_mask),
+            }
+            for bit in FitStatus
+            if bit.name and int(bit)
+        },
+    }
+
+
+def _goodness(data: ReportData) -> dict[str, Any]:
+    p = finite(data.fit.get("goodness_p", np.empty(0)))
+    return {
+        "n_pixels": int(p.size),
+        "median_p": float(np.median(p)) if p.size else None,
+        "fraction_below_0.001": float((p < 1e-3).mean()) if p.size else None,
+    }
+
+
+def _electron_numbers(data: ReportData) -> dict[str, Any]:
+    names = ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
+    return {name.removeprefix("electron_"): data.ensemble[name] for name in names if name in data.ensemble}
+
+
+def _truth(data: ReportData) -> dict[str, Any]:
+    found = {}
+    for name, truth in data.truth.items():
+        if name not in data.maps:
+            continue
+        error = data.maps[name] - truth
+        known = finite(error)
+        pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
+        found[name] = {
+            "median": float(np.median(truth)),
+            "rmse": float(np.sqrt(np.mean(known**2))) if known.size else None,
+            "pull_mean": float(pull.mean()) if pull.size else None,
+            "pull_sd": float(pull.std()) if pull.size else None,
+        }
+    return found
+
+
+def _discrepancy(data: ReportData) -> dict[str, Any] | None:
+    """Return the verdict; its evidence is in ``discrepancy.json``."""
+    if data.discrepancy is None:
+        return None
+    found = data.discrepancy.found
+    return {"verdict": found.verdict, "sentence": headline(found), "effects": found.effects}
+
+
+def _plain(value: Any) -> Any:
+    """Turn numpy scalars and arrays, tuples and odd objects into what JSON knows; NaN into None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int | bool):
+        return value
+    if isinstance(value, Sequence):
+        return [_plain(item) for item in value]
+    return str(value)

@@ -1,0 +1,434 @@
+"""The tables of a report, as plain rows of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.map_figures import status_counts
+from pchem_pipeline.report.figures.trust_figures import noise_shares
+from pchem_pipeline.report.pages.verdict import summaries
+from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.report.style.wording import (
+    count,
+    measured,
+    percent,
+    scientific,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
+
+__all__ = ["Table", "provenance_tables", "result_tables", "size_words"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: the first cell of each row is its heading; ``section`` is the id of the one that shows it."""
+
+    id: str
+    title: str
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    section: str = "tables"
+
+
+def result_tables(data: ReportData) -> list[Table]:
+    """Return the tables of results that the data allow."""
+    makers = (
+        _channels, _parameters, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals, _status,
+    )  # fmt: skip
+    return [table for make in makers if (table := make(data)).rows]
+
+
+def provenance_tables(data: ReportData) -> list[Table]:
+    """Return the tables of what was run on what."""
+    return [table for make in (_run, _stages, _inputs) if (table := make(data)).rows]
+
+
+def size_words(size: float) -> str:
+    """Return a number of bytes in MB or GB."""
+    return (
+        f"{size / 1e9:.2f} GB"
+        if size >= 1e9
+        else f"{size / 1e6:.1f} MB"
+        if size >= 1e5
+        else f"{size / 1e3:.1f} kB"
+    )
+
+
+def _parameters(data: ReportData) -> Table:
+    rows = []
+    found = summaries(data)
+    for name, summary in ((name, found[name]) for name in _ORDER if data.has_values(name)):
+        _, words, unit = symbol(name)
+        errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
+        values = [short(value, 4) for value in summary.percentiles.values()]
+        rows.append(
+            (
+                f"{words} ({unit})",
+                measured(summary.median, summary.median_stderr),
+                short(summary.robust_sd),
+                short(float(np.median(errors)), 2) if errors.size else "not known",
+                *values,
+                f"{summary.n_low + summary.n_high:,}",
+                f"{summary.n_valid:,}",
+            )
+        )
+    return Table(
+        "parameters",
+        "Parameters",
+        f"Median over the {data.noun}s with its standard error, robust standard deviation between them "
+        f"(1.4826 MAD), median standard error of one {data.noun}, percentiles, and outliers beyond "
+        f"{data.outlier_sigmas:g} robust standard deviations.",
+        (
+            "parameter",
+            "median",
+            "spread",
+            "error of a pixel",
+            *(f"{p:g} %" for p in data.percentiles),
+            "outliers",
+            "pixels",
+        ),
+        tuple(rows),
+    )
+
+
+#: More channels than these are in the maps of the store only.
+_MOST_CHANNELS = 100
+
+
+def _channels(data: ReportData) -> Table:
+    names = [name for name in _ORDER if data.has_values(name)]
+    rows = []
+    if data.shape[0] == 1 and data.shape[1] <= _MOST_CHANNELS:
+        status = np.ravel(data.fit.get("fit_status", np.zeros(data.shape, dtype=np.uint16)))
+        for x in range(data.shape[1]):
+            label = data.channel_names[x] if x < len(data.channel_names) else ""
+            values = []
+            for name in names:
+                stderr = data.maps.get(f"{name}_stderr")
+                error = float(stderr[0, x]) if stderr is not None else float("nan")
+                values.append(measured(float(data.maps[name][0, x]), error))
+            words = "; ".join(text for bit, text in data.status_words.items() if int(status[x]) & bit)
+            rows.append((f"{x} {label}".strip(), *values, words or "good fit"))
+    head = tuple(f"{symbol(name)[1]} ({symbol(name)[2]})" for name in names)
+    return Table(
+        "channels",
+        "Channels",
+        "Estimates with their standard errors.",
+        ("channel", *head, "fit status"),
+        tuple(rows),
+    )
+
+
+_ORDER = (
+    "quanta_exposure",
+    "dark_current",
+    "conversion_gain",
+    "bias",
+    "read_noise_dn",
+    "read_noise_e",
+    "analog_read_noise_e",
+)
+
+
+def _against_truth(data: ReportData) -> Table:
+    rows = []
+    for name, truth in data.truth.items():
+        if name not in data.maps:
+            continue
+        error = data.maps[name] - truth
+        known = finite(error)
+        if known.size == 0:
+            continue
+        pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
+        _, words, unit = symbol(name)
+        rows.append(
+            (
+                f"{words} ({unit})",
+                short(float(np.median(truth)), 4),
+                short(float(np.median(data.maps[name][np.isfinite(data.maps[name])])), 4),
+                short(float(np.sqrt(np.mean(known**2)))),
+                measured(float(pull.mean()), float(1 / np.sqrt(pull.size))) if pull.size else "not known",
+                measured(float(pull.std()), float(1 / np.sqrt(2 * pull.size))) if pull.size else "not known",
+            )
+        )
+    return Table(
+        "truth",
+        "Estimates against the truth",
+        "Simulated data only. Pulls are (estimate − truth) / standard error: mean 0 and standard deviation 1 "
+        "if estimates are unbiased and errors right.",
+        ("parameter", "true median", "estimated median", "RMSE", "mean pull", "sd of pulls"),
+        tuple(rows),
+    )
+
+
+_RMSE_ROWS = (
+    ("epcd_exact", "raw, exact mean over pixels", "noise_floor"),
+    ("epcd_dependent", "raw, dependent parameters", "noise_floor"),
+    ("epcd_independent", "raw, independent parameters", "noise_floor"),
+    ("nuced_exact", "NUCed, exact mean over pixels", "nuced_noise_floor"),
+    ("nuced_dependent", "NUCed, dependent parameters", "nuced_noise_floor"),
+    ("nuced_independent", "NUCed, independent parameters", "nuced_noise_floor"),
+)
+
+
+def _rmse(data: ReportData) -> Table:
+    rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
+    rows = []
+    for name, words, floor_name in _RMSE_ROWS:
+        if rmse.get(name) is None:
+            continue
+        floor = rmse.get(floor_name)
+        unit = "1/DN" if name.startswith("epcd") else "1/e⁻"
+        rows.append(
+            (
+                words,
+                f"{scientific(rmse[name], 3)} {unit}",
+                f"{scientific(floor, 3)} {unit}" if floor else "not known",
+                short(rmse[name] / floor) if floor else "not known",
+            )
+        )
+    return Table(
+        "rmse",
+        "Ensemble prediction against data",
+        "Root mean square difference of densities, and what sampling noise alone would give.",
+        ("prediction", "RMSE", "sampling noise", "ratio"),
+        tuple(rows),
+        section="ensemble",
+    )
+
+
+def _moments(data: ReportData) -> Table:
+    rows = []
+    for row in data.moments:
+        unit = unit_text(str(row.get("unit", "")))
+        observed, error = row.get("observed"), row.get("stderr")
+        predicted = float(row["predicted"])
+        if observed is None:
+            seen, difference = "", ""
+        elif error:
+            seen = measured(float(observed), float(error))
+            difference = signed((float(observed) - predicted) / float(error))
+        else:
+            seen, difference = short(float(observed), 5), ""
+        rows.append(
+            (
+                f"{row['quantity']} ({unit})" if unit else str(row["quantity"]),
+                short(predicted, 6),
+                seen,
+                difference,
+            )
+        )
+    return Table(
+        "moments",
+        "Moments of the ensemble",
+        "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data, with "
+        "the standard error of the data.",
+        ("moment", "from the maps", "from the data", "difference / standard error"),
+        tuple(rows),
+        section="ensemble",
+    )
+
+
+#: Larger electron numbers are in ``report.json`` only.
+_MOST_NUMBERS = 24
+
+
+def _electrons(data: ReportData) -> Table:
+    arrays, facts = data.ensemble, data.ensemble_facts
+    if "electron_mass" not in arrays:
+        return Table("electron-table", "", "", (), ())
+    k = np.asarray(arrays["k"])
+    mass, pmf = np.asarray(arrays["electron_mass"]), np.asarray(arrays["electron_pmf"])
+    expected = np.asarray(arrays["electron_pmf_map"]) if "electron_pmf_map" in arrays else None
+    seen = np.flatnonzero(mass > 1e-3)
+    last = int(seen[-1]) if seen.size else 0
+    samples = float(np.sum(arrays["electron_counts"])) if "electron_counts" in arrays else 0.0
+    errors = np.sqrt(mass * (1.0 - mass) / samples) if samples else np.full(mass.shape, np.nan)
+    rows = [
+        (
+            str(int(k[i])),
+            measured(float(mass[i]), float(errors[i])) if samples else f"{mass[i]:.5f}",
+            f"{pmf[i]:.5f}",
+            f"{expected[i]:.5f}" if expected is not None else "",
+        )
+        for i in range(min(last + 1, _MOST_NUMBERS))
+    ]
+    words = ""
+    if facts.get("error_rate") is not None:
+        rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
+        words += f" Against the true electron numbers, {measured(rate, error)} % are wrong."
+    if facts.get("expected_error_rate") is not None:
+        expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
+        words += f" The fitted parameters lead one to expect {expected_errors} wrong."
+    return Table(
+        "electron-table",
+        "Electron numbers",
+        f"Share of each estimated electron number, and its predictions.{words}",
+        ("k", "estimated", "predicted p(k)", "estimator should show"),
+        tuple(rows),
+        section="electrons",
+    )
+
+
+def _misfits(data: ReportData) -> Table:
+    facts = data.misfits
+    rows = [
+        (
+            f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
+            f"{row['chi2']:.1f}",
+            f"{row['dof']:.1f}",
+            scientific(float(row["p"])),
+            scientific(float(row["q"])),
+            "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",
+        )
+        for row in facts.get("worst", ())
+    ]
+    if not rows:
+        return Table("misfits", "", "", (), ())
+    return Table(
+        "misfits",
+        f"Worst {data.noun}s",
+        f"Of {int(facts['tested']):,} tested {data.noun}s, {int(facts['misfits']):,} disagree with the model "
+        f"at a rate of false discoveries of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
+        f"{count(int(facts['pixels_with_outliers']), data.noun)} lost samples to the tail guard, at most "
+        f"{percent(float(facts['largest_outlier_share']), 1.0)} of their frames.",
+        (data.noun, "χ²", "degrees of freedom", "p", "q", "misfit"),
+        tuple(rows),
+        section="goodness",
+    )
+
+
+def _intervals(data: ReportData) -> Table:
+    rows = []
+    shares = noise_shares(data.maps, _ORDER)
+    for name in (name for name in _ORDER if data.has_values(name) and f"{name}_stderr" in data.maps):
+        _, words, unit = symbol(name)
+        values, errors = data.maps[name], data.maps[f"{name}_stderr"]
+        known = finite(errors)
+        if not known.size:
+            continue
+        ends = ["", ""]
+        if name in data.intervals:
+            low, high = data.intervals[name]
+            ends = [short(float(np.nanmedian(part / errors)), 3) for part in (values - low, high - values)]
+        rows.append(
+            (
+                f"{words} ({unit})",
+                short(float(np.median(known)), 3),
+                percent(float(np.median(known)), abs(float(np.median(finite(values))))),
+                percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
+                *(ends if data.intervals else ()),
+            )
+        )
+    profile = ("profile: below", "profile: above") if data.intervals else ()
+    head = ("quantity", f"error of a {data.noun}", "of the value", "noise in the map", *profile)
+    words = (
+        f" Ends of the {100 * data.interval_level:g} % profile-likelihood intervals below and above the "
+        "estimate, in standard errors."
+    )
+    return Table(
+        "uncertainties",
+        "Uncertainties",
+        f"Median standard error of a {data.noun}, and the part of the map's variance that it makes."
+        + (words if data.intervals else ""),
+        head,
+        tuple(rows),
+        section="uncertainty",
+    )
+
+
+def _status(data: ReportData) -> Table:
+    status = data.fit.get("fit_status")
+    if status is None:
+        return Table("failures", "", "", (), ())
+    total = status.size
+    unfitted = int(data.unfitted.sum())
+    good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
+    rows: list[tuple[str, ...]] = [("good fit", f"{good:,}", percent(good, total), f"{good:,}")]
+    if unfitted:
+        rows.append(("not fitted yet", f"{unfitted:,}", percent(unfitted, total), "none"))
+    kept = status[(status & data.failed_mask) == 0]
+    for bit, text, n in status_counts(status, data.status_words):
+        usable = int(((kept & bit) != 0).sum())
+        rows.append((text, f"{n:,}", percent(n, total), f"{usable:,}, with caution" if usable else "none"))
+    return Table(
+        "failures",
+        "Fit status by reason",
+        "A pixel can have several reasons and then counts for each.",
+        ("reason", "pixels", "share", "of them with a value"),
+        tuple(rows),
+        section="status",
+    )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows += _flat(value, f"{prefix}{key}: ")
+        elif isinstance(value, Sequence) and not isinstance(value, str):
+            rows.append((f"{prefix}{key}", ", ".join(str(item) for item in value)))
+        else:
+            rows.append((f"{prefix}{key}", "not known" if value is None else str(value)))
+    return rows
+
+
+def _run(data: ReportData) -> Table:
+    rows = _flat(data.run)
+    return Table("run", "Run", "What made this report.", ("item", "value"), tuple(rows))
+
+
+def _stages(data: ReportData) -> Table:
+    rows = []
+    for stage in data.stages:
+        memory = stage.get("peak_memory_bytes")
+        rows.append(
+            (
+                str(stage.get("stage", "")),
+                str(stage.get("state", "")),
+                f"{float(stage['seconds']):.1f} s" if stage.get("seconds") is not None else "",
+                f"{float(stage['cpu_seconds']):.1f} s" if stage.get("cpu_seconds") is not None else "",
+                size_words(float(memory)) if memory else "",
+                str(stage.get("started", "")),
+            )
+        )
+    return Table(
+        "stages",
+        "Stages",
+        "Wall time, CPU time and largest resident memory of a process.",
+        ("stage", "state", "wall", "CPU", "peak memory", "started (UTC)"),
+        tuple(rows),
+    )
+
+
+#: Files beyond this number are counted, not listed.
+_MOST_FILES = 200
+
+
+def _inputs(data: ReportData) -> Table:
+    rows = [
+        (
+            str(entry.get("name", "")),
+            size_words(float(entry["size"])) if entry.get("size") is not None else "",
+            str(entry.get("hash", "")),
+        )
+        for entry in data.inputs[:_MOST_FILES]
+    ]
+    more = len(data.inputs) - _MOST_FILES
+    words = f" The first {_MOST_FILES} of {len(data.inputs):,} files." if more > 0 else ""
+    return Table(
+        "inputs",
+        "Input files",
+        f"Names, sizes and content hashes of the files that were read.{words}",
+        ("file", "size", "hash"),
+        tuple(rows),
+    )

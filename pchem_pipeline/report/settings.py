@@ -1,0 +1,46 @@
+"""The YAML section ``report``: what the report shows and how figures are saved."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from pchem_pipeline.base.settings import Section
+
+__all__ = ["ReportSettings"]
+
+PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+
+
+class ReportSettings(Section):
+    """Settings of the stage ``report``."""
+
+    pixels: tuple[PixelPosition, ...] = Field(
+        default=(),
+        max_length=16,
+        description="pixels whose fits are drawn, [[y, x], ...]; empty: four pixels at low and high "
+        "read noise and low and high quanta exposure",
+    )
+    figure_formats: tuple[Literal["svg", "png", "pdf"], ...] = Field(
+        default=("svg", "png"),
+        description="formats of the files in figures/: svg, png, pdf; empty: no files, only the HTML",
+    )
+    dpi: int = Field(
+        default=300, ge=72, le=1200, description="resolution of PNG figures and of maps, dots per inch"
+    )
+    map_stretch: Literal["beta", "linear"] = Field(
+        default="beta",
+        description="colours of the maps: 'beta' follows the rank of a pixel (Beta(2,2) transform), "
+        "'linear' its value between the 1st and the 99th percentile",
+    )
+    histogram_bins: int = Field(
+        default=128, ge=8, le=1024, description="largest number of bins in histograms of maps"
+    )
+
+    @field_validator("figure_formats")
+    @classmethod
+    def _no_doubles(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(value)) != len(value):
+            raise ValueError("a format is listed twice; list each of svg, png, pdf at most once")
+        return value

@@ -1,0 +1,1 @@
+"""One look: palette, axes, map stretch, numbers in words, pictures as files."""

@@ -1,0 +1,61 @@
+"""What the run knows of the sensor once its input was looked at."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from pchem_pipeline.base.errors import StoreError, quoted
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["SensorInfo"]
+
+
+@dataclass(frozen=True)
+class SensorInfo:
+    """The input as the later stages see it; kept in the attributes of the group ``frames``.
+
+    Attributes:
+        kind: frames, or ready-made histograms (no order in time, no neighbours).
+        n_frames: number of frames (for histograms: the largest number of samples of a channel).
+        ny: rows.
+        nx: columns (for histograms: channels).
+        dtype: numpy name of the DN type.
+        bit_depth: bits of the ADC, if known; codes at its limits count as clipped.
+        integration_time: seconds per frame as the files say, if they do.
+        mode: copy (``frames/dn`` holds the frames) or reference (they stay in the camera files).
+        identity: names, sizes and content hashes of the files.
+        names: names of the channels of ready-made histograms.
+    """
+
+    kind: Literal["frames", "histograms"]
+    n_frames: int
+    ny: int
+    nx: int
+    dtype: str
+    bit_depth: int | None
+    integration_time: float | None
+    mode: Literal["copy", "reference"]
+    identity: dict[str, Any]
+    names: tuple[str, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.ny, self.nx
+
+    def write(self, store: RunStore) -> None:
+        """Keep this in the store."""
+        store.set_attributes("frames", {"sensor": {**asdict(self), "names": list(self.names)}})
+
+    @classmethod
+    def read(cls, store: RunStore) -> SensorInfo:
+        """Return what ``ingest`` kept.
+
+        Raises:
+            StoreError: the run has no input yet.
+        """
+        content = store.attributes("frames").get("sensor")
+        if content is None:
+            raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
+        return cls(**{**content, "names": tuple(content["names"])})

@@ -1,0 +1,60 @@
+"""Ctrl-C and SIGTERM: finish the running tiles, write their markers, and go."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from pchem_pipeline.base.errors import ExitCode, PchEmError
+
+__all__ = ["InterruptedRunError", "StopRequest", "stop_on_signals"]
+
+
+class InterruptedRunError(PchEmError):
+    """The user or the system asked the run to stop; what was finished is kept."""
+
+    def __init__(self, number: int) -> None:
+        name = signal.Signals(number).name
+        super().__init__(f"stopped by {name}; finished tiles are kept, run the same command again to go on")
+        self.exit_code = ExitCode.SIGTERM if number == signal.SIGTERM else ExitCode.SIGINT
+
+
+class StopRequest:
+    """Remembers the signal that asked for a stop."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def check(self) -> None:
+        """Raise if a stop was asked for.
+
+        Raises:
+            InterruptedRunError: a signal arrived.
+        """
+        if self.signal is not None:
+            raise InterruptedRunError(self.signal)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[StopRequest]:
+    """Turn the first SIGINT or SIGTERM into a request; a second one ends the process at once."""
+    request = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if request.signal is not None:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
+        request.signal = number
+
+    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield request
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)

@@ -1,0 +1,357 @@
+"""What every stage is made of, and what it is given.
+
+A stage is a module of this package with
+
+* ``NAME`` (``"fit"``) and ``VERSION`` (raised when its algorithm changes, which makes old results stale);
+* ``UPSTREAM``: the stages whose results it needs; ``SETTINGS``: the dotted config keys that it reads
+  (``("fit", "run.tile")``): a change of any of them, or upstream, makes its results stale;
+* ``READS`` and ``WRITES``: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``); what it
+  writes is removed when it starts anew;
+* a pure ``*_tile`` function, arrays in and arrays out;
+* ``run(context)``: makes its arrays (``context.create``), then calls
+  ``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
+  ``functools.partial`` of one) that takes a unit, opens the store by path
+  (``open_store(path)``), writes whole chunks and returns a small JSON-able summary. The marker of a
+  unit is set, in the worker, after its task returned;
+* optionally ``identity(context)``: JSON data that joins its fingerprint (the content of the camera files).
+
+The first four, and ``identity``, are declared in :mod:`pchem_pipeline.run.declared`, which is light.
+
+A unit is anything picklable with ``key``, the words for messages, and ``keys``, the markers that it sets: a
+:class:`~pchem_pipeline.store.tiles.Tile`, a band of tiles, or a block of frames. A stage without
+parallel units has one, ``WHOLE``, which is done in this process.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from pchem_pipeline.base.errors import InputError, PchEmError, StoreError
+from pchem_pipeline.base.variables import LENGTHS, VARIABLES
+from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import StopRequest
+from pchem_pipeline.store.files import is_fatal
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid
+
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.sequence import FrameSequence
+
+__all__ = ["WHOLE", "Options", "StageContext", "Swept", "Unit", "nothing_left", "open_store"]
+
+
+class Unit(Protocol):
+    """A piece of a stage's work."""
+
+    @property
+    def key(self) -> str:
+        """What messages call it."""
+        ...
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The markers that it sets when it is done."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Whole:
+    key: str = "all"
+    keys: tuple[str, ...] = ("all",)
+
+
+#: The only unit of a stage that is not divided.
+WHOLE = _Whole()
+
+AnyUnit = TypeVar("AnyUnit", bound=Unit)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line adds to the configuration; none of it changes a result."""
+
+    force: bool = False
+    dry_run: bool = False
+    tiles: str | None = None
+    roi: tuple[int, int, int, int] | None = None
+
+
+@functools.lru_cache(maxsize=8)
+def open_store(path: Path) -> RunStore:
+    """Return the store at ``path``, writable, opened once per process."""
+    return RunStore.open(path, writable=True)
+
+
+@dataclass(frozen=True)
+class MarkedTask:
+    """A task that sets the markers of its unit once it is done, in the worker."""
+
+    store: Path
+    stage: str
+    fingerprint: str
+    task: Callable[[Any], Mapping[str, Any] | None]
+
+    def __call__(self, unit: Unit) -> Mapping[str, Any]:
+        """Do the unit, then mark it."""
+        summary = dict(self.task(unit) or {})
+        records = open_store(self.store).records
+        for key in unit.keys:
+            records.mark(self.stage, self.fingerprint, key, summary)
+        return summary
+
+
+@dataclass(frozen=True)
+class Swept:
+    """What one pass over the input did for several stages at once; they have but to mark their units.
+
+    Attributes:
+        stages: the stages whose arrays are written.
+        frames: the opened camera files.
+        clock: wall and CPU time when the pass began.
+    """
+
+    stages: frozenset[str]
+    frames: FrameSequence
+    clock: tuple[float, float]
+
+
+def nothing_left(unit: Any) -> dict[str, Any]:
+    """Be the task of units whose work is done."""
+    return {}
+
+
+@dataclass
+class StageContext:
+    """All that a stage is given.
+
+    Attributes:
+        config: the whole configuration.
+        base_dir: folder to which relative paths of the configuration refer.
+        store: the run's store, writable.
+        executor: who does the work.
+        reporter: where to say what happens.
+        stop: raised signals; checked between units.
+        options: of the command line.
+        stage: name of the running stage.
+        fingerprint: of the running stage.
+        fresh: True where the stage starts anew and must create its arrays.
+        failed: unit key to reason, filled by :meth:`run_units`.
+        n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
+        config_path: the YAML file of the run, where it has one.
+        notes: remarks for the report, filled by the stage.
+        swept: what the one pass over the input has done, where there was one.
+    """
+
+    config: RunConfig
+    base_dir: Path
+    store: RunStore
+    executor: Executor
+    reporter: Reporter
+    stop: StopRequest
+    options: Options = field(default_factory=Options)
+    stage: str = ""
+    fingerprint: str = ""
+    fresh: bool = True
+    failed: dict[str, str] = field(default_factory=dict)
+    n_keys: int = 0
+    config_path: Path | None = None
+    notes: list[str] = field(default_factory=list)
+    swept: Swept | None = None
+
+    @property
+    def is_swept(self) -> bool:
+        """The arrays of the running stage were made beforehand, by the one pass over the input."""
+        return self.swept is not None and self.stage in self.swept.stages
+
+    @property
+    def sensor(self) -> SensorInfo:
+        """The input as ``ingest`` found it.
+
+        Raises:
+            StoreError: nothing was ingested yet.
+        """
+        return SensorInfo.read(self.store)
+
+    @property
+    def integration_time(self) -> float | None:
+        """Seconds per frame: from the configuration, else from the files."""
+        return self.config.input.integration_time or self.sensor.integration_time
+
+    @property
+    def adc_limits(self) -> tuple[int, int] | None:
+        """First and last code of the ADC, or None where the bit depth is not known."""
+        depth = self.config.input.bit_depth or self.sensor.bit_depth
+        return None if depth is None else (0, 2**depth - 1)
+
+    def tiles(self) -> list[Tile]:
+        """Return all tiles of the sensor."""
+        return tile_grid(self.sensor.shape, self.config.run.tile)
+
+    def tiles_done(self, stage: str) -> set[str]:
+        """Return the keys of the tiles that an upstream stage has finished."""
+        record = self.store.records.read(stage)
+        return set() if record is None else self.store.records.done(stage, record.fingerprint)
+
+    def note(self, text: str) -> None:
+        """Warn once, and keep the remark for the report."""
+        self.notes.append(text)
+        self.reporter.warning(text, stage=self.stage)
+
+    def create(
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        *,
+        chunks: tuple[int, ...],
+        dtype: Any = None,
+        **attributes: Any,
+    ) -> None:
+        """Make an array of this stage, unless the stage resumes and has it."""
+        if self.fresh or not self.store.has(name):
+            self.store.create_array(name, shape, chunks=chunks, dtype=dtype, attributes=attributes)
+
+    def create_maps(self, names: Sequence[str], **attributes: Any) -> None:
+        """Make arrays whose first dimensions are (y, x), one tile per chunk; further ones are whole."""
+        tile = self.config.run.tile
+        for name in names:
+            rest = tuple(LENGTHS[dim] for dim in VARIABLES[name].dims[2:])
+            self.create(name, (*self.sensor.shape, *rest), chunks=(tile, tile, *rest), **attributes)
+
+    def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
+        """Return the units that ``--tiles`` and ``--roi`` choose (all of them without these options)."""
+        if self.options.tiles is None and self.options.roi is None:
+            return list(units)
+        grid = self.tiles()
+        chosen = {t.key for t in (parse_tiles(self.options.tiles, grid) if self.options.tiles else grid)}
+        if self.options.roi is not None:
+            chosen &= {t.key for t in roi_tiles(self.options.roi, grid)}
+        return [unit for unit in units if unit is WHOLE or chosen & set(unit.keys)]
+
+    def pending(self, units: Sequence[AnyUnit], *, by_tiles: bool = True) -> list[AnyUnit]:
+        """Return the chosen units that are not done; with ``--force`` all the chosen ones.
+
+        Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
+        """
+        done = self.store.records.done(self.stage, self.fingerprint)
+        some_tiles = self.options.tiles is not None or self.options.roi is not None
+        chosen = self.selected(units) if by_tiles else list(units)
+        if self.options.force and (by_tiles or not some_tiles):
+            return chosen
+        return [unit for unit in chosen if not set(unit.keys) <= done]
+
+    def run_units(
+        self,
+        units: Sequence[AnyUnit],
+        task: Callable[[AnyUnit], Mapping[str, Any] | None],
+        *,
+        unit_name: str = "tile",
+        needs: str | None = None,
+        by_tiles: bool = True,
+        total: int | None = None,
+    ) -> dict[str, dict[str, Any]]:
+        """Run ``task`` on every unit that is chosen and not done yet, and mark each.
+
+        Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
+        every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same
+        tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
+        ``--tiles`` and ``--roi`` do not choose, such as blocks of frames. A stage that learns only on its way
+        what its units are calls this several times and says in ``total`` how many markers that makes so far;
+        it resumes also under ``--force``, which has made it start anew. Returns the summaries of all
+        finished units by key, earlier runs included.
+
+        Raises:
+            InterruptedRunError: a signal asked for a stop; running units were finished.
+            InputError: the camera files are gone.
+            StoreError: the store cannot be written.
+        """
+        self._know_total(sum(len(unit.keys) for unit in units) if total is None else total)
+        todo = self._ready(self._pending_of(units, by_tiles, total), needs)
+        for unit in todo:
+            for key in unit.keys:
+                self.store.records.unmark(self.stage, self.fingerprint, key)
+        marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
+        fatal: list[BaseException] = []
+        shown = len(self.selected(units) if by_tiles else units)
+        undivided = list(units) == [WHOLE]
+        # what is not divided is done here, and tells its own steps
+        executor = SerialExecutor() if undivided else self.executor
+        with self.reporter.progress(
+            self.stage, shown, unit_name, shown - len(todo), hidden=undivided
+        ) as advance:
+
+            def on_result(unit: AnyUnit, outcome: Outcome) -> None:
+                advance()
+                if outcome.error is not None:
+                    self._failed(unit, outcome, fatal)
+                if fatal or self.stop.signal is not None:
+                    raise Stop
+
+            self.stop.check()
+            try:
+                executor.map(marked, todo, on_result)
+            except Stop:
+                if fatal:
+                    raise fatal[0] from fatal[0].__cause__
+        self.stop.check()
+        return self.store.records.summaries(self.stage, self.fingerprint)
+
+    def _pending_of(self, units: Sequence[AnyUnit], by_tiles: bool, total: int | None) -> list[AnyUnit]:
+        if total is None:
+            return self.pending(units, by_tiles=by_tiles)
+        done = self.store.records.done(self.stage, self.fingerprint)
+        return [unit for unit in units if not set(unit.keys) <= done]
+
+    def _know_total(self, n_keys: int) -> None:
+        """Keep how many markers the stage will have, before the first is set: a kill must not lose it."""
+        self.n_keys = n_keys
+        record = self.store.records.read(self.stage)
+        if record is not None and record.keys != n_keys:
+            self.store.records.write(replace(record, keys=n_keys))
+
+    def _ready(self, units: list[AnyUnit], needs: str | None) -> list[AnyUnit]:
+        """Split off the units that an upstream stage has not finished."""
+        if needs is None:
+            return units
+        there = self.tiles_done(needs)
+        for unit in units:
+            if not set(unit.keys) <= there:
+                self.failed[unit.key] = f"stage {needs} has not finished it"
+        return [unit for unit in units if set(unit.keys) <= there]
+
+    def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:
+        error = outcome.error
+        assert error is not None
+        reason = str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
+        self.failed[unit.key] = reason
+        self.reporter.event("failed", stage=self.stage, unit=unit.key, reason=reason, trace=outcome.trace)
+        full = (isinstance(error, StoreError) and is_fatal(error.__cause__ or error)) or is_fatal(error)
+        # camera files that vanished or changed are gone for all units, too
+        if full or isinstance(error, InputError):
+            fatal.append(error)
+
+
+class StageModule(Protocol):
+    """The names that a stage module offers; see the top of this file."""
+
+    NAME: str
+    VERSION: int
+    UPSTREAM: tuple[str, ...]
+    SETTINGS: tuple[str, ...]
+    READS: tuple[str, ...]
+    WRITES: tuple[str, ...]
+
+    def run(self, context: StageContext) -> None:
+        """Do the stage."""
+
+
+def identity_of(stage: object, context: StageContext) -> Any:
+    """Return what the stage adds to its fingerprint, if anything."""
+    identity = getattr(stage, "identity", None)
+    return None if identity is None else identity(context)

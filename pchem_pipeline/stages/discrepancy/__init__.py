@@ -1,0 +1,1 @@
+"""Stage ``discrepancy``: find what the model is missing."""

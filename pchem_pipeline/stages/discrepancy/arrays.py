@@ -1,0 +1,247 @@
+"""What the figures of a discrepancy verdict are drawn from: small arrays made of an ``Evidence``.
+
+The arrays are those of group ``discrepancy`` in :mod:`pchem_pipeline.base.variables`. Where the null
+hypothesis gives a standard deviation, values are divided by it, so that a reader sees at once what is beyond
+chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.framework.evidence import SCORES
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+
+__all__ = ["evidence_arrays", "path_arrays"]
+
+FloatArray = NDArray[np.float64]
+
+#: Frames in the pictures of the row and column means.
+_SHOWN_FRAMES = 96
+#: Rows of the sensor, and frames at a time, from which the path of a named effect is computed.
+_PATH_ROWS, _PATH_FRAMES = 4, 256
+
+
+def evidence_arrays(
+    evidence: Evidence,
+    before: Mapping[str, float] | None = None,
+    after: Mapping[str, float] | None = None,
+    effects: Sequence[Effect] = (),
+    integration_time: float = 1.0,
+    bit_depth: int = 16,
+    code_grown: FloatArray | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of group ``discrepancy``, by their names without the group.
+
+    Args:
+        evidence: what the frames show beyond the PCD.
+        before: the statistics standardised by replicates of the plain model; None for ``evidence.z``.
+        after: the same for the grown model; None where nothing was added.
+        effects: the named effects; those whose path does not depend on chance are drawn over the frames.
+        integration_time: s, as the effects are given it.
+        bit_depth: bits of the ADC, as the effects are given it.
+        code_grown: samples expected at each code from the grown model; None where nothing was added.
+
+    Returns:
+        Ready for ``RunStore.write_array(f"discrepancy/{name}", ...)``; what the evidence lacks (everything
+        along time for ready-made histograms) is absent.
+    """
+    code = evidence.code
+    found: dict[str, NDArray[Any]] = {
+        "goodness": _single(evidence.goodness),
+        "tail": np.stack([evidence.tail_low, evidence.tail_high]).astype(np.uint32),
+        "code_dn": (code.first + np.arange(code.observed.size)).astype(np.int32),
+        "code_observed": np.asarray(code.observed, dtype=np.float64),
+        "code_expected": np.asarray(code.expected, dtype=np.float64),
+        "z_before": _vector(evidence.z if before is None else before),
+    }
+    if all(name in evidence.scores for name in SCORES):
+        found["score"] = np.stack([_single(evidence.scores[name]) for name in SCORES])
+    if code_grown is not None:
+        found["code_grown"] = np.asarray(code_grown, dtype=np.float64)
+    if after is not None:
+        found["z_after"] = _vector(after)
+    if evidence.time is not None:
+        found |= _time_arrays(evidence, evidence.time)
+        found |= path_arrays(evidence, effects, integration_time, bit_depth)
+    return found
+
+
+def _single(values: NDArray[Any]) -> NDArray[np.float32]:
+    return np.asarray(values, dtype=np.float32)
+
+
+def _vector(z: Mapping[str, float]) -> FloatArray:
+    return np.array([z.get(name, np.nan) for name in STATISTICS], dtype=np.float64)
+
+
+def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]]:
+    usable = evidence.maps.usable
+    variance = [np.where(usable, std, 0.0) ** 2 for std in (evidence.charge_std, evidence.readout_std)]
+    total = float(np.where(usable, evidence.maps.quanta_exposure, 0.0).sum())
+    sizes = np.array([total, float(usable.sum())])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        frame_sd = np.sqrt([float(v.sum()) for v in variance]) / sizes
+    found: dict[str, NDArray[Any]] = {
+        "frame_number": np.asarray(time.frames, dtype=np.int64),
+        "frame_charge": np.asarray(time.frame_charge, dtype=np.float64),
+        "frame_readout": np.asarray(time.frame_readout, dtype=np.float64),
+        "frame_sd": np.where(np.isfinite(frame_sd), frame_sd, np.nan),
+        "lag1": _single(np.stack([time.lag_charge[0], time.lag_readout[0]]) * np.sqrt(time.n_pairs)),
+        "block_spread": _block_spread(evidence, time),
+    }
+    lines = {"row": (1, time.row_charge, time.row_readout), "column": (0, time.column_charge,
+             time.column_readout)}  # fmt: skip
+    for line, (axis, charge, readout) in lines.items():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sd = [np.sqrt(v.sum(axis=axis)) / usable.sum(axis=axis) for v in variance]
+            scaled = np.stack([charge / sd[0], readout / sd[1]])
+        scaled[~np.isfinite(scaled)] = np.nan
+        found[f"{line}_rms"] = np.sqrt(np.mean(scaled.astype(np.float64) ** 2, axis=1))
+        found[f"{line}_image"] = _single(scaled[:, :_SHOWN_FRAMES])
+    return found
+
+
+def _block_spread(evidence: Evidence, time: TimeSeries) -> NDArray[np.float32]:
+    """Return the scatter of each pixel's block means as a normal quantile (Wilson and Hilferty 1931)."""
+    frames = np.diff(np.append(np.searchsorted(time.frames, time.block_start), time.frames.size))
+    weight = frames[:, None, None].astype(np.float64)
+    dof = max(frames.size - 1, 1)
+    found = []
+    for means, std in (
+        (time.block_charge, evidence.charge_std),
+        (time.block_readout, evidence.readout_std),
+    ):
+        centre = (weight * means).sum(axis=0) / max(float(frames.sum()), 1.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            chi2 = (weight * (means - centre) ** 2).sum(axis=0) / std**2
+        quantile = (np.cbrt(chi2 / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
+        found.append(np.where(np.isfinite(quantile), quantile, np.nan))
+    return _single(np.stack(found))
+
+
+def path_arrays(
+    evidence: Evidence, effects: Iterable[Effect], integration_time: float = 1.0, bit_depth: int = 16
+) -> dict[str, FloatArray]:
+    """Return how frame means move under the effects whose path is not a matter of chance.
+
+    Each effect acts alone on a few rows of a noiseless sensor with the fitted maps, twice with different
+    random numbers: what comes out alike is its path. An effect that cannot do this is left out. The posterior
+    mean k follows a change only in part, and the residual takes the rest: an exposure H (1 + a) moves the
+    mean of k by a Var(k), and an offset of d electrons moves it by d E[Var(K|x)] / sigma_e^2, both to first
+    order (scores of H and mu of the PCD, Hendrickson et al. 2023, eq. update_eqns).
+
+    Args:
+        evidence: gives the maps and the frame numbers.
+        effects: the named effects.
+        integration_time: s.
+        bit_depth: bits of the ADC.
+
+    Returns:
+        ``frame_charge_model`` (relative) and ``frame_readout_model`` (DN), shape (n_frames,) each; empty
+        where no effect has a path.
+    """
+    time = evidence.time
+    if time is None or not evidence.maps.usable.any():
+        return {}
+    exposure, offset = np.zeros(time.frames.size), np.zeros(time.frames.size)
+    for effect in effects:
+        try:
+            first, second = (
+                _path(evidence, time, effect, seed, integration_time, bit_depth) for seed in (1, 2)
+            )
+        except Exception:  # an effect of others may expect more than a noiseless sensor
+            continue
+        if np.allclose(first, second, rtol=1e-6, atol=1e-12) and np.isfinite(first).all():
+            exposure += first[0] - first[0].mean()
+            offset += first[1] - first[1].mean()
+    if not np.ptp(exposure) and not np.ptp(offset):
+        return {}
+    return _seen(evidence, exposure, offset)
+
+
+def _seen(evidence: Evidence, exposure: FloatArray, offset: FloatArray) -> dict[str, FloatArray]:
+    """Turn relative exposure and offset (DN) of the frames into what their means of k and r show."""
+    usable, maps = evidence.maps.usable, evidence.maps
+    h, g, sigma = (m[usable] for m in (maps.quanta_exposure, maps.conversion_gain, maps.read_noise_dn))
+    variance = np.minimum(evidence.charge_std[usable] ** 2, h)
+    leak = np.clip((h - variance) / (sigma * g) ** 2, 0.0, 1.0)
+    return {
+        "frame_charge_model": (exposure * variance.sum() + offset * (g * leak).sum()) / h.sum(),
+        "frame_readout_model": exposure * ((h - variance) / g).mean() + offset * (1.0 - leak).mean(),
+    }
+
+
+def _path(
+    evidence: Evidence, time: TimeSeries, effect: Effect, seed: int, integration_time: float, bit_depth: int
+) -> FloatArray:
+    """Return relative exposure and offset (DN) of every frame under one effect alone, shape (2, n_frames)."""
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.simulate.streams import KeyedStreams
+
+    ny, nx = evidence.maps.usable.shape
+    rows = np.unique(np.linspace(0, ny - 1, _PATH_ROWS).astype(np.int64))
+    truth = _filled(evidence, rows)
+    parts = []
+    for start in range(0, time.frames.size, _PATH_FRAMES):
+        frames = np.asarray(time.frames[start : start + _PATH_FRAMES], dtype=np.int64)
+        context = EffectContext(
+            frames=frames,
+            n_frames=time.n_run,
+            rows=rows,
+            shape=(ny, nx),
+            integration_time=integration_time,
+            bit_depth=bit_depth,
+            truth=truth,
+            random=KeyedStreams(seed, "path", frames, rows, np.arange(nx)),
+        )
+        parts.append(_moved(effect, context))
+    return np.concatenate(parts, axis=1)
+
+
+def _filled(evidence: Evidence, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
+    """Return the fitted maps of some rows under the names of a truth, pixels without a fit filled in."""
+    maps = evidence.maps
+    found = {
+        "quanta_exposure": maps.quanta_exposure,
+        "conversion_gain": maps.conversion_gain,
+        "bias": maps.bias,
+        "analog_read_noise_e": maps.read_noise_dn * maps.conversion_gain,
+    }
+    return {
+        name: np.where(maps.usable, values, np.median(values[maps.usable]))[rows]
+        for name, values in found.items()
+    }
+
+
+def _moved(effect: Effect, context: EffectContext) -> FloatArray:
+    """Return relative exposure and offset (DN) of the frames of a block, shape (2, n_frames)."""
+    from pchem_pipeline.effects.framework.plane import Plane
+
+    truth, gain = context.truth, context.truth["conversion_gain"]
+    full = (context.frames.size, *gain.shape)
+    mean = np.array(np.broadcast_to(truth["quanta_exposure"], full))
+    charge = np.rint(mean)
+    nothing = np.zeros(context.frames.size)
+    if effect.plane is Plane.EXPOSURE:
+        relative = effect.apply(mean, context) / np.maximum(mean, 1e-12) - 1.0
+        return np.stack([relative.mean(axis=(1, 2)), nothing])
+    context = replace(context, exposure=mean, charge=charge.astype(np.int64), read_noise=np.zeros(full))
+    if effect.plane is Plane.ANALOG:
+        offset = (effect.apply(charge, context) - charge) / gain
+    elif effect.plane is Plane.ADC:
+        signal = charge / gain + truth["bias"]
+        offset = effect.apply(signal, context) - signal
+    else:
+        return np.stack([nothing, nothing])
+    return np.stack([nothing, offset.mean(axis=(1, 2))])

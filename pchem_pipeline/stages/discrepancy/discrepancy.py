@@ -1,0 +1,261 @@
+"""Stage ``discrepancy``: find what the model is missing, and put it into the run's model.
+
+It looks at the frames alone, never at the truth of a simulated run. Its units are simulated stacks; each
+leaves its statistics in its marker, so that a stopped search goes on where it was. It is not part of ``run``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
+from pchem_pipeline.config.grow import with_model_effects
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.discrepancy.by_likelihood.workflow import find_in_histograms
+from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
+from pchem_pipeline.discrepancy.by_simulation.workflow import find_discrepancies
+from pchem_pipeline.discrepancy.splits import block_length
+from pchem_pipeline.discrepancy.verdict import Discrepancy
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
+from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
+from pchem_pipeline.stages.fit.added_exposure import write_added_exposure
+from pchem_pipeline.stages.histogram.frame_source import FrameSource, open_source
+from pchem_pipeline.store.files import write_atomic
+
+__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "Window", "choose_window", "run"]
+
+_THIS = DECLARED["discrepancy"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
+
+_RESULT = "discrepancy.json"
+# frames tell more than pixels about what happens in time; pixels more about what is rare
+_FRAMES_WANTED = 6000
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of the stack that is looked at.
+
+    Attributes:
+        numbers: frame numbers, whole blocks, increasing.
+        rows, columns: first, and end.
+    """
+
+    numbers: NDArray[np.int64]
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """One simulated stack as a unit of the stage."""
+
+    replicate: Replicate
+
+    @property
+    def key(self) -> str:
+        """Its name."""
+        return self.replicate.key
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its marker."""
+        return (self.replicate.key,)
+
+
+def choose_window(
+    shape: tuple[int, int, int], max_samples: int, block_frames: int | None, roi: Sequence[int] | None = None
+) -> Window:
+    """Return what to look at: everything if small enough, else a window and blocks over the whole run.
+
+    Args:
+        shape: frames, rows, columns of the stack.
+        max_samples: frames x pixels to look at.
+        block_frames: frames in a block, or None to choose.
+        roi: rows and columns that the user asked for: y0, y1, x0, x1.
+    """
+    n_frames, ny, nx = shape
+    y0, y1, x0, x1 = roi or (0, ny, 0, nx)
+    frames = min(n_frames, max(_FRAMES_WANTED, max_samples // max((y1 - y0) * (x1 - x0), 1)))
+    side = max(max_samples // frames, 1)
+    if (y1 - y0) * (x1 - x0) > side:
+        height = min(y1 - y0, max(int(np.sqrt(side)), side // (x1 - x0)))
+        width = min(x1 - x0, side // height)
+        y0, x0 = y0 + (y1 - y0 - height) // 2, x0 + (x1 - x0 - width) // 2
+        y1, x1 = y0 + height, x0 + width
+    numbers = np.arange(n_frames, dtype=np.int64)
+    if frames < n_frames:
+        length = block_length(frames, block_frames)
+        starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
+        numbers = (starts[:, None] + np.arange(length)).ravel()
+    return Window(numbers, (y0, y1), (x0, x1))
+
+
+def run(context: StageContext) -> None:
+    """Find discrepancies, write ``discrepancy.json`` and the arrays of its pictures, and grow the model.
+
+    Raises:
+        InputError: the frames are too few, or there are none.
+        StoreError: the store refuses.
+    """
+    settings, sensor = context.config.discrepancy, context.sensor
+    before = context.config.model.effects
+    if sensor.kind != "frames":
+        _run_histograms(context)
+        return
+    source = open_source(context)
+    block_length(source.shape[0], settings.block_frames)
+    window = choose_window(source.shape, settings.max_samples, settings.block_frames, context.options.roi)
+    found = find_discrepancies(
+        read_window(source, window),
+        window.numbers,
+        settings,
+        n_run=source.shape[0],
+        bit_depth=context.config.input.bit_depth or sensor.bit_depth,
+        integration_time=context.integration_time or 1.0,
+        model=before,
+        mapper=_Mapper(context),
+    )
+    result = found.to_json()
+    result["examined"] |= {"rows": list(window.rows), "columns": list(window.columns)}
+    for place in result["where"]:
+        # the search counts pixels from the corner of its window, people from that of the sensor
+        place["pixels"] = [[y + window.rows[0], x + window.columns[0]] for y, x in place["pixels"]]
+    _write(context, found, result, before)
+    write_added_exposure(context.store, found.added, found.model, window.rows, window.columns)
+    _grow(context, found, before)
+
+
+def _run_histograms(context: StageContext) -> None:
+    """Do the same with ready-made histograms, in one unit."""
+    if not context.store.has("histogram/counts"):
+        place = quoted(context.store.path)
+        raise StoreError(f"{NAME} of histograms needs them in the store; run: pchem histogram {place}")
+    before = context.config.model.effects
+    counts = context.store.read("histogram/counts")
+    found = find_in_histograms(
+        counts.reshape(-1, counts.shape[2]),
+        context.store.read("histogram/origin").ravel(),
+        context.config.discrepancy,
+        model=before,
+    )
+    _write(context, found, found.to_json(), before)
+    _grow(context, found, before)
+    context.run_units([WHOLE], _nothing_left, by_tiles=False)
+
+
+def _nothing_left(unit: Unit) -> None:
+    """Be a unit whose work is done."""
+
+
+@dataclass
+class _Mapper:
+    """Runs replicates as units of the stage; those done before an interruption are not done again."""
+
+    context: StageContext
+    total: int = 0
+
+    def __call__(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
+        """Return the statistics of each replicate, or what it raised."""
+        units = {r.key: _Unit(r) for r in replicates}
+        self.total += len(units)
+        summaries = self.context.run_units(
+            list(units.values()), _simulate, unit_name="stack", by_tiles=False, total=self.total
+        )
+        found: list[Mapping[str, float] | Exception] = []
+        for replicate in replicates:
+            reason = self.context.failed.pop(replicate.key, None)
+            if reason is not None:
+                self.total -= 1
+                found.append(PchEmError(reason))
+            else:
+                found.append(summaries[replicate.key])
+        return found
+
+
+def _simulate(unit: _Unit) -> dict[str, float]:
+    return unit.replicate()
+
+
+def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteger]:
+    """Return the frames of a window, (frame, y, x), DN."""
+    (y0, y1), (x0, x1) = window.rows, window.columns
+    stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
+    breaks = np.flatnonzero(np.diff(window.numbers) != 1) + 1
+    at = 0
+    for run_ in np.split(window.numbers, breaks):
+        # not more at once than a few dozen megabytes, whatever the width of the sensor
+        step = max(1, (1 << 24) // ((y1 - y0) * source.shape[2]))
+        for first in range(int(run_[0]), int(run_[-1]) + 1, step):
+            last = min(first + step, int(run_[-1]) + 1)
+            block = np.empty((last - first, y1 - y0, source.shape[2]), source.dtype)
+            source.read_into(block, first, last, y0, y1)
+            stack[at : at + last - first] = block[:, :, x0:x1]
+            at += last - first
+    return stack
+
+
+def _write(
+    context: StageContext, found: Discrepancy, result: dict[str, Any], before: Sequence[Effect]
+) -> None:
+    names, z_before, z_after = found.statistics
+    arrays = evidence_arrays(
+        found.evidence,
+        dict(zip(names, z_before.tolist(), strict=True)),
+        dict(zip(names, z_after.tolist(), strict=True)) if found.steps else None,
+        [s.effect for s in found.steps if s.effect is not None],
+        context.integration_time or 1.0,
+        context.config.input.bit_depth or context.sensor.bit_depth or 16,
+        found.code_grown,
+    )
+    for name, array in arrays.items():
+        context.store.write_array(f"{NAME}/{name}", array)
+    context.store.write_file(_RESULT, json.dumps(result, indent=1, ensure_ascii=False).encode())
+    context.store.set_attributes(
+        NAME,
+        {
+            "model_before": _dump(before),
+            "model_after": _dump(found.model),
+            "roi": list(context.options.roi or ()),
+        },
+    )
+    for tag, reason in found.left_out.items():
+        context.note(f"effect {tag} left out: {reason}")
+
+
+def _grow(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
+    """Put what was found into the model of the run, if wanted."""
+    if context.config.discrepancy.add and found.model != tuple(before):
+        grow_model(context, found.model, found.set_aside)
+
+
+def grow_model(
+    context: StageContext,
+    effects: Sequence[Effect],
+    set_aside: tuple[tuple[float | None, float | None], ...] = (),
+) -> None:
+    """Put effects into the model of the run: in the store's copy of the YAML, and in the user's own file."""
+    set_aside = set_aside or context.config.model.set_aside_e
+    model = ModelSettings(effects=tuple(effects), set_aside_e=set_aside)
+    context.store.write_config(dump_config(context.config.model_copy(update={"model": model})))
+    path = context.config_path
+    if path is None or not path.exists():
+        return
+    text = path.read_text(encoding="utf-8")
+    write_atomic(path, with_model_effects(text, _dump(effects), str(path), set_aside).encode())
+    context.reporter.info(f"model.effects of {path}: {', '.join(e.tag for e in effects)}")
+
+
+def _dump(effects: Sequence[Effect]) -> list[dict[str, Any]]:
+    return [effect.model_dump(mode="json") for effect in effects]

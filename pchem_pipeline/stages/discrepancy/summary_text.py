@@ -1,0 +1,139 @@
+"""The verdict of a discrepancy search as the terminal shows it: a dozen plain lines."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pchem_pipeline.report.pages.findings import Findings, Place, Step, findings, headline
+
+__all__ = ["verdict_text"]
+
+_WIDTH = 100
+#: Longer lists end with a count.
+_MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
+_LEAD = "where: "
+_PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
+
+
+def verdict_text(result: Mapping[str, Any]) -> str:
+    """Return the verdict, where data and model disagree, the candidates, the gap, and what is not tested.
+
+    Args:
+        result: content of ``discrepancy.json``; keys may lack.
+
+    Returns:
+        Lines of at most 100 characters, without one at the end.
+    """
+    found = findings(result)
+    lines = [*_wrapped(f"{found.verdict.upper()}: {headline(found)}", "  ")]
+    lines += _places("where: ", found.where, _MOST_PLACES)
+    for number, step in enumerate(found.steps, 1):
+        lines += _step(step, number if len(found.steps) > 1 else 0, found)
+    lines += _gap(found)
+    if found.unexplained:
+        lines += _places("left unexplained: ", found.unexplained, _MOST_LEFT)
+    lines += [line for tag, why in found.left_out.items() for line in _wrapped(f"left out: {tag}: {why}")]
+    if found.untestable:
+        lines += _listed("not testable with such frames", list(found.untestable), 0)
+    return "\n".join(lines)
+
+
+def _wrapped(text: str, indent: str = "  ") -> list[str]:
+    # line breaks inside a stranger's message would break the columns
+    words = " ".join(text.translate(_PLAIN).split())
+    return textwrap.wrap(words, _WIDTH - 7, subsequent_indent=indent, break_long_words=True) or [""]
+
+
+def _listed(words: str, items: Sequence[str], more: int) -> list[str]:
+    return _wrapped(f"{words}: {', '.join(items)}{f' and {more} more' if more > 0 else ''}")
+
+
+def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
+    lines = []
+    indent = " " * len(_LEAD)
+    for i, place in enumerate(places[:most]):
+        spots = _spots(place)
+        words = f"{place.sentence or place.statistic} ({_sd(place.z)}{f'; {spots}' if spots else ''})"
+        first, *rest = _wrapped(words)
+        if i == 0 and len(title) > len(indent):
+            lines.append(title.rstrip())
+        lead = title if i == 0 and len(title) == len(indent) else indent
+        lines += [lead + first, *(indent + line for line in rest)]
+    more = len(places) - most
+    return [*lines, f"{indent}and {more} more"] if more > 0 else lines
+
+
+def _spots(place: Place) -> str:
+    words = []
+    if place.pixels:
+        words.append(f"{len(place.pixels)} pixels, first (y, x) = {place.pixels[0]}")
+    if place.dn is not None:
+        words.append(f"{place.dn[0]:g} to {place.dn[1]:g} DN")
+    if place.frames:
+        words.append(f"{len(place.frames)} frames, first {place.frames[0]}")
+    return ", ".join(words)
+
+
+def _sd(z: float) -> str:
+    return f"{z:+.1f} sd" if math.isfinite(z) else "sd not known"
+
+
+def _step(step: Step, number: int, found: Findings) -> list[str]:
+    """Return the table of candidates of a step and the parameters of what was named."""
+    lines = []
+    if step.candidates:
+        title = f"step {number}" if number else "candidate"
+        lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
+        for each in step.candidates[:_MOST_CANDIDATES]:
+            chosen = " <-" if step.effect and each.effect == step.effect else ""
+            row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
+            lines.append(f"{row}{_number(each.probability, 3):>13}{chosen}".translate(_PLAIN)[:_WIDTH])
+        more = len(step.candidates) - _MOST_CANDIDATES
+        lines += [f"  and {more} more"] if more > 0 else []
+    if step.effect and step.parameters:
+        values = [_value(p.name, p.value, p.stderr, p.unit) for p in step.parameters]
+        lines += _listed(step.effect, values, 0)
+    if not step.effect and found.verdict == "ambiguous":
+        lines += [
+            line
+            for rival, text in step.separate.items()
+            for line in _wrapped(f"to tell {rival} apart: {text}")
+        ]
+    return lines
+
+
+def _number(value: float, digits: int = 1) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+
+def _value(name: str, value: float, stderr: float, unit: str) -> str:
+    error = f" +- {stderr:.2g}" if math.isfinite(stderr) else ""
+    return f"{name} = {value:.4g}{error}{f' {unit}' if unit else ''}"
+
+
+def _gap(found: Findings) -> list[str]:
+    gap = found.gap
+    if not math.isfinite(gap.before):
+        return []
+    words = f"gap: {_micro(gap.before)}"
+    if found.steps and math.isfinite(gap.after):
+        words += f" -> {_micro(gap.after)}"
+    words += f" micro-nats per sample (floor {_micro(gap.floor)}"
+    if found.steps and math.isfinite(gap.closed_fraction):
+        words += f", {100 * gap.closed_fraction:.1f} % closed"
+    words += ")"
+    for role, rival in [
+        (role, rival)
+        for step in found.steps[-1:]
+        for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo))
+    ]:
+        if rival is not None:
+            words += f"; {role} {rival.effect} leaves {_micro(rival.gap_after)}"
+    return _wrapped(words)
+
+
+def _micro(gap: float) -> str:
+    return f"{1e6 * gap:.3g}" if math.isfinite(gap) else "not known"

@@ -1,0 +1,1 @@
+"""Stage ``electrons``: the stack of electron numbers."""

@@ -1,0 +1,1 @@
+"""Stage ``ensemble``: the sensor as a whole, predicted from its maps."""

@@ -1,0 +1,221 @@
+"""The curves of the ensemble and their agreement with the data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.checks.residuals import (
+    central_window,
+    chi_square,
+    noise_floor,
+    normalised_residuals,
+    rmse,
+)
+from pchem_pipeline.model.electrons.electrons import cell_probabilities
+from pchem_pipeline.model.ensemble.components import component_widths
+from pchem_pipeline.model.ensemble.ensemble import electron_pmf
+from pchem_pipeline.model.ensemble.ensemble_binned import (
+    HistogramChoice,
+    electron_pmf_binned,
+    epcd_dependent,
+    epcd_independent,
+    nuced_dependent,
+    nuced_independent,
+)
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings
+from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+from pchem_pipeline.stages.ensemble.tile import EnsembleTotals
+
+__all__ = ["components", "curves", "electron_numbers", "error_rates"]
+
+#: Components are shown up to the electron number whose mass is above this.
+_SMALLEST_COMPONENT = 1e-4
+_WAYS = ("exact", "dependent", "independent")
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def _choice(settings: EnsembleSettings) -> HistogramChoice:
+    return HistogramChoice(settings.parameter_bins, settings.parameter_range, settings.cell_representative)
+
+
+def curves(
+    totals: EnsembleTotals, pixels: PixelParameters, settings: EnsembleSettings
+) -> tuple[Arrays, dict[str, Any]]:
+    """Return the densities, raw and NUCed, and how well they agree with the data.
+
+    Args:
+        totals: the sums over all tiles.
+        pixels: all pixels with a value.
+        settings: the section ``ensemble``.
+
+    Returns:
+        Arrays of the group ``ensemble``, and numbers for its attributes.
+    """
+    axes, choice = totals.axes, _choice(settings)
+    width = axes.nuced.width
+    variance, nuced_variance = totals.variance("pcd_variance"), totals.variance("nuced_variance") / width**2
+    arrays: Arrays = {
+        "dn": axes.dn.dn.astype(np.int32),
+        "counts": totals.counts("counts"),
+        "counts_all": totals.counts("counts_all"),
+        "density": totals.mean("share"),
+        "density_all": totals.mean("share_all"),
+        "epcd_exact": totals.mean("pcd"),
+        "epcd_dependent": epcd_dependent(pixels, axes.dn, choice),
+        "epcd_independent": epcd_independent(pixels, axes.dn, choice),
+        "electrons": axes.nuced.electrons,
+        "nuced_counts": totals.counts("nuced_counts"),
+        "nuced_density": totals.mean("nuced_share") / width,
+        "nuced_exact": totals.mean("nuced") / width,
+        "nuced_dependent": nuced_dependent(pixels, axes.nuced, choice),
+        "nuced_independent": nuced_independent(pixels, axes.nuced, choice),
+    }
+    if not axes.grown:
+        arrays["epcd_stderr"] = np.sqrt(totals.variance("pcd_error"))
+        arrays["nuced_stderr"] = np.sqrt(totals.variance("nuced_error"))
+    for prefix, noise in (("", variance), ("nuced_", nuced_variance)):
+        exact = arrays["nuced_exact" if prefix else "epcd_exact"]
+        arrays[f"{prefix}residual"] = normalised_residuals(arrays[f"{prefix}density"], exact, noise)
+    facts = _agreement(arrays, variance, nuced_variance, totals, settings.rmse_coverage)
+    facts |= {
+        "nuced_bin_width": width,
+        "samples_beyond_dn": totals.count("outside"),
+        "samples_beyond_dn_all_frames": totals.count("outside_all"),
+        "samples_beyond_electrons": totals.count("nuced_outside"),
+    }
+    return arrays, facts
+
+
+def _agreement(
+    arrays: Mapping[str, NDArray[Any]],
+    variance: FloatArray,
+    nuced_variance: FloatArray,
+    totals: EnsembleTotals,
+    coverage: float,
+) -> dict[str, Any]:
+    """Return RMSEs, their noise floors, chi-square, and the windows they were taken over."""
+    window = central_window(arrays["counts"], coverage)
+    nuced_window = central_window(arrays["nuced_counts"], coverage)
+    found = {f"epcd_{way}": rmse(arrays["density"], arrays[f"epcd_{way}"], window) for way in _WAYS}
+    found["noise_floor"] = noise_floor(variance, window)
+    for way in _WAYS:
+        found[f"nuced_{way}"] = rmse(arrays["nuced_density"], arrays[f"nuced_{way}"], nuced_window)
+    found["nuced_noise_floor"] = noise_floor(nuced_variance, nuced_window)
+    found_all = {f"epcd_{way}": rmse(arrays["density_all"], arrays[f"epcd_{way}"], window) for way in _WAYS}
+    n, n_all = totals.samples
+    found_all["noise_floor"] = found["noise_floor"] * math.sqrt(n / n_all)
+    model_error = {
+        prefix: noise_floor(arrays[f"{prefix}_stderr"] ** 2, place)
+        for prefix, place in (("epcd", window), ("nuced", nuced_window))
+        if f"{prefix}_stderr" in arrays
+    }
+    chi = chi_square(arrays["density"], arrays["epcd_exact"], variance, arrays["counts"])
+    ends = [window.start, window.stop - 1], [nuced_window.start, nuced_window.stop - 1]
+    return {
+        "rmse": found,
+        "rmse_all_frames": found_all,
+        "model_error": model_error,
+        "chi_square": asdict(chi),
+        "rmse_window_dn": [int(arrays["dn"][i]) for i in ends[0]],
+        "rmse_window_electrons": [float(arrays["electrons"][i]) for i in ends[1]],
+    }
+
+
+def electron_numbers(
+    totals: EnsembleTotals, pixels: PixelParameters, settings: EnsembleSettings
+) -> tuple[Arrays, dict[str, Any]]:
+    """Return the electron numbers, observed and predicted, and how often they should be wrong.
+
+    Args:
+        totals: the sums over all tiles.
+        pixels: all pixels with a value.
+        settings: the section ``ensemble``.
+
+    Returns:
+        Arrays of the group ``ensemble``, and numbers for its attributes.
+    """
+    n_k = totals.axes.n_k
+    arrays: Arrays = {
+        "k": np.arange(n_k, dtype=np.int32),
+        "electron_counts": totals.counts("electron_counts"),
+        "electron_mass": totals.mean("electron_share"),
+        "electron_pmf": electron_pmf(pixels.quanta_exposure, n_k),
+        "electron_pmf_binned": electron_pmf_binned(pixels.quanta_exposure, n_k, _choice(settings)),
+        "electron_pmf_map": totals.mean("electron_expected"),
+    }
+    mass = arrays["electron_pmf_map"]
+    n_samples = max(int(arrays["electron_counts"].sum()), 1)
+    errors = {
+        name: rmse(arrays["electron_mass"], arrays[f"electron_{name}"])
+        for name in ("pmf", "pmf_binned", "pmf_map")
+    }
+    return arrays, {
+        "expected_error_rate": float(totals.mean("error")[0]),
+        "electrons_beyond": totals.count("electrons_beyond"),
+        "electron_rmse": errors | {"noise_floor": noise_floor(mass * (1.0 - mass) / n_samples)},
+    }
+
+
+def error_rates(
+    totals: EnsembleTotals, pixels: PixelParameters, true: PixelParameters | None
+) -> dict[str, Any]:
+    """Return how often the electron numbers are wrong, where the true ones are known.
+
+    What one should expect follows from the fitted parameters alone (``expected_error_rate``) or, better, from
+    data of the true parameters cut at the thresholds of the fitted ones; the least possible rate has the
+    thresholds of the true parameters. Frames that the fit has seen err slightly less than new ones.
+
+    Args:
+        totals: the sums over all tiles.
+        pixels: fitted parameters of all pixels with a value.
+        true: true parameters of the same pixels, or None where they are not known or not all there is.
+
+    Returns:
+        Numbers for the attributes of the group; none where nothing was compared.
+    """
+    compared = totals.count("compared")
+    if not compared:
+        return {}
+    sizes = totals.counts("error_sizes")
+    frames = compared / totals.count("pixels")
+    facts: dict[str, Any] = {
+        "error_rate": 1.0 - int(sizes[0]) / compared,
+        "error_rate_stderr": math.sqrt(float(totals.variance("error_variance")[0]) / frames),
+        "error_sizes": [int(n) for n in sizes],
+        "mean_error": totals.count("signed_error") / compared,
+        "samples_compared": compared,
+    }
+    if true is not None:
+        error = cell_probabilities(true, 1, pixels).error
+        facts |= {
+            "expected_error_rate_from_truth": float(error.mean()),
+            "error_rate_stderr": math.sqrt(float(np.mean(error * (1.0 - error))) / compared),
+            "least_error_rate": float(cell_probabilities(true, 1).error.mean()),
+        }
+    return facts
+
+
+def components(pixels: PixelParameters, mass: FloatArray) -> Arrays:
+    """Return means and widths of the components that matter (Appendix B).
+
+    Args:
+        pixels: all pixels with a value.
+        mass: mass of each electron number, shape (n_k,).
+
+    Returns:
+        Arrays of the group ``ensemble``.
+    """
+    shown = max(2, int(np.flatnonzero(mass >= _SMALLEST_COMPONENT)[-1]) + 1)
+    widths = component_widths(pixels, min(shown, mass.size))
+    return {
+        "component_mean": widths.mean,
+        "component_variance": widths.variance,
+        "nuced_component_variance": widths.nuced_variance,
+    }

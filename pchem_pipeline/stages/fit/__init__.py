@@ -1,0 +1,1 @@
+"""Stage ``fit``: maximum likelihood for every pixel."""

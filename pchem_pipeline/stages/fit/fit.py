@@ -1,0 +1,214 @@
+"""Stage ``fit``: PCH-EM on the histogram of every pixel, and again with the effects of the run's model."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.errors.fisher import correlations
+from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine
+from pchem_pipeline.model.fit.excluding_codes import Interval, fit_beside
+from pchem_pipeline.model.fit.grown import fit_grown
+from pchem_pipeline.model.fit.intervals import profile_intervals
+from pchem_pipeline.model.fit.outliers import without_outliers
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.fit.added_exposure import read_added_exposure
+from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
+from pchem_pipeline.stages.fit.together import judge_sensor
+
+if TYPE_CHECKING:
+    from pchem_pipeline.store.tiles import Tile
+
+__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "fit_tile", "identity", "run"]
+
+_THIS = DECLARED["fit"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
+
+#: Pixels of which effects are told nothing: no value, or one electron off.
+_UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
+
+
+_PLAIN_ONLY = (
+    "fit.intervals: profile and fit.errors: sandwich need the plain model; with model.effects or "
+    "model.set_aside_e the errors are those of the observed information"
+)
+
+
+def fit_tile(
+    histogram: Mapping[str, NDArray[Any]],
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+    effects: Sequence[Effect] = (),
+    set_aside: Sequence[Interval] = (),
+    start: NDArray[np.float64] | None = None,
+    added: AddedExposure | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the group ``fit`` of a tile, by name.
+
+    With effects the plain fit is where the one under the grown law starts.
+
+    Args:
+        histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of the tile.
+        settings: of the fit.
+        adc_limits: first and last code of the ADC, DN, or None where they are not known.
+        effects: of the run's model.
+        set_aside: codes that the fit leaves out, e- on the comb of the plain fit.
+        start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
+        added: exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
+    """
+    counts = histogram["counts"]
+    shape = counts.shape[:2]
+    flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
+    rows = counts.reshape(-1, counts.shape[2])
+    old = None if start is None else start.reshape(-1, start.shape[2])
+    known = None if old is None else old[:, : len(PARAMETERS)]
+    plain: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits, start=known)
+    if old is not None:
+        # from a start no neighbours are tried; the gap to them was the old one, and grows with the frames
+        plain = replace(plain, likelihood_gap=np.fmin(plain.likelihood_gap, old[:, len(PARAMETERS)]))
+    if effects:
+        result = _grown(rows, flat["origin"], plain, settings, effects, added)
+    else:
+        result = refine(rows, flat["origin"], plain, settings, adc_limits)
+    if set_aside:
+        law = functools.partial(_law, effects=effects)
+        result = fit_beside(rows, flat["origin"], plain, result, law, set_aside, settings)
+    variances = np.diagonal(result.covariance, axis1=1, axis2=2)
+    arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
+    arrays["correlation"] = correlations(result.covariance)
+    if settings.intervals == "profile" and not (effects or set_aside):
+        ends = _intervals(rows, flat["origin"], plain, settings)
+        other = result.bias != plain.bias  # fitted with the exact likelihood, whose profile this is not
+        arrays |= {name: np.where(other, np.nan, values) for name, values in ends.items()}
+    arrays |= {
+        v.name: getattr(result, v.name)
+        for v in variables_of("fit")
+        if v.name not in arrays and hasattr(result, v.name)
+    }
+    return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
+
+
+def _intervals(
+    counts: NDArray[Any], origin: NDArray[Any], fit: FitResult, settings: FitSettings
+) -> dict[str, NDArray[np.float64]]:
+    """Return the ends of the profile intervals of all quantities, by name."""
+    parameters = np.stack([getattr(fit, name) for name in PARAMETERS], axis=1)
+    kept = without_outliers(counts, origin, parameters, fit.outlier_share, settings)
+    ends = profile_intervals(kept, origin, parameters, settings.interval_level)
+    return {
+        path: ends[:, place, side]
+        for place, name in enumerate(INTERVALS)
+        for side, path in enumerate(interval_names(name))
+    }
+
+
+def _grown(
+    counts: NDArray[Any],
+    origin: NDArray[Any],
+    plain: FitResult,
+    settings: FitSettings,
+    effects: Sequence[Effect],
+    added: AddedExposure | None,
+) -> FitResult:
+    """Fit again with the law that the effects compose, as they see the pixels after the plain fit."""
+    usable = (plain.fit_status & int(_UNUSABLE)) == 0
+    maps = pixel_maps([getattr(plain, name) for name in PARAMETERS], usable)
+    return fit_grown(counts, origin, plain, marginal_model(effects, maps, added), settings, plain=plain)
+
+
+def _law(parameters: NDArray[np.float64], *, effects: Sequence[Effect]) -> MarginalModel:
+    """Return the law of pixels with (H, g, mu, sigma), shape (n, 4)."""
+    return marginal_model(effects, pixel_maps(list(parameters.T), np.ones(parameters.shape[0], np.bool_)))
+
+
+def run(context: StageContext) -> None:
+    """Fit every tile whose histograms are there.
+
+    Raises:
+        StoreError: the histograms are missing, or the store refuses.
+    """
+    effects = context.config.model.effects
+    left_out = {"fit_status", *(() if effects else FREE_LOBES)}
+    settings, plain = context.config.fit, not (effects or context.config.model.set_aside_e)
+    if settings.intervals == "normal" or not plain:
+        left_out |= {path for name in INTERVALS for path in interval_names(name)}
+    if not plain and (settings.intervals, settings.errors) != ("normal", "information"):
+        context.note(_PLAIN_ONLY)
+    context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])
+    context.create_maps(
+        ["fit/fit_status"],
+        flag_masks=[int(bit) for bit in MEANINGS],
+        flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
+        flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
+    )
+    if not context.executor.shares_memory:
+        _compile(context.store.array("histogram/counts").dtype, effects)
+    task = functools.partial(
+        _do_tile,
+        store=context.store.path,
+        settings=context.config.fit,
+        adc_limits=context.adc_limits,
+        effects=effects,
+        set_aside=context.config.model.set_aside_e,
+    )
+    done = context.run_units(context.tiles(), task, needs="histogram")
+    judge_sensor(context)
+    if len(done) == context.n_keys:
+        drop_fit(context.store.path)
+    biased, pixels = (sum(tile.get(key, 0) for tile in done.values()) for key in ("rounded", "pixels"))
+    if biased:
+        share = f"{biased / pixels:.1%}" if biased >= 0.001 * pixels else "fewer than 0.1%"
+        context.note(
+            f"rounding to whole DN biases {share} of the pixels by more than {LARGEST_BIAS:g} "
+            "standard errors; set fit.likelihood: auto"
+        )
+
+
+def _compile(dtype: np.dtype[Any], effects: Sequence[Effect]) -> None:
+    """Compile the kernels once, into the cache, before other processes do it all at the same time."""
+    histogram = {name: np.zeros((1, 1), np.int32) for name in ("origin", "under", "over")}
+    fit_tile({"counts": np.ones((1, 1, 8), dtype), **histogram}, FitSettings(), None, effects)
+
+
+def _do_tile(
+    tile: Tile,
+    *,
+    store: Path,
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+    effects: Sequence[Effect],
+    set_aside: Sequence[Interval],
+) -> dict[str, Any]:
+    """Fit one tile of the store; the summary counts its pixels."""
+    run_store = open_store(store)
+    histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
+    start = kept_fit(store, tile.region)
+    ny, nx = run_store.array("histogram/origin").shape
+    added = read_added_exposure(run_store, effects, (ny, nx), tile.region)
+    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start, added)
+    for name, array in arrays.items():
+        run_store.write(f"fit/{name}", tile.region, array)
+    words = arrays["fit_status"]
+    summary = {"pixels": int(words.size), "failed": int(np.count_nonzero(words & np.uint16(int(FAILED))))}
+    if settings.likelihood == "density" and not effects:
+        counts = histogram["counts"].sum(axis=2, dtype=np.float64)
+        biased = biased_by_rounding([arrays[name].ravel() for name in PARAMETERS], counts.ravel())
+        summary["rounded"] = int(np.count_nonzero(biased))
+    return summary

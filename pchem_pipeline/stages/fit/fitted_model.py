@@ -1,0 +1,52 @@
+"""The model with which the maps of a run were fitted, whatever its configuration says by now."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+    from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["deciding_maps", "fitted_effects"]
+
+
+def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
+    """Return the effects of the model of the stored fit, in their order; none without a fit.
+
+    Raises:
+        pydantic.ValidationError: an effect came from a package that is no longer there.
+    """
+    record = store.records.read("fit")
+    settings = {} if record is None else record.content.get("settings", {}).get("model") or {}
+    return ModelSettings.model_validate(settings).effects
+
+
+def deciding_maps(
+    maps: Sequence[NDArray[np.float64]], effects: Sequence[Effect], added: AddedExposure | None = None
+) -> tuple[NDArray[np.float64], ...]:
+    """Return the parameters with which electron numbers are decided: the maps themselves without effects.
+
+    Args:
+        maps: fitted (H, g, mu, sigma), each of the same shape; NaN where the fit failed.
+        effects: with which they were fitted.
+        added: exposure that these add to the pixels, a pixel for each of the maps; None: nothing.
+
+    Returns:
+        The four, in that shape; with effects those of the nearest PCD.
+    """
+    if not effects:
+        return tuple(maps)
+    model = marginal_model(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), added)
+    return tuple(values.reshape(maps[0].shape) for values in nearest_pcd(list(maps), model))

@@ -1,0 +1,61 @@
+"""The answer of an earlier fit, from which the fit of more frames of the same pixels starts."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.run.runner import setting_values
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.remote_path import RemotePath
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.stage import StageContext
+
+__all__ = ["drop_fit", "keep_fit", "kept_fit"]
+
+_FILE = "fit_start.npy"
+
+
+def _place(store: Path) -> Path:
+    return store / ".pchem" / _FILE
+
+
+def keep_fit(context: StageContext) -> None:
+    """Keep the pixels that were fitted well, unless the fit was another one.
+
+    The file holds (H, g, mu, sigma, likelihood gap), float64, (y, x, 5); NaN for pixels without a start.
+    """
+    store = context.store
+    record = store.records.read("fit")
+    if record is None or not record.finished or record.content["settings"] != setting_values("fit", context):
+        drop_fit(store.path)
+        return
+    names = (*PARAMETERS, "likelihood_gap")
+    start = np.stack([store.read(f"fit/{name}") for name in names], axis=-1)
+    start[store.read("fit/fit_status") != 0] = np.nan
+    buffer = io.BytesIO()
+    np.save(buffer, start)
+    write_atomic(_place(store.path), buffer.getvalue())
+
+
+def kept_fit(store: Path, region: tuple[slice, slice]) -> NDArray[np.float64] | None:
+    """Return what `keep_fit` kept of a tile, or None."""
+    place = _place(store)
+    if not place.exists():
+        return None
+    if isinstance(place, RemotePath):
+        whole = np.load(io.BytesIO(place.read_bytes()), allow_pickle=False)
+    else:
+        whole = np.load(place, mmap_mode="r", allow_pickle=False)
+    return np.array(whole[region])
+
+
+def drop_fit(store: Path) -> None:
+    """Forget it, once a fit has started from it."""
+    _place(store).unlink(missing_ok=True)

@@ -1,0 +1,78 @@
+"""The last step of stage ``fit``: what all pixels of the sensor together say about the fit of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool
+from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["judge_sensor"]
+
+_LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
+_LARGEST_KEPT = 2**22  # pixels, 24 bytes each
+_GAIN, _SIGMA = 1, 3  # places in ``variables.PARAMETERS``
+_PAIR = CORRELATION_PAIRS.index((_GAIN, _SIGMA))
+
+_Region = tuple[slice, slice]
+
+
+def judge_sensor(context: StageContext) -> int:
+    """Give the word ``WEAKLY_IDENTIFIED`` to the pixels that earn it; return their number.
+
+    The words depend on the sensor as a whole, not on its tiles, and may be given again and again.
+
+    Raises:
+        StoreError: the store refuses.
+    """
+    store, shape = context.store, context.sensor.shape
+    bands = list(_bands(shape, context.config.run.tile))
+    every = -(-shape[0] * shape[1] // _LARGEST_POOL)
+    kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
+    chosen = []
+    for band in bands:
+        pixels = _judged(store, band)
+        some = pixels.of(slice(-band[0].start * shape[1] % every, None, every))
+        chosen.append(Judged.join([some]))  # a copy: a view would keep the whole band
+        if shape[0] * shape[1] <= _LARGEST_KEPT:
+            kept[band[0].start] = pixels
+    pool = NoisePool.of(Judged.join(chosen))
+    weakly, found = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED)), 0
+    for band in bands:
+        words = store.read("fit/fit_status", band)
+        new = words & ~weakly
+        if pool is not None:
+            pixels = kept[band[0].start] if kept else _judged(store, band)
+            weak = pool.weak(pixels, context.config.fit).reshape(words.shape)
+            new[weak] |= weakly
+            found += int(np.count_nonzero(weak))
+        if not np.array_equal(new, words):
+            store.write("fit/fit_status", band, new)
+    return found
+
+
+def _bands(shape: tuple[int, int], tile: int) -> Iterator[_Region]:
+    """Return the rows of the sensor, as high as a tile: whole chunks."""
+    for first in range(0, shape[0], tile):
+        yield slice(first, min(first + tile, shape[0])), slice(0, shape[1])
+
+
+def _judged(store: RunStore, band: _Region) -> Judged:
+    """Return the pixels of a band, in order; NaN where they are not fitted."""
+    gain, sigma, of_gain, of_sigma, gap = (
+        store.read(f"fit/{name}", band).ravel()
+        for name in (
+            "conversion_gain", "read_noise_dn", "conversion_gain_stderr", "read_noise_dn_stderr",
+            "likelihood_gap",
+        )
+    )  # fmt: skip
+    together = store.read("fit/correlation", (*band, slice(_PAIR, _PAIR + 1))).ravel()
+    by_gain, by_sigma = sigma * of_gain, gain * of_sigma
+    with np.errstate(invalid="ignore"):
+        stderr = np.sqrt(np.maximum(by_gain**2 + by_sigma**2 + 2.0 * together * by_gain * by_sigma, 0.0))
+    return Judged(gain * sigma, stderr, gap)

@@ -1,0 +1,212 @@
+"""Counting frames as they come: one object for some rows of the sensor, and its chunks in the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
+from pchem_pipeline.model.histogram.summaries import (
+    ROW_GROUP,
+    CovarianceMaps,
+    OpenSums,
+    SummaryAccumulator,
+    line_sums,
+)
+from pchem_pipeline.run.stage import open_store
+
+if TYPE_CHECKING:
+    from pchem_pipeline.model.histogram.settings import HistogramSettings
+
+__all__ = ["AlongTime", "BandCounter", "Emit", "TileCounter"]
+
+_HISTOGRAMS = ("counts", "origin", "under", "over", "minimum", "maximum")
+_ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
+_OPEN = ("open_sums", "open_covariances")
+
+Emit = Callable[[str, NDArray[Any]], None]
+
+
+class TileCounter:
+    """Histograms and summaries of the pixels of some rows, in memory."""
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        bins: int,
+        n_frames: int,
+        settings: HistogramSettings,
+        emit: Emit | None = None,
+    ) -> None:
+        """Begin with no frames.
+
+        Args:
+            shape: rows (from the top of a group of rows) and columns.
+            bins: bins of a pixel.
+            n_frames: number of frames to come.
+            settings: the section ``histogram``.
+            emit: told of each piece of the arrays along time as it comes: the variable's name in the group
+                ``summary``, and its next rows (first axis: frame or block).
+        """
+        self._emit: Emit = emit or (lambda name, part: None)
+        self._histograms = HistogramAccumulator(shape, bins, n_frames)
+        self._summaries = SummaryAccumulator(shape, settings.block_frames) if settings.summaries else None
+
+    def resume(self, histograms: HistogramAccumulator, summaries: SummaryAccumulator | None) -> None:
+        """Go on from frames that were counted before."""
+        self._histograms, self._summaries = histograms, summaries
+
+    def add(self, frames: NDArray[Any]) -> None:
+        """Take the next frames, (frame, y, x); the first time those that decide the windows.
+
+        Raises:
+            InputError: DN of more than 24 bits.
+        """
+        self._histograms.add(frames)
+        if self._summaries is not None:
+            for sums in self._summaries.add(frames):
+                self._tell({name: part[None] for name, part in vars(sums).items()})
+            self._tell(vars(line_sums(frames)))
+
+    def open_sums(self) -> OpenSums | None:
+        """Return what the summaries need to go on later, to be taken before `finish`."""
+        return None if self._summaries is None else self._summaries.open_sums()
+
+    def finish(self) -> tuple[RowHistograms, CovarianceMaps | None]:
+        """Return the histograms, and the covariances, or None without summaries."""
+        if self._summaries is None:
+            return self._histograms.finish(), None
+        rest, covariances = self._summaries.finish()
+        for sums in rest:
+            self._tell({name: part[None] for name, part in vars(sums).items()})
+        return self._histograms.finish(), covariances
+
+    def _tell(self, parts: dict[str, NDArray[Any]]) -> None:
+        for name, part in parts.items():
+            self._emit(name, part)
+
+
+class AlongTime:
+    """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
+
+    def __init__(self, store: Path, name: str, rows: slice, done: int = 0) -> None:
+        """Begin at the first frame or block, or behind those that are there.
+
+        Args:
+            store: path of the run.
+            name: the array.
+            rows: its rows that are written, whole chunks.
+            done: frames or blocks that are in the store; those of the last chunk are written again.
+        """
+        self._store, self._name, self._rows = open_store(store), name, rows
+        array = self._store.array(name)
+        self._length = array.chunks[0]
+        self._parts: list[NDArray[Any]] = []
+        self._held = done % self._length
+        self._written = done - self._held
+        if self._held:
+            rest = (slice(None),) * (array.ndim - 2)
+            self._parts.append(self._store.read(name, (slice(self._written, done), rows, *rest)))
+
+    def add(self, part: NDArray[Any]) -> None:
+        """Take the next piece."""
+        while part.shape[0]:
+            piece = part[: self._length - self._held]
+            self._parts.append(piece)
+            self._held += piece.shape[0]
+            part = part[piece.shape[0] :]
+            if self._held == self._length:
+                self.flush()
+
+    def flush(self) -> None:
+        """Write what is held."""
+        if self._held:
+            data = np.concatenate(self._parts)
+            end = self._written + self._held
+            rest = (slice(None),) * (data.ndim - 2)
+            self._store.write(self._name, (slice(self._written, end), self._rows, *rest), data)
+            self._parts, self._held, self._written = [], 0, end
+
+
+class BandCounter:
+    """Histograms and summaries of some rows over the full width, written into a run."""
+
+    def __init__(
+        self,
+        store: Path,
+        rows: tuple[int, int],
+        shape: tuple[int, int, int],
+        bins: int,
+        settings: HistogramSettings,
+    ) -> None:
+        """Begin with no frames.
+
+        Args:
+            store: path of the run, which has the arrays.
+            rows: first row and end of the rows, whole tiles and whole groups of rows.
+            shape: frames, rows and columns of the stack.
+            bins: bins of a pixel.
+            settings: the section ``histogram``.
+        """
+        y0, y1 = rows
+        self._store, self._rows = store, slice(y0, y1)
+        self._groups = slice(y0 // ROW_GROUP, -(-y1 // ROW_GROUP))
+        self._series: dict[str, AlongTime] = {}
+        self._done = dict.fromkeys(_ALONG_TIME, 0)
+        self._settings, self._shape = settings, shape
+        self._counter = TileCounter((y1 - y0, shape[2]), bins, shape[0], settings, self._emit)
+
+    def resume(self, n_frames: int) -> None:
+        """Go on behind the frames that the run has counted.
+
+        Args:
+            n_frames: their number.
+
+        Raises:
+            StoreError: an array is missing or damaged.
+        """
+        opened = open_store(self._store)
+        held = RowHistograms(**{name: self._read(f"histogram/{name}") for name in _HISTOGRAMS})
+        histograms = HistogramAccumulator.resumed(held, self._shape[0])
+        if not self._settings.summaries:
+            self._counter.resume(histograms, None)
+            return
+        region = (slice(None), self._rows, slice(None))
+        state = OpenSums(*(opened.read(f"summary/{name}", region) for name in _OPEN))
+        length = self._settings.block_frames
+        self._counter.resume(histograms, SummaryAccumulator.resumed(state, n_frames, length))
+        blocks = n_frames // length
+        self._done = {name: blocks if name.startswith("block") else n_frames for name in _ALONG_TIME}
+
+    def _read(self, name: str) -> NDArray[Any]:
+        return open_store(self._store).read(name, (self._rows,))
+
+    def add(self, frames: NDArray[Any]) -> None:
+        """Take the next frames, (frame, y, x) of these rows; see `TileCounter.add`."""
+        self._counter.add(frames)
+
+    def finish(self) -> None:
+        """Write all that was not written on the way."""
+        state = self._counter.open_sums()
+        histograms, covariances = self._counter.finish()
+        for each in self._series.values():
+            each.flush()
+        opened = open_store(self._store)
+        for name, values in vars(histograms).items():
+            opened.write(f"histogram/{name}", (self._rows, *(slice(None),) * (values.ndim - 1)), values)
+        if covariances is not None:
+            for name, values in vars(covariances).items():
+                opened.write(f"summary/{name}", (self._rows, slice(None)), values)
+        if state is not None:
+            for name, values in zip(_OPEN, vars(state).values(), strict=True):
+                opened.write(f"summary/{name}", (slice(None), self._rows, slice(None)), values)
+
+    def _emit(self, name: str, part: NDArray[Any]) -> None:
+        if name not in self._series:
+            rows = self._groups if name == "column_sum" else self._rows
+            self._series[name] = AlongTime(self._store, f"summary/{name}", rows, self._done[name])
+        self._series[name].add(part)

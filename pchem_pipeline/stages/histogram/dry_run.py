@@ -1,0 +1,239 @@
+"""What a run is going to read, write and hold, and how long that takes: said before it starts."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.compute.environment import available_memory, available_workers
+from pchem_pipeline.model.histogram.count import HistogramAccumulator, RangeAccumulator, choose_bins
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
+from pchem_pipeline.stages.histogram.bands import bytes_per_row
+from pchem_pipeline.stages.ingest import chunk_shape
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.frames.reader import FrameReader
+
+__all__ = [
+    "Plan",
+    "allowed_bytes",
+    "band_bytes",
+    "make_plan",
+    "sweep_bytes",
+    "sweep_rows",
+    "worker_count",
+]
+
+#: the program with its libraries and compiled kernels
+BASE_BYTES = 240 << 20
+#: the same with what the later stages hold, and that for each pixel
+_REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
+#: bytes in the store for each pixel: histograms, fit and maps; for each byte of the summaries along time
+_STORED_PIXEL, _STORED_SERIES = 420, 0.5
+#: the copied frames are so much smaller than the frames
+_COPY_RATIO = 1.77
+#: CPU seconds for each pixel of ensemble and report, and for what does not depend on them
+_REST_SECONDS, _REST_PIXEL_SECONDS = 6.0, 6e-5
+_FIT_SAMPLE = 256
+
+
+def worker_count(config: RunConfig) -> int:
+    """Return the workers on this machine that a configuration asks for."""
+    if config.compute.backend == "serial":
+        return 1
+    return available_workers() if config.compute.workers == "auto" else config.compute.workers
+
+
+def allowed_bytes(config: RunConfig, workers: int) -> int:
+    """Return the memory that the run may take, in all: the setting, else half of what is free."""
+    if config.compute.max_memory is not None:
+        return config.compute.max_memory << 20
+    bands = BASE_BYTES + workers * (config.histogram.band_memory << 20)
+    return max(bands, (available_memory() or 0) // 2)
+
+
+def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
+    """Return the memory of a worker that counts a band of rows.
+
+    Args:
+        config: of the run.
+        workers: number of workers.
+        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    """
+    bytes_each = config.histogram.band_memory << 20
+    if limit is not None:
+        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
+    if config.compute.max_memory is None:
+        return bytes_each
+    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+
+
+def sweep_rows(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
+    """Return the rows that must stay together in a sweep: those of tiles, groups and chunks of the copy."""
+    step = max(config.run.tile, ROW_GROUP)
+    if config.input.mode == "copy":
+        step = math.lcm(step, chunk_shape(shape, dtype.itemsize)[1])
+    return step
+
+
+def sweep_bytes(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any], bins: int) -> int:
+    """Return the memory of the one pass over the input, the program included.
+
+    Args:
+        config: of the run.
+        shape: frames, rows, columns.
+        dtype: type of the samples.
+        bins: bins of a pixel.
+    """
+    n_frames, ny, nx = shape
+    return BASE_BYTES + ny * bytes_per_row(nx, n_frames, dtype.itemsize, bins, config.histogram)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run from camera files to the report takes.
+
+    Attributes:
+        shape: frames, rows, columns.
+        bins: bins of a pixel.
+        tiles: number of tiles.
+        tile: rows and columns of one.
+        workers: number of workers.
+        one_pass: the camera files are read once; else twice, by bands of rows.
+        input_bytes: of the camera files.
+        read_bytes: of the camera files, in all.
+        written_bytes: into the store, about.
+        held_bytes: largest resident memory of the process.
+        allowed_bytes: memory that it may take.
+        seconds: about, with nothing else running on the machine.
+    """
+
+    shape: tuple[int, int, int]
+    bins: int
+    tiles: int
+    tile: int
+    workers: int
+    one_pass: bool
+    input_bytes: int
+    read_bytes: int
+    written_bytes: int
+    held_bytes: int
+    allowed_bytes: int
+    seconds: float
+
+    def words(self) -> list[str]:
+        """Return the plan as ``--dry-run`` prints it."""
+        n, ny, nx = self.shape
+        how = "once" if self.one_pass else "twice, by bands of rows (more compute.max_memory: once)"
+        return [
+            f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tiles of {self.tile} x {self.tile}, "
+            f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
+            f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files {how}: "
+            f"{self.read_bytes / 1e9:.3g} GB in all; writes about {self.written_bytes / 1e9:.2g} GB",
+            f"plan: holds {self.held_bytes / 2**20:.0f} MiB at most, whatever the number of frames; "
+            f"{self.allowed_bytes / 2**20:.0f} MiB are allowed",
+            f"plan: about {max(self.seconds, 1):.0f} s on a quiet machine",
+        ]
+
+
+def make_plan(config: RunConfig, base_dir: Path) -> Plan:
+    """Look at the camera files and at their first frames, and say what the run takes.
+
+    Raises:
+        InputError: the input is bad.
+    """
+    from pchem_pipeline.frames.identity import file_size
+    from pchem_pipeline.frames.open import open_frames
+    from pchem_pipeline.frames.resolve import input_paths
+
+    frames = open_frames(config.input, base_dir)
+    n, ny, nx = frames.shape
+    workers = worker_count(config)
+    size = sum(file_size(path) for path in input_paths(config.input, base_dir))
+    bins, reading, sample = _first_frames(config, frames)
+    whole = sweep_bytes(config, frames.shape, frames.dtype, bins)
+    allowed = allowed_bytes(config, workers)
+    one_pass = whole <= allowed and config.compute.backend != "distributed"
+    bands = BASE_BYTES + min(whole - BASE_BYTES, workers * band_bytes(config, workers))
+    report = _REPORT_BYTES + _REPORT_PIXEL_BYTES * ny * nx
+    first = min(config.histogram.window_frames, n) / n
+    ensemble = n if config.ensemble.frames == "all" else min(config.ensemble.frames, n)
+    again = ensemble / n + (0 if one_pass else 1 + first)
+    copies = config.input.mode == "copy"
+    counting, fitting = _speeds(config, sample, bins, n)
+    samples = n * ny * nx
+    seconds = max(samples * reading, samples * (reading + counting) / workers)
+    seconds += (fitting * ny * nx + _REST_SECONDS + _REST_PIXEL_SECONDS * ny * nx) / workers
+    return Plan(
+        shape=frames.shape,
+        bins=bins,
+        tiles=math.ceil(ny / config.run.tile) * math.ceil(nx / config.run.tile),
+        tile=config.run.tile,
+        workers=workers,
+        one_pass=one_pass,
+        input_bytes=size,
+        read_bytes=round(size * (1 + (0 if copies else again))),
+        written_bytes=_written(config, frames.shape, frames.dtype),
+        held_bytes=max(whole if one_pass else bands, report),
+        allowed_bytes=allowed,
+        seconds=seconds * (1.5 if copies else 1.0),
+    )
+
+
+def _written(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
+    """Return about how many bytes the store takes."""
+    n, ny, nx = shape
+    blocks = n / config.histogram.block_frames
+    series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
+    total = _STORED_PIXEL * ny * nx + (_STORED_SERIES * series if config.histogram.summaries else 0)
+    if config.input.mode == "copy":
+        total += math.prod(shape) * dtype.itemsize / _COPY_RATIO
+    return round(total)
+
+
+def _first_frames(config: RunConfig, frames: FrameReader) -> tuple[int, float, NDArray[Any]]:
+    """Return the bins of the sensor, the seconds to read a sample, and the first frames of some rows."""
+    n, ny, nx = frames.shape
+    window = min(config.histogram.window_frames, n)
+    limit = min(config.histogram.max_bins, 1 << (8 * frames.dtype.itemsize))
+    ranges = np.zeros(limit + 2, np.int64)
+    spent = 0.0
+    step = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
+    for y0 in range(0, ny, step):
+        start = time.perf_counter()
+        block = frames.read(0, window, y0, min(y0 + step, ny))
+        spent += time.perf_counter() - start
+        accumulator = RangeAccumulator(block.shape[1:], block.dtype, window)
+        accumulator.add(block)
+        ranges += accumulator.finish(limit)
+    return choose_bins(ranges, limit), spent / (window * ny * nx), block[:, :ROW_GROUP]
+
+
+def _speeds(config: RunConfig, frames: NDArray[Any], bins: int, n_frames: int) -> tuple[float, float]:
+    """Return the seconds to count a sample, and to fit a pixel, both on one processor, tried on some rows."""
+    from pchem_pipeline.model.fit.pchem import fit_histograms
+
+    shape = (frames.shape[1], frames.shape[2])
+    histograms = HistogramAccumulator(shape, bins, n_frames)
+    summaries = SummaryAccumulator(shape, config.histogram.block_frames)
+    for _ in range(2):  # the first time loads the compiled loops
+        start = time.perf_counter()
+        histograms.add(frames)
+        summaries.add(frames)
+        line_sums(frames)
+        counting = (time.perf_counter() - start) / frames.size
+    rows = histograms.finish()
+    flat = {name: getattr(rows, name).ravel()[:_FIT_SAMPLE] for name in ("origin", "under", "over")}
+    counts = rows.counts.reshape(-1, bins)[:_FIT_SAMPLE]
+    fit_histograms(counts[:1], **{name: values[:1] for name, values in flat.items()}, settings=config.fit)
+    start = time.perf_counter()
+    fit_histograms(counts, **flat, settings=config.fit)
+    return counting, (time.perf_counter() - start) / counts.shape[0]

@@ -1,0 +1,300 @@
+"""Stage ``histogram``: per-pixel histograms, and summaries of what they lose, in one pass over the frames.
+
+The unit of work is a band of rows over the full width: its frames are read once, by blocks, the next block
+being read while one is counted. How high the bands are depends on the memory allowed, the result does not.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.model.histogram.count import (
+    RangeAccumulator,
+    RowHistograms,
+    choose_bins,
+    counts_dtype,
+)
+from pchem_pipeline.model.histogram.summaries import (
+    ROW_GROUP,
+    CovarianceMaps,
+    block_starts,
+    frame_statistics,
+)
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
+from pchem_pipeline.stages.histogram.bands import (
+    CHUNK_BLOCKS,
+    COLUMN_FRAMES,
+    Band,
+    bytes_per_row,
+    plan_bands,
+    row_frames,
+)
+from pchem_pipeline.stages.histogram.counting import BandCounter, Emit, TileCounter
+from pchem_pipeline.stages.histogram.dry_run import band_bytes
+from pchem_pipeline.stages.histogram.frame_source import FrameSource, open_source, read_ahead
+
+if TYPE_CHECKING:
+    from pchem_pipeline.compute.executor import Outcome
+    from pchem_pipeline.frames.histogram_files import HistogramInput
+    from pchem_pipeline.model.histogram.settings import HistogramSettings
+    from pchem_pipeline.store.tiles import Tile
+
+__all__ = [
+    "NAME",
+    "READS",
+    "SETTINGS",
+    "UPSTREAM",
+    "VERSION",
+    "WRITES",
+    "histogram_tile",
+    "run",
+]
+
+_THIS = DECLARED["histogram"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+
+_MAPS = ("origin", "under", "over", "minimum", "maximum")
+_COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
+#: samples that one process looks through in a second or so
+_FEW_SAMPLES = 1 << 31
+
+
+def histogram_tile(
+    blocks: Iterable[NDArray[Any]],
+    shape: tuple[int, int],
+    bins: int,
+    n_frames: int,
+    settings: HistogramSettings,
+    emit: Emit | None = None,
+) -> tuple[RowHistograms, CovarianceMaps | None]:
+    """Return histograms and covariances of the pixels of some rows.
+
+    Args:
+        blocks: all frames, (frame, y, x) each; the first of ``window_frames``, further ones of any length.
+        shape: rows (from the top of a group of rows) and columns.
+        bins: bins of a pixel.
+        n_frames: number of frames.
+        settings: the section ``histogram``.
+        emit: told of each piece of the arrays along time as it comes: the variable's name in the group
+            ``summary``, and its next rows (first axis: frame or block).
+
+    Returns:
+        The histograms, and the covariances, or None without summaries.
+
+    Raises:
+        InputError: DN of more than 24 bits.
+    """
+    counter = TileCounter(shape, bins, n_frames, settings, emit)
+    for frames in blocks:
+        counter.add(frames)
+    return counter.finish()
+
+
+# -- the stage ----------------------------------------------------------------------------------
+
+
+def _band_bytes(context: StageContext) -> int:
+    return band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
+
+
+def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
+    """Return the bands; say so where even the lowest possible ones need more memory than allowed."""
+    settings, tiles = context.config.histogram, context.tiles()
+    n_frames, _, columns = source.shape
+    row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
+    most = _band_bytes(context) // row
+    pending = {tile.key for tile in context.pending(tiles)}
+    bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
+    highest = max(band.y1 - band.y0 for band in bands)
+    if highest > most:
+        context.note(
+            f"{highest} rows of {columns} pixels, the least that a worker can take, need "
+            f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory or compute.max_memory "
+            "allow; lower histogram.window_frames, or --workers"
+        )
+    return bands
+
+
+def run(context: StageContext) -> None:
+    """Make histograms and summaries of all chosen tiles.
+
+    Raises:
+        InputError: the camera files vanished or changed.
+        StoreError: the input is not complete, or the store refuses.
+    """
+    if context.sensor.kind == "histograms":
+        _copy_histograms(context)
+        return
+    if context.is_swept:
+        context.run_units(context.tiles(), nothing_left)
+        _end(context, context.tiles())
+        return
+    source = open_source(context)
+    settings = context.config.histogram
+    if context.fresh or not context.store.has("histogram/counts"):
+        bins = _decide_bins(context, source)
+    else:
+        bins = context.store.array("histogram/counts").shape[2]
+    create_arrays(context, source.shape, bins)
+    bands = _bands(context, source, bins)
+    task = functools.partial(
+        _do_band,
+        store=context.store.path,
+        source=source,
+        bins=bins,
+        settings=settings,
+        threads=max(1, context.executor.workers // max(1, len(context.pending(bands)))),
+    )
+    done = context.run_units(bands, task, unit_name="band")
+    if len(done) == context.n_keys:
+        _end(context, bands)
+
+
+def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
+    """Do what needs the whole sensor."""
+    if number := sum(_pixels_outside(context, area) for area in areas):
+        bins = context.store.array("histogram/counts").shape[2]
+        context.note(
+            f"{number} pixels have DN outside of their {bins} bins; they are counted as under or over"
+        )
+    if context.config.histogram.summaries:
+        _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
+
+
+def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
+    region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
+    under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
+    return int(np.count_nonzero(under | over))
+
+
+def _decide_bins(context: StageContext, source: FrameSource) -> int:
+    """Return the number of bins of the sensor, from its first frames."""
+    limit = min(context.config.histogram.max_bins, 1 << (8 * source.dtype.itemsize))
+    settings = context.config.histogram
+    task = functools.partial(_ranges_of_band, source=source, frames=settings.window_frames, max_bins=limit)
+    outcomes: list[Outcome] = []
+    n_frames, _, columns = source.shape
+    row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
+    tiles = context.tiles()
+    most = _band_bytes(context) // row
+    everything = {tile.key for tile in tiles}
+    bands = plan_bands(tiles, everything, most, context.executor.workers, source.rows_per_read)
+    context.stop.check()
+    # starting other processes takes longer than this does on all but huge sensors
+    few = settings.window_frames * math.prod(source.shape[1:]) < _FEW_SAMPLES
+    executor = SerialExecutor() if few and not context.executor.shares_memory else context.executor
+    executor.map(task, bands, lambda band, outcome: outcomes.append(outcome))
+    for outcome in outcomes:
+        if outcome.error is not None:
+            raise outcome.error
+    return choose_bins(np.sum([outcome.value for outcome in outcomes], axis=0), limit)
+
+
+def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: int) -> NDArray[np.int64]:
+    n_frames, _, columns = source.shape
+    frames = min(frames, n_frames)
+    block = np.empty((frames, band.y1 - band.y0, columns), source.dtype)
+    source.read_into(block, 0, frames, band.y0, band.y1)
+    ranges = RangeAccumulator(block.shape[1:], source.dtype, frames)
+    ranges.add(block)
+    return ranges.finish(max_bins)
+
+
+def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
+    """Make the arrays of the stage for a stack of some shape (frames, rows, columns)."""
+    n_frames, ny, nx = shape
+    settings, tile = context.config.histogram, context.config.run.tile
+    context.create(
+        "histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
+    )
+    context.create_maps([f"histogram/{name}" for name in _MAPS])
+    if not settings.summaries:
+        context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
+        return
+    context.create_maps([f"summary/{name}" for name in _COVARIANCES])
+    for name, length in (("open_sums", 7), ("open_covariances", 3)):
+        context.create(f"summary/{name}", (length, ny, nx), chunks=(length, tile, tile))
+    starts = block_starts(n_frames, settings.block_frames)
+    rows = max(tile, ROW_GROUP)
+    for name in ("block_sum", "block_sum_square"):
+        context.create(f"summary/{name}", (starts.size, ny, nx), chunks=(CHUNK_BLOCKS, rows, nx))
+    for name in ("row_sum", "row_sum_square"):
+        context.create(f"summary/{name}", (n_frames, ny), chunks=(row_frames(ny), rows))
+    context.create(
+        "summary/column_sum",
+        (n_frames, -(-ny // ROW_GROUP), nx),
+        chunks=(COLUMN_FRAMES, rows // ROW_GROUP, nx),
+        rows=ROW_GROUP,
+    )
+    if context.fresh:
+        context.store.write_array("summary/block_start", starts, {"frames": n_frames})
+
+
+def _do_band(
+    band: Band, *, store: Path, source: FrameSource, bins: int, settings: HistogramSettings, threads: int
+) -> None:
+    """Count a band and write its chunks."""
+    rows = (band.y0, band.y1)
+    counter = BandCounter(store, rows, source.shape, bins, settings)
+    for frames in read_ahead(source, rows, settings.window_frames, threads):
+        counter.add(frames)
+    counter.finish()
+
+
+def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
+    """Derive the statistics of whole frames from the row sums, when all bands are there."""
+    n_frames, ny, nx = shape
+    mean, variance = np.empty(n_frames), np.empty(n_frames)
+    step = row_frames(ny)
+    for t in range(0, n_frames, step):
+        part = slice(t, min(t + step, n_frames))
+        sums, squares = (
+            context.store.read(f"summary/{name}", (part, slice(None)))
+            for name in ("row_sum", "row_sum_square")
+        )
+        mean[part], variance[part] = frame_statistics(sums, squares, nx)
+    context.store.write_array("summary/frame_mean", mean)
+    context.store.write_array("summary/frame_variance", variance)
+
+
+# -- ready-made histograms ----------------------------------------------------------------------
+
+
+def _copy_histograms(context: StageContext) -> None:
+    """Take ready-made histograms as they are; order in time and neighbours are not known."""
+    from pchem_pipeline.frames.histogram_files import read_histograms
+
+    given = read_histograms(context.config.input, context.base_dir)
+    ny, nx, bins = given.counts.shape
+    tile = context.config.run.tile
+    context.create("histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=given.counts.dtype)
+    context.create_maps([f"histogram/{name}" for name in _MAPS])
+    context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
+    task = functools.partial(_copy_tile, store=context.store.path, given=given)
+    context.run_units(context.tiles(), task)
+
+
+def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
+    counts, origin = given.counts[tile.region], given.origin[tile.region]
+    occupied = counts > 0
+    last = counts.shape[2] - 1
+    values = RowHistograms(
+        counts=counts,
+        origin=origin,
+        under=np.zeros(origin.shape, np.uint32),
+        over=np.zeros(origin.shape, np.uint32),
+        minimum=(origin + occupied.argmax(axis=2)).astype(np.int32),
+        maximum=(origin + last - occupied[:, :, ::-1].argmax(axis=2)).astype(np.int32),
+    )
+    for name, part in vars(values).items():
+        open_store(store).write(f"histogram/{name}", tile.region, part)

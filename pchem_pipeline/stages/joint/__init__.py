@@ -1,0 +1,1 @@
+"""Stage ``joint``: several exposures of the same pixels fitted together."""

@@ -1,0 +1,1 @@
+"""Stage ``methods``: other characterisation methods on the same pixels."""

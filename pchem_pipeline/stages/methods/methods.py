@@ -1,0 +1,280 @@
+"""Stage ``methods``: the other characterisation methods on the run's pixels, and on simulated ones.
+
+It is not part of ``run``. Its units are the run's pixels and each read noise of the simulation; each leaves
+its numbers in its marker, so that a stopped comparison goes on where it was.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.methods.base import FloatArray, PixelSamples, Sample, Settings
+from pchem_pipeline.methods.compare import MethodResult, compare
+from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.settings import MethodsSettings
+from pchem_pipeline.methods.study import StudyPoint, study_point
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.run.other_runs import open_other_runs
+from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.methods.result import METHODS_FILE
+
+if TYPE_CHECKING:
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = [
+    "NAME",
+    "READS",
+    "SETTINGS",
+    "UPSTREAM",
+    "VERSION",
+    "WRITES",
+    "choose",
+    "identity",
+    "methods_tile",
+    "run",
+]
+
+_THIS = DECLARED["methods"]
+NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
+SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+identity = _THIS.identity
+
+#: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
+_NO_REFERENCE = FAILED | FitStatus.BIAS_AMBIGUOUS
+_BAND_BYTES = 64 << 20
+_DARK_LIMIT = 0.01  # e-: more electrons in the dark sample are remarked
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """The run's pixels, or one read noise of the simulation."""
+
+    key: str
+    point: StudyPoint | None = None
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its marker."""
+        return (self.key,)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Does a unit."""
+
+    store: Path
+    others: tuple[Path, ...]
+    settings: MethodsSettings
+    adc_limits: tuple[int, int] | None
+
+    def __call__(self, unit: _Unit) -> dict[str, Any]:
+        """Compare the methods and return the numbers as plain data."""
+        numbers = Settings(self.settings.em_iterations, self.settings.em_tolerance)
+        if unit.point is not None:
+            return study_point(unit.point, numbers)
+        return _compare_run(self, numbers)
+
+
+def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> NDArray[np.int64]:
+    """Choose pixels at random places, so that no pattern of rows or columns is favoured.
+
+    Args:
+        shape: rows and columns of the sensor.
+        n_pixels: how many; all if there are fewer.
+        seed: of the choice.
+
+    Returns:
+        Flat indices, increasing.
+    """
+    total = shape[0] * shape[1]
+    chosen = np.random.default_rng(seed).permutation(total)[: min(n_pixels, total)]
+    return np.sort(chosen).astype(np.int64)
+
+
+def methods_tile(
+    pixels: PixelSamples, reference: FloatArray | None, settings: Settings, *, ours: bool
+) -> list[MethodResult]:
+    """Return what every method makes of some pixels; pure.
+
+    Args:
+        pixels: their samples.
+        reference: (H, g, mu, sigma) held for true, shape (n, 4), or None.
+        settings: of the methods.
+        ours: the reference is the fit of the run itself, against which PCH-EM cannot err.
+    """
+    return compare(pixels, reference, settings, skip_errors=("pchem_em",) if ours else ())
+
+
+def run(context: StageContext) -> None:
+    """Write ``methods.json`` and the estimates of every method.
+
+    Raises:
+        ConfigError: a run is listed twice.
+        InputError: another run is of other pixels.
+        StoreError: a run is missing or the store cannot be written.
+    """
+    settings = context.config.methods
+    others = open_other_runs(context.store, context.base_dir, settings.with_runs)
+    n_pixels = min(settings.pixels, context.sensor.ny * context.sensor.nx)
+    for name in ("pixel_y", "pixel_x"):
+        context.create(f"methods/{name}", (n_pixels,), chunks=(n_pixels,))
+    names = list(methods())
+    for name in PARAMETERS:
+        shape = (len(names), n_pixels)
+        context.create(f"methods/{name}", shape, chunks=shape, methods=names)
+    units = [_Unit("run"), *_study_units(context, settings)]
+    task = _Task(context.store.path, tuple(o.path for o in others), settings, context.adc_limits)
+    found = context.run_units(units, task, unit_name="part", by_tiles=False)
+    if not {unit.key for unit in units} <= found.keys():
+        return
+    result = {
+        "schema": 1,
+        "run": context.store.path.name,
+        **found["run"],
+        "study": [found[unit.key] for unit in units[1:]],
+        "study_at": _conditions(units[1:]),
+    }
+    for remark in result["remarks"]:
+        context.note(remark)
+    context.store.write_file(METHODS_FILE, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _conditions(units: Sequence[_Unit]) -> dict[str, Any] | None:
+    if not units or units[0].point is None:
+        return None
+    point = units[0].point
+    names = ("quanta_exposure", "conversion_gain", "n_frames", "n_pixels")
+    return {name: getattr(point, name) for name in names}
+
+
+def _study_units(context: StageContext, settings: MethodsSettings) -> list[_Unit]:
+    """Return the points of the simulation, at the median exposure, gain and number of frames of the run."""
+    store = context.store
+    gain = store.read("fit/conversion_gain")
+    if settings.study_pixels == 0 or not np.isfinite(gain).any():
+        return []
+    exposure = float(np.nanmedian(store.read("fit/quanta_exposure")))
+    place = choose(context.sensor.shape, 64, settings.seed)
+    frames = int(np.median(_sample(store, context.sensor.shape, place).counts.sum(axis=1)))
+    return [
+        _Unit(
+            f"study-{noise:g}",
+            StudyPoint(
+                noise, exposure, float(np.nanmedian(gain)), frames, settings.study_pixels, settings.seed
+            ),
+        )
+        for noise in dict.fromkeys(settings.study_read_noise)
+    ]
+
+
+def _compare_run(task: _Task, numbers: Settings) -> dict[str, Any]:
+    """Compare the methods on the run's pixels, and store their estimates."""
+    store = open_store(task.store)
+    shape = store.array("fit/bias").shape
+    place = choose((shape[0], shape[1]), task.settings.pixels, task.settings.seed)
+    stores = [store, *(_readable(path) for path in task.others)]
+    samples = tuple(_sample(each, (shape[0], shape[1]), place) for each in stores)
+    reference, words = _reference(store, place)
+    pixels = PixelSamples(samples, task.adc_limits)
+    results = methods_tile(pixels, reference, numbers, ours=words == "fit")
+    y, x = np.divmod(place, shape[1])
+    everything = (slice(None),)
+    store.write("methods/pixel_y", everything, y.astype(np.int32))
+    store.write("methods/pixel_x", everything, x.astype(np.int32))
+    blank = np.full((place.size, 4), np.nan)
+    estimates = np.stack([blank if r.estimates is None else r.estimates for r in results])
+    for column, name in enumerate(PARAMETERS):
+        store.write(f"methods/{name}", (slice(None), slice(None)), estimates[:, :, column])
+    return {
+        "pixels": int(place.size),
+        "reference": words,
+        "samples": _sample_words(stores, samples, reference),
+        "remarks": _remarks(stores, samples, reference),
+        "methods": [result.as_json() for result in results],
+    }
+
+
+@functools.lru_cache(maxsize=8)
+def _readable(path: Path) -> RunStore:
+    from pchem_pipeline.store.run_store import RunStore
+
+    return RunStore.open(path)
+
+
+def _sample(store: RunStore, shape: tuple[int, int], place: NDArray[np.int64]) -> Sample:
+    """Read the histograms of some pixels, a band of rows at a time."""
+    counts = store.array("histogram/counts")
+    row_bytes = shape[1] * counts.shape[2] * counts.dtype.itemsize
+    rows = max(counts.chunks[0], _BAND_BYTES // max(row_bytes, 1))
+    taken = []
+    for first in range(0, shape[0], rows):
+        last = min(first + rows, shape[0])
+        inside = place[(place >= first * shape[1]) & (place < last * shape[1])] - first * shape[1]
+        if inside.size:
+            band = store.read("histogram/counts", (slice(first, last), slice(None), slice(None)))
+            taken.append(band.reshape(-1, band.shape[2])[inside])
+    origin = store.read("histogram/origin").ravel()[place].astype(np.int64)
+    return Sample(np.concatenate(taken), origin)
+
+
+def _reference(store: RunStore, place: NDArray[np.int64]) -> tuple[FloatArray, str]:
+    """Return what is held for true, and whether it is the truth or the fit of the run."""
+    if store.has("truth/read_noise_e"):
+        truth = {
+            name: store.read(f"truth/{name}").ravel()[place] for name in (*PARAMETERS[:3], "read_noise_e")
+        }
+        noise = truth["read_noise_e"] / truth["conversion_gain"]
+        columns = [truth["quanta_exposure"], truth["conversion_gain"], truth["bias"], noise]
+        return np.stack(columns, axis=1).astype(np.float64), "truth"
+    fit = np.stack([store.read(f"fit/{name}").ravel()[place] for name in PARAMETERS], axis=1)
+    fit[(store.read("fit/fit_status").ravel()[place] & int(_NO_REFERENCE)) != 0] = np.nan
+    return fit, "fit"
+
+
+def _sample_words(
+    stores: Sequence[RunStore], samples: Sequence[Sample], reference: FloatArray
+) -> list[dict[str, Any]]:
+    """Describe the samples: name, frames, and the median exposure that the reference gives them."""
+    found = []
+    for store, sample in zip(stores, samples, strict=True):
+        moments = sample.moments()
+        exposure = reference[:, 1] * (moments.mean - reference[:, 2])
+        known = exposure[np.isfinite(exposure)]
+        found.append(
+            {
+                "run": store.path.name,
+                "n_frames": int(np.median(moments.n_frames)),
+                "quanta_exposure": float(np.median(known)) if known.size else None,
+            }
+        )
+    return found
+
+
+def _remarks(stores: Sequence[RunStore], samples: Sequence[Sample], reference: FloatArray) -> list[str]:
+    """Say what the comparison lacks."""
+    if len(samples) == 1:
+        return [
+            "one sample: methods that need dark frames or a series were left out of the run's table; "
+            "give runs of the same pixels at other exposures with --with"
+        ]
+    words = _sample_words(stores, samples, reference)
+    darkest = min(
+        words, key=lambda each: np.inf if each["quanta_exposure"] is None else each["quanta_exposure"]
+    )
+    exposure = darkest["quanta_exposure"]
+    if exposure is not None and exposure > _DARK_LIMIT:
+        return [
+            f"the darkest sample, {darkest['run']}, is not free of electrons (H = {exposure:.3g} e-): "
+            "methods that take it for the bias are off by as much"
+        ]
+    return []

@@ -1,0 +1,1 @@
+"""Stage ``report``: the page, its numbers and its figures."""

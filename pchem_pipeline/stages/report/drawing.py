@@ -1,0 +1,62 @@
+"""Drawing the figures of a report with the workers of the run, and telling how far it is."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+
+from pchem_pipeline.compute.environment import available_workers
+from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor
+from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import DrawAll, Drawn, draw_exhibit
+from pchem_pipeline.run.progress import Reporter
+
+__all__ = ["draw_by_workers", "drawing_executor", "drawing_workers"]
+
+
+def drawing_executor(workers: int, n_figures: int) -> Executor:
+    """Return who draws: processes, since drawing shares its settings within one; here, if one is enough."""
+    count = min(workers, available_workers(), n_figures)
+    return FreshProcessExecutor(count) if count > 1 else SerialExecutor()
+
+
+def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
+    """Return how many processes may draw: as asked for, else as the run's section ``compute`` says."""
+    if wanted is not None:
+        return wanted
+    return available_workers() if settings.workers == "auto" else settings.workers
+
+
+def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
+    """Return a function that draws figures with up to so many processes.
+
+    It raises the first error of a figure once the others are drawn.
+
+    Args:
+        workers: of the run.
+        reporter: hears of each figure.
+        label: of the bar.
+    """
+
+    def draw(exhibits: Sequence[Exhibit], settings: ReportSettings) -> Mapping[str, Drawn]:
+        drawn: dict[str, Drawn] = {}
+        errors: list[BaseException] = []
+        executor = drawing_executor(workers, len(exhibits))
+        with reporter.progress(label, len(exhibits), "figure") as advance:
+
+            def on_result(exhibit: Exhibit, outcome: Outcome) -> None:
+                advance()
+                if outcome.error is None:
+                    drawn[exhibit.name] = outcome.value
+                else:
+                    errors.append(outcome.error)
+
+            executor.map(functools.partial(draw_exhibit, settings=settings), exhibits, on_result)
+        if errors:
+            raise errors[0]
+        return drawn
+
+    return draw
