@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = ["MOST_PEAKS", "peaks_tile"]
 
@@ -12,7 +13,7 @@ __all__ = ["MOST_PEAKS", "peaks_tile"]
 MOST_PEAKS = 64
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def smooth(counts: NDArray[np.integer], width: float, out: NDArray[np.float64]) -> None:
     """Fill ``out`` with the histogram convolved with a Gaussian of standard deviation ``width`` bins."""
     reach = max(1, int(np.ceil(4 * width)))
@@ -25,7 +26,7 @@ def smooth(counts: NDArray[np.integer], width: float, out: NDArray[np.float64]) 
                 out[j] += counts[i] * kernel[j - i + reach]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def summit(values: NDArray[np.float64], around: float, reach: float) -> tuple[float, float]:
     """Return place and height of the largest local maximum near a place; height 0 where there is none.
 
@@ -44,7 +45,7 @@ def summit(values: NDArray[np.float64], around: float, reach: float) -> tuple[fl
     return best + shift, np.exp(middle - 0.25 * (left - right) * shift)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def walk(
     values: NDArray[np.float64],
     noise: float,
@@ -84,7 +85,7 @@ def walk(
     return found
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def peaks_pixel(counts: NDArray[np.integer], spacing: float, width: float, out: NDArray[np.float64]) -> None:
     """Estimate one pixel; see :func:`peaks_tile`."""
     values = np.empty(counts.size)
@@ -119,7 +120,7 @@ def peaks_pixel(counts: NDArray[np.integer], spacing: float, width: float, out: 
     out[4] = valley / (0.5 * (heights[pair] + heights[pair + 1]))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def peaks_tile(
     counts: NDArray[np.integer],
     spacing: NDArray[np.float64],

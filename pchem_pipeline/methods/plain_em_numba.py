@@ -6,15 +6,16 @@ Nothing here is shared with the fit of this package, so that the two can be comp
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = ["em_tile"]
 
 _SMALL = 1e-17  # terms below this share of their sum are left out
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def mean_electrons(x: float, theta: NDArray[np.float64]) -> tuple[float, float]:
     """Return the posterior mean of k and of k^2 given x, eq. (gamma_nk); theta: (H, 1/g, mu, sigma)."""
     exposure, step, bias, sigma = theta
@@ -49,7 +50,7 @@ def mean_electrons(x: float, theta: NDArray[np.float64]) -> tuple[float, float]:
     return one / total, two / total
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def em_pixel(
     counts: NDArray[np.integer],
     theta: NDArray[np.float64],
@@ -109,7 +110,7 @@ def em_pixel(
     return max_iterations
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def em_tile(
     counts: NDArray[np.integer],
     parameters: NDArray[np.float64],

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.simulate.streams_numba import (
     normal_from_uniform,
     poisson_start,
@@ -18,7 +18,7 @@ __all__ = ["draw_rows", "simulate_rows"]
 _LINEAR = 48
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _look_up(table, n, u):  # type: ignore[no-untyped-def]
     if n <= _LINEAR:
         i = 0
@@ -36,7 +36,7 @@ def _look_up(table, n, u):  # type: ignore[no-untyped-def]
     return low
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _widest(mean):  # type: ignore[no-untyped-def]
     widest = 1
     for x in range(mean.size):
@@ -45,7 +45,7 @@ def _widest(mean):  # type: ignore[no-untyped-def]
     return widest
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def simulate_rows(  # type: ignore[no-untyped-def]
     exposure, gain, bias, noise, frames, ys, xs, k0, k1, top, dn, electrons
 ):
@@ -79,7 +79,7 @@ def simulate_rows(  # type: ignore[no-untyped-def]
                     electrons[t, y, x] = k[x]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def draw_rows(exposure, noise, frames, ys, xs, k0, k1, charge, read_noise):  # type: ignore[no-untyped-def]
     """Fill ``charge`` and ``read_noise`` (frame, y, x), e-, with the draws of :func:`simulate_rows`.
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = [
     "fill_uniform",
@@ -33,7 +34,7 @@ _TO_UNIT = 2.0**-52
 _LARGEST = 1.0 - 2.0**-53
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def philox_block(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
     """Return the four 32-bit words of one Philox4x32-10 block, as uint64 (arguments: uint64 below 2**32)."""
     for _ in range(10):
@@ -45,7 +46,7 @@ def philox_block(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
     return c0, c1, c2, c3
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def uniform_row(frame, y, xs, draw, k0, k1, first, second):  # type: ignore[no-untyped-def]
     """Fill ``first`` and ``second`` with the uniforms in (0, 1) of a row's positions (all uint64)."""
     for i in range(xs.size):
@@ -55,7 +56,7 @@ def uniform_row(frame, y, xs, draw, k0, k1, first, second):  # type: ignore[no-u
         second[i] = (np.float64(((c << _HALF) | d) >> _SHIFT) + 0.5) * _TO_UNIT
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def fill_uniform(frames, ys, xs, draw, k0, k1, first, second):  # type: ignore[no-untyped-def]
     """Fill two (frame, y, x) arrays with the uniforms of all combinations of the coordinates (uint64)."""
     for t in range(frames.size):
@@ -126,19 +127,19 @@ _FAR_DEN = (
 )
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _polynomial(c, r):  # type: ignore[no-untyped-def]
     upper = (((c[0] * r + c[1]) * r + c[2]) * r + c[3]) * r
     return (((upper + c[4]) * r + c[5]) * r + c[6]) * r + c[7]
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _normal_centre(q):  # type: ignore[no-untyped-def]
     r = 0.180625 - q * q
     return q * _polynomial(_CENTRE_NUM, r) / _polynomial(_CENTRE_DEN, r)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _normal_tail(q, tail):  # type: ignore[no-untyped-def]
     r = math.sqrt(-math.log(tail))
     if r <= 5.0:
@@ -148,7 +149,7 @@ def _normal_tail(q, tail):  # type: ignore[no-untyped-def]
     return -z if q < 0.0 else z
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def normal_from_uniform(p, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` with standard normal quantiles of ``p`` (1-D), Wichura 1988, AS 241, PPND16.
 
@@ -162,7 +163,7 @@ def normal_from_uniform(p, out):  # type: ignore[no-untyped-def]
             out[i] = _normal_tail(q, p[i] if q < 0.0 else 1.0 - p[i])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def poisson_start(mean):  # type: ignore[no-untyped-def]
     """Return the first electron number whose probability matters, its probability, and the last one."""
     spread = 9.0 * math.sqrt(mean)
@@ -179,7 +180,7 @@ def poisson_start(mean):  # type: ignore[no-untyped-def]
     return first, math.exp(-stirling - deviance) / math.sqrt(2.0 * math.pi * first), last
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def poisson_quantile(u, mean):  # type: ignore[no-untyped-def]
     """Return the smallest k with P(K <= k) >= u for K ~ Poisson(mean), by adding up the masses."""
     k, mass, last = poisson_start(mean)
@@ -191,14 +192,14 @@ def poisson_quantile(u, mean):  # type: ignore[no-untyped-def]
     return k
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def poisson_from_uniform(u, mean, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` with the Poisson quantiles of ``u`` (all 1-D, same length)."""
     for i in range(u.size):
         out[i] = poisson_quantile(u[i], mean[i])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def poisson_table(mean, table):  # type: ignore[no-untyped-def]
     """Write the cumulative masses into ``table``; return (first k, number of entries).
 

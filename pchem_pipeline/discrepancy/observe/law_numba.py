@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = ["COLUMNS", "NOTHING", "N_COLUMNS", "N_NUISANCE", "N_TESTS", "fill_law", "supports", "within"]
 
@@ -36,7 +37,7 @@ _NARROW = 0.7
 NOTHING = 1e-14
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def electron_range(exposure: float, negligible: float) -> tuple[int, int]:
     """Return the smallest and largest electron number with at least the negligible probability."""
     mode = int(exposure)
@@ -52,7 +53,7 @@ def electron_range(exposure: float, negligible: float) -> tuple[int, int]:
     return first, last
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _cell_mass(low: float, high: float) -> float:
     """Return the standard normal mass between two numbers, exact in both tails."""
     root = 0.7071067811865476
@@ -63,7 +64,7 @@ def _cell_mass(low: float, high: float) -> float:
     return 0.5 * (math.erf(high * root) - math.erf(low * root))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _add_peak(
     weight: float,
     one: float,
@@ -121,7 +122,7 @@ def _add_peak(
         edge1, edge2, edge3, edge4 = up1, up2, up3, up4
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def fill_law(
     exposure: float, step: float, offset: float, width: float, first: int, last: int, law: FloatArray
 ) -> None:
@@ -158,7 +159,7 @@ def fill_law(
         )
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def supports(
     exposure: FloatArray,
     step: FloatArray,
@@ -176,7 +177,7 @@ def supports(
         codes[p, 1] = math.ceil(bias[p] + last * step[p] + REACH * width[p])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def within(law: FloatArray, n: float, allowed: float) -> tuple[int, int, float, float]:
     """Return the first and last code of the support, and what is expected below and above it."""
     low, below = 0, 0.0

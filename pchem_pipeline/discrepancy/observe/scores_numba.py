@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.discrepancy.observe.law_numba import N_COLUMNS, N_NUISANCE, N_TESTS
 
 __all__ = ["pixel_scores", "whiten"]
@@ -26,7 +26,7 @@ _N_DIRECTIONS = N_NUISANCE - 1
 _SINGULAR = 1e-9
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
     """Make the first columns of ``law`` orthonormal, and the tests orthogonal to them.
 
@@ -66,7 +66,7 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
     return True
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _fit_covariance(gram: FloatArray, covariance: FloatArray, inverse: FloatArray) -> None:
     """Fill the covariance of the fit, times n, along C1, He1, He1 C1, He2 from the triangular factor."""
     inverse[:] = 0.0
@@ -85,7 +85,7 @@ def _fit_covariance(gram: FloatArray, covariance: FloatArray, inverse: FloatArra
             covariance[i, j] = total
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _curvature(covariance: FloatArray, exposure: float, curvature: FloatArray) -> None:
     """Fill the coefficients of the tests in ``sum_ab cov(a, b) D_a D_b p``, in the order of the columns.
 
@@ -105,7 +105,7 @@ def _curvature(covariance: FloatArray, exposure: float, curvature: FloatArray) -
     curvature[7] = 2.0 * covariance[2, 3]  # He3C1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def pixel_scores(
     law: FloatArray, inverse: FloatArray, seen: FloatArray, gram: FloatArray, exposure: float, out: FloatArray
 ) -> None:

@@ -11,8 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = ["LAGS", "count_repeats", "find_hits", "sum_block"]
 
@@ -23,7 +24,7 @@ Float32Array = NDArray[np.float32]
 LAGS = 3
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _look_up(
     frames: NDArray[Any],
     support: NDArray[np.int32],
@@ -44,7 +45,7 @@ def _look_up(
             readout[LAGS + j, y, x] = tables[at, 1]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sum_half(
     charge: Float32Array, readout: Float32Array, weights: Float32Array, j: int, y: int, begin: int, end: int
 ) -> tuple[Any, Any, Any]:
@@ -73,7 +74,7 @@ def _sum_half(
     return k0 + k1, r0 + r1, g0 + g1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sum_rows(
     charge: Float32Array,
     readout: Float32Array,
@@ -94,7 +95,7 @@ def _sum_rows(
         gain[t] += left[2] + right[2]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _add(
     values: Float32Array, channel: int, y: int, done: int, size: int, columns: Float32Array, block: FloatArray
 ) -> None:
@@ -107,14 +108,14 @@ def _add(
             block[channel, y, x] += values[LAGS + j, y, x]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _subtract(values: Float32Array, pattern: Float32Array, amount: np.float32, j: int) -> None:
     for y in range(pattern.shape[0]):
         for x in range(pattern.shape[1]):
             values[j, y, x] -= amount * pattern[y, x]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _add_lagged(
     now: Float32Array,
     before: Float32Array,
@@ -131,7 +132,7 @@ def _add_lagged(
             total[which, y, x] += now[LAGS + j, y, x] * before[LAGS + j - lag, y, x]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _add_neighbours(
     charge: Float32Array, readout: Float32Array, y: int, dy: int, dx: int, size: int, total: FloatArray
 ) -> None:
@@ -146,7 +147,7 @@ def _add_neighbours(
             total[2, y, x] += one + charge[j, y, x] * readout[j, y + dy, x + dx]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_block(
     frames: NDArray[Any],
     support: NDArray[np.int32],
@@ -215,7 +216,7 @@ def sum_block(
             readout[j] = readout[size + j]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def count_repeats(frames: NDArray[Any], consecutive: NDArray[np.bool_], repeated: NDArray[np.bool_]) -> int:
     """Mark frames equal to the one before, and return the number of such rows in the other frames.
 
@@ -242,7 +243,7 @@ def count_repeats(frames: NDArray[Any], consecutive: NDArray[np.bool_], repeated
     return found
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def find_hits(frames: NDArray[Any], pixels: IntArray, last: IntArray, hits: IntArray) -> int:
     """Fill ``hits`` (frame, y, x, DN) with samples of pixels (m, 2) above ``last``; return how many."""
     found = 0

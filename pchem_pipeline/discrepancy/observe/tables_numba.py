@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.discrepancy.observe.law_numba import (
     N_COLUMNS,
     N_NUISANCE,
@@ -31,7 +31,7 @@ EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
 _FOLD = 16
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _goodness(
     law: FloatArray, seen: FloatArray, expected: FloatArray, n: float, smallest: float
 ) -> tuple[float, float, float]:
@@ -64,7 +64,7 @@ def _goodness(
     return chi2, mean, variance
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _channels(
     mass: FloatArray,
     charge: FloatArray,
@@ -110,7 +110,7 @@ def _channels(
     out[7] = mean_k
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _code_sums(
     law: FloatArray,
     seen: FloatArray,
@@ -166,7 +166,7 @@ def _code_sums(
                 bin_covariance[begin + a, begin + b] -= value * binned[i, b]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _count(
     counts: NDArray[Any], origin: int, first: int, seen: FloatArray, axis: int, codes: FloatArray
 ) -> tuple[float, float]:
@@ -189,7 +189,7 @@ def _count(
     return low, high
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _fill_tables(
     law: FloatArray,
     inverse: FloatArray,
@@ -210,7 +210,7 @@ def _fill_tables(
         table[1, x] = x - offset - k * step
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: FloatArray) -> None:
     """Fill what is expected of each code, the parameters moved (first order) to suit the samples."""
     total = np.zeros(N_NUISANCE)
@@ -224,7 +224,7 @@ def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: Fl
             expected[x] += total[i] * law[x, i]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def summarise_pixels(
     counts: NDArray[Any],
     origin: IntArray,

@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.ensemble.ensemble_numba import _capacity, poisson_weights
 
 __all__ = ["convert_frames", "count_errors", "electron_of_dn", "sum_cell_probabilities", "tally_electrons"]
@@ -20,7 +20,7 @@ IntArray = NDArray[np.int64]
 LONGEST_TABLE = 4096
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _threshold(k: int, exposure: float, gain: float, bias: float, noise: float) -> float:
     """Return the boundary between k and k + 1; ``noise`` is g sigma^2."""
     if exposure == 0.0:
@@ -28,7 +28,7 @@ def _threshold(k: int, exposure: float, gain: float, bias: float, noise: float) 
     return bias + (k + 0.5) / gain + noise * math.log((k + 1.0) / exposure)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def electron_of_dn(dn: float, exposure: float, gain: float, bias: float, noise: float, start: int) -> int:
     """Return the electron number of a DN: how many thresholds lie below it, tried from ``start``."""
     k = start
@@ -39,12 +39,12 @@ def electron_of_dn(dn: float, exposure: float, gain: float, bias: float, noise: 
     return k
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _guess(dn: float, gain: float, bias: float) -> int:
     return max(0, int((dn - bias) * gain))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def convert_frames(
     frames: NDArray[Any],
     exposure: FloatArray,
@@ -106,7 +106,7 @@ def convert_frames(
                     out[t, y, x] = min(k, largest)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def count_errors(
     estimated: NDArray[np.uint16], true: NDArray[np.uint16], missing: int, errors: IntArray
 ) -> tuple[np.int64, np.int64]:
@@ -131,7 +131,7 @@ def count_errors(
     return compared, signed
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def tally_electrons(
     counts: NDArray[Any],
     origin: IntArray,
@@ -158,14 +158,14 @@ def tally_electrons(
     return beyond
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _upper_edge(k: int, exposure: float, gain: float, bias: float, noise: float) -> float:
     """Return the end of cell k on the continuous axis before rounding: its last integer DN plus one half."""
     threshold = _threshold(k, exposure, gain, bias, noise)
     return math.floor(threshold) + 0.5 if threshold < math.inf else math.inf
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_cell_probabilities(
     exposure: FloatArray,
     gain: FloatArray,

@@ -10,8 +10,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = [
     "add_density",
@@ -35,7 +36,7 @@ SMALLEST = 1e-18
 NARROW = 1.0
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
     """Fill ``weights[k] = P(K = k)`` for the k that matter and return the first and the last of them.
 
@@ -60,7 +61,7 @@ def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
     return low, high
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def add_density(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
     """Add ``weight * phi(base + i; centre, sigma^2)`` to ``out[i]``, by two multiplications a point."""
     first = max(0, math.ceil(centre - REACH * sigma - base))
@@ -85,7 +86,7 @@ def add_density(out: FloatArray, base: float, weight: float, centre: float, sigm
         out[i] += value
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def add_mass(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
     """Add ``weight`` times the mass of N(centre, sigma^2) between ``base + i -+ 1/2`` to ``out[i]``."""
     first = max(0, math.floor(centre - REACH * sigma - base + 0.5))
@@ -98,7 +99,7 @@ def add_mass(out: FloatArray, base: float, weight: float, centre: float, sigma: 
         below = above
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def add_component(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
     """Add a component of the PCD at the integers ``base + i``: its density, or its mass if narrow."""
     if sigma >= NARROW:
@@ -107,7 +108,7 @@ def add_component(out: FloatArray, base: float, weight: float, centre: float, si
         add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - 1.0 / 12.0, 1e-12)))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _capacity(exposure: FloatArray) -> int:
     largest = 0.0
     for p in range(exposure.size):
@@ -115,7 +116,7 @@ def _capacity(exposure: FloatArray) -> int:
     return int(largest + 12.0 * math.sqrt(largest) + 40.0)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_pcd_pixels(
     exposure: FloatArray,
     gain: FloatArray,
@@ -156,7 +157,7 @@ def sum_pcd_pixels(
             _add_nuced(part, base, gain[p], bias[p], width, nuced_start, nuced, nuced_square)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _add_nuced(
     part: FloatArray,
     base: float,
@@ -183,7 +184,7 @@ def _add_nuced(
         nuced_square[bin_open] += held * held
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_pcd_cells(
     share: FloatArray,
     exposure: FloatArray,
@@ -201,7 +202,7 @@ def sum_pcd_cells(
             add_component(out, float(dn_start), share[c] * weights[k], bias[c] + k / gain[c], sigma[c])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_nuced_cells(
     share: FloatArray,
     exposure: FloatArray,
@@ -218,7 +219,7 @@ def sum_nuced_cells(
             add_mass(out, float(nuced_start), share[c] * weights[k], k / width, sigma_e[c] / width)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_nuced_product(
     electron_mass: FloatArray,
     sigma_share: FloatArray,
@@ -235,7 +236,7 @@ def sum_nuced_product(
                 add_mass(out, base, sigma_share[m] * electron_mass[k], k / width, sigma_e[m] / width)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_poisson(share: FloatArray, exposure: FloatArray, out: FloatArray) -> None:
     """Add ``share`` times the Poisson mass of each exposure at k = 0, 1, ... up to the end of ``out``."""
     weights = np.zeros(max(out.size, _capacity(exposure)))
@@ -245,7 +246,7 @@ def sum_poisson(share: FloatArray, exposure: FloatArray, out: FloatArray) -> Non
             out[k] += share[c] * weights[k]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def tally_counts(
     counts: NDArray[Any],
     origin: IntArray,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.ensemble.ensemble_numba import _add_nuced
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sort_masses(
     mass: NDArray[np.float64],
     base: float,

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 _SINGULAR = 1e-12  # of the diagonal element: what is left of it after the other parameters are taken out
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def cholesky(information: NDArray[np.float64], held: NDArray[np.bool_], lower: NDArray[np.float64]) -> bool:
     """Factor the information of the parameters that are not held; False unless positive definite."""
     for row in range(4):
@@ -32,7 +33,7 @@ def cholesky(information: NDArray[np.float64], held: NDArray[np.bool_], lower: N
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def back_substitute(lower: NDArray[np.float64], vector: NDArray[np.float64]) -> float:
     """Solve ``L L' x = vector`` in place; return ``vector' x``, which is the squared decrement."""
     squared = 0.0
@@ -48,7 +49,7 @@ def back_substitute(lower: NDArray[np.float64], vector: NDArray[np.float64]) -> 
     return squared
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def invert(
     information: NDArray[np.float64], held: NDArray[np.bool_], covariance: NDArray[np.float64]
 ) -> bool:
@@ -72,7 +73,7 @@ def invert(
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def to_natural(
     theta: NDArray[np.float64],
     centre: float,

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 _REACH = 8.0  # standard deviations around a sample in which components count
 _FAR = 700.0  # exponents below minus this are 0
 _SMALLEST_EXPECTATION = 5.0
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def log_poisson(exposure: float, size: int) -> NDArray[np.float64]:
     """Return log P(K = k) of k = 0 .. size - 1."""
     out = np.empty(size)
@@ -28,7 +29,7 @@ def log_poisson(exposure: float, size: int) -> NDArray[np.float64]:
     return out
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def sample_score(
     x: float,
     parameters: NDArray[np.float64],
@@ -78,13 +79,13 @@ def sample_score(
     return top + math.log(s0) - math.log(sigma) - 0.9189385332046727
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _size(exposure: float, gain: float, reach: float) -> int:
     """Return how many electron numbers matter for values up to ``reach`` DN above the bias."""
     return int(max(exposure + 12.0 * math.sqrt(exposure), max(reach, 0.0) * gain) + 40.0)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def outer_scores(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],
@@ -126,7 +127,7 @@ def outer_scores(
                     out[p, i, j] += c * score[i] * score[j]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def grouped_trace(
     first: NDArray[np.int64],
     last: NDArray[np.int64],
@@ -178,7 +179,7 @@ def grouped_trace(
         out[p] = trace
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _form(vector: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
     """Return ``vector' matrix vector`` over the entries of the matrix that are known."""
     found = 0.0
@@ -189,7 +190,7 @@ def _form(vector: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
     return found
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def curve_variance(
     parameters: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -226,7 +227,7 @@ def curve_variance(
                 out[i] += math.exp(2.0 * logged) * _form(score, covariance[p])
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def trim_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.start_numba import assemble, start_cumulants, start_peak, start_regression
 from pchem_pipeline.model.law.estep_numba import evaluate
 from pchem_pipeline.model.law.workspace_numba import Histogram, Workspace, copy, load, make_rows
@@ -21,7 +21,7 @@ _N_SCAN = 25  # steps of the scan over the gain, from a fifth of the sd to 2.5 s
 _SCAN_NOISE = 0.1225  # e-^2
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def first_start(
     histogram: Histogram, basis: NDArray[np.float64], space: Workspace, theta: NDArray[np.float64]
 ) -> bool:
@@ -56,7 +56,7 @@ def first_start(
     return best > -math.inf
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _scan(histogram: Histogram, space: Workspace, theta: NDArray[np.float64]) -> bool:
     """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
     trial = np.empty(4)
@@ -74,7 +74,7 @@ def _scan(histogram: Histogram, space: Workspace, theta: NDArray[np.float64]) ->
     return best > -math.inf
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def other_start(
     which: int, histogram: Histogram, best: NDArray[np.float64], space: Workspace, theta: NDArray[np.float64]
 ) -> bool:
@@ -114,7 +114,7 @@ def other_start(
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def start_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],

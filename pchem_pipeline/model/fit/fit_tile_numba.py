@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.fisher_numba import to_natural
 from pchem_pipeline.model.fit.goodness_numba import normal_score
 from pchem_pipeline.model.fit.outliers_numba import core_ends, cut, inner_ends, leave_out, total
@@ -69,7 +69,7 @@ class Room(NamedTuple):
     theta: NDArray[np.float64]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fit_row(
     row: NDArray[np.generic],
     origin: int,
@@ -85,7 +85,7 @@ def _fit_row(
     return status
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fit_loaded(
     histogram: Histogram,
     centre: int,
@@ -123,7 +123,7 @@ def _fit_loaded(
     return status
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _unexpected(
     row: NDArray[np.generic],
     origin: int,
@@ -143,7 +143,7 @@ def _unexpected(
     return changed
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _suspicious(
     limits: NDArray[np.float64],
     theta: NDArray[np.float64],
@@ -157,7 +157,7 @@ def _suspicious(
     return bool(out[OUTLYING] > 0.0 or misfit > _MISFIT)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fit_guarded(
     row: NDArray[np.generic],
     kept: NDArray[np.generic],
@@ -205,7 +205,7 @@ def _fit_guarded(
     return status
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fit_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 SMALLEST_EXPECTATION = 5.0
 FITTED_PARAMETERS = 4
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def pearson(
     weights: NDArray[np.float64], expectations: NDArray[np.float64], n_bins: int, n: float
 ) -> tuple[float, int]:
@@ -44,7 +45,7 @@ def pearson(
     return chi2, freedom
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def normal_score(chi2: float, freedom: int) -> float:
     """Return the chi-square as a standard normal deviate (Wilson and Hilferty 1931); 0 without freedom."""
     if freedom <= 0:

@@ -2,9 +2,9 @@
 
 Where effects change the law of a pixel's samples
 (:class:`~pchem_pipeline.model.law.sample_law.MarginalModel`), the plain estimates of PCH-EM are biased. Here
-the likelihood of the grown law is climbed from them by damped Newton steps with analytic derivatives. The mass
-of every code is an integral over its cell, not a density at its middle: rounding, code edges and clipping are
-exact, and the likelihood is bounded at any read noise.
+the likelihood of the grown law is climbed from them by damped Newton steps with analytic derivatives. The
+mass of every code is an integral over its cell, not a density at its middle: rounding, code edges and
+clipping are exact, and the likelihood is bounded at any read noise.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.grown_newton_numba import climb, find_held, newton_step, sensible
 from pchem_pipeline.model.fit.grown_numba import (
     CLEAR_GAP,
@@ -50,7 +50,7 @@ _FINER, _N_REFINED = 0.12, 4  # first step of log amplitude, and steps at most
 _LEAST_MASS = 1e-9  # of a sample that must not decide between starts
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _climb(
     theta: NDArray[np.float64],
     cells: Cells,
@@ -65,7 +65,7 @@ def _climb(
     return fine, loglik, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def lobe_weight(cells: Cells, room: Room) -> tuple[float, float]:
     """Return the likeliest weight of the free lobes, all else as it is, and the rise of the log-likelihood.
 
@@ -96,7 +96,7 @@ def lobe_weight(cells: Cells, room: Room) -> tuple[float, float]:
     return weight, rise
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _from_fit(
     theta: NDArray[np.float64], cells: Cells, law: Law, limits: NDArray[np.float64], room: Room
 ) -> tuple[float, int]:
@@ -119,7 +119,7 @@ def _from_fit(
     return loglik if fine else -math.inf, used + 1
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _beside(direction: float, cells: Cells, law: Law, room: Room, theta: NDArray[np.float64]) -> float:
     """Move ``theta`` by one electron (H + direction, mu - direction/g); return the log-likelihood there.
 
@@ -142,7 +142,7 @@ def _beside(direction: float, cells: Cells, law: Law, room: Room, theta: NDArray
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def third_cumulant(histogram: Histogram) -> float:
     """Return the third cumulant, DN^3, but at least that of a small skewness."""
     third = 0.0
@@ -152,7 +152,7 @@ def third_cumulant(histogram: Histogram) -> float:
     return max(third / histogram.n, least)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _with_cumulants(
     a: float,
     noise: float,
@@ -192,7 +192,7 @@ def _with_cumulants(
     return fine
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _height(amplitude: float, theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
     """Return the log-likelihood with lobes: the masses without in ``room``, moved by whole and part DN."""
     n, weight = cells.n_bins, theta[LOBE]
@@ -214,7 +214,7 @@ def _height(amplitude: float, theta: NDArray[np.float64], cells: Cells, law: Law
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _scan(
     histogram: Histogram,
     cells: Cells,
@@ -263,7 +263,7 @@ def _scan(
                     starts[place, i] = trial[i]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _refine(
     amplitude: float,
     theta: NDArray[np.float64],
@@ -315,7 +315,7 @@ def _refine(
     return amplitude, highest, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def search_lobes(
     theta: NDArray[np.float64],
     loglik: float,

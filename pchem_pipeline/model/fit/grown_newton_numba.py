@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.grown_cells_numba import evaluate
 from pchem_pipeline.model.law.grown_types_numba import (
     BIAS,
@@ -34,7 +34,7 @@ _SINGULAR = 1e-12  # of the diagonal element: what is left of it after the other
 _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e9
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def factor(matrix: NDArray[np.float64], held: NDArray[np.bool_], lower: NDArray[np.float64]) -> bool:
     """Fill the Cholesky factor for the parameters that are not held; False unless positive definite."""
     for row in range(N_THETA):
@@ -55,7 +55,7 @@ def factor(matrix: NDArray[np.float64], held: NDArray[np.bool_], lower: NDArray[
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def solve(lower: NDArray[np.float64], vector: NDArray[np.float64]) -> float:
     """Solve ``L L' x = vector`` in place; return ``vector' x``, the squared decrement."""
     squared = 0.0
@@ -71,13 +71,13 @@ def solve(lower: NDArray[np.float64], vector: NDArray[np.float64]) -> float:
     return squared
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def least_log_variance(a: float) -> float:
     """Return the lower bound of log sigma_R^2 at a step a."""
     return 2.0 * math.log(max(LEAST_NOISE_DN, LEAST_NOISE_E * a))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def keep_inside(theta: NDArray[np.float64], bound: float) -> None:
     """Move ``theta`` to the nearest allowed values."""
     theta[LOG_EXPOSURE] = max(theta[LOG_EXPOSURE], bound)
@@ -85,7 +85,7 @@ def keep_inside(theta: NDArray[np.float64], bound: float) -> None:
     theta[LOBE] = min(max(theta[LOBE], 0.0), MOST_LOBE)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def find_held(
     theta: NDArray[np.float64],
     score: NDArray[np.float64],
@@ -103,7 +103,7 @@ def find_held(
     held[LOBE] = not lobe_free or below or (theta[LOBE] >= MOST_LOBE and score[LOBE] >= 0.0)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def newton_step(
     room: Room, held: NDArray[np.bool_], damping: float, step: NDArray[np.float64]
 ) -> tuple[float, bool]:
@@ -125,7 +125,7 @@ def newton_step(
     return 0.5 * solve(lower, step), pure
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def take_step(
     theta: NDArray[np.float64], step: NDArray[np.float64], bound: float, out: NDArray[np.float64]
 ) -> None:
@@ -139,7 +139,7 @@ def take_step(
     keep_inside(out, bound)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def sensible(theta: NDArray[np.float64]) -> bool:
     """Tell whether the parameters can be told from those of one Gaussian."""
     noise = math.exp(0.5 * theta[LOG_VARIANCE]) / theta[STEP]
@@ -147,7 +147,7 @@ def sensible(theta: NDArray[np.float64]) -> bool:
     return fine
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def climb(
     theta: NDArray[np.float64],
     cells: Cells,

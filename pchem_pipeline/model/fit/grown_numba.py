@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.grown_newton_numba import climb, factor, find_held, solve
 from pchem_pipeline.model.law.grown_types_numba import (
     BIAS,
@@ -46,13 +46,13 @@ _LEAST_VARIANCE = 1e-6  # DN^2
 _LEAST_SHARE = 0.1
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _row(values: NDArray[np.float64], pixel: int) -> int:
     """Return the row of a pixel in an array with one row for all, or one for each."""
     return pixel if values.shape[0] > 1 else 0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def set_lobes(law: Law, pixel: int, amplitude: float, lobes: NDArray[np.float64]) -> int:
     """Fill the lobes of a pixel, those of an amplitude (e-; 0: none) beside each; return how many."""
     row, count = _row(law.lobe_weights, pixel), 0
@@ -75,13 +75,13 @@ def set_lobes(law: Law, pixel: int, amplitude: float, lobes: NDArray[np.float64]
     return count
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def make_lobes(law: Law) -> NDArray[np.float64]:
     """Return room for the lobes of a pixel."""
     return np.empty((N_LOBE_ROWS, law.lobe_weights.shape[1] * (1 + law.pattern.shape[0])))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def make_cells(
     law: Law,
     pixel: int,
@@ -135,7 +135,7 @@ def make_cells(
     )
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def to_theta(
     parameters: NDArray[np.float64],
     centre: int,
@@ -171,7 +171,7 @@ def to_theta(
     theta[LOBE] = 0.0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def from_theta(
     theta: NDArray[np.float64],
     centre: int,
@@ -208,7 +208,7 @@ def from_theta(
     return regular
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def climb_neighbours(
     theta: NDArray[np.float64],
     loglik: float,

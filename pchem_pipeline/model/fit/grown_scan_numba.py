@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.grown_newton_numba import sensible
 from pchem_pipeline.model.fit.grown_numba import make_cells, make_lobes
 from pchem_pipeline.model.law.grown_cells_numba import near_masses
@@ -36,7 +36,7 @@ _AROUND = 6  # steps from the exposure to the median, at most
 _LEAST_MASS = 1e-9  # of a sample that must not decide between starts
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _median(histogram: Histogram) -> float:
     """Return the median, counted from the centre."""
     place = 0
@@ -45,7 +45,7 @@ def _median(histogram: Histogram) -> float:
     return histogram.first + place
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _scan(
     a: float,
     histogram: Histogram,
@@ -78,7 +78,7 @@ def _scan(
     return best
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def scan_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],

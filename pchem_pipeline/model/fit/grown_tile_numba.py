@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.goodness_numba import normal_score, pearson
 from pchem_pipeline.model.fit.grown_lobes_numba import search_lobes
 from pchem_pipeline.model.fit.grown_newton_numba import climb
@@ -51,7 +51,7 @@ _SUSPICIOUS = 2.3
 _UNRESOLVED = 0.45
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _goodness(cells: Cells, n: float, room: Room) -> tuple[float, int]:
     """Return chi-square and degrees of freedom of the masses in ``room``; its ratios are overwritten."""
     for i in range(cells.n_bins):
@@ -60,7 +60,7 @@ def _goodness(cells: Cells, n: float, room: Room) -> tuple[float, int]:
     return chi2, freedom
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fit_pixel(
     theta: NDArray[np.float64],
     histogram: Histogram,
@@ -121,7 +121,7 @@ def fit_pixel(
     return True, used + 1, freedom
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fit_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],
@@ -180,7 +180,7 @@ def fit_tile(
             )
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def score_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],
@@ -220,7 +220,7 @@ def score_tile(
         out[pixel] = total
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def mass_tile(
     first: NDArray[np.int64],
     parameters: NDArray[np.float64],
@@ -255,7 +255,7 @@ def mass_tile(
             out[pixel, i] = room.mass[i]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def slope_tile(
     first: NDArray[np.int64],
     parameters: NDArray[np.float64],

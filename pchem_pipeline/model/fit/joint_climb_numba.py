@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.grown_newton_numba import LEAST_STEP, MOST_NOISE, least_log_variance
 from pchem_pipeline.model.fit.joint_likelihood_numba import evaluate_joint, solve_arrow
 from pchem_pipeline.model.fit.joint_types_numba import (
@@ -54,14 +54,14 @@ _N_BESIDE = 4  # neighbours of a maximum
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def floor_of(a: float, exact: bool) -> float:
     """Return the smallest v for a step a."""
     floor: float = least_log_variance(a) if exact else min_log_variance(a)
     return floor
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def keep_inside(theta: NDArray[np.float64], bound: float, exact: bool) -> None:
     """Move ``theta`` to the nearest allowed values."""
     n_samples = theta.size - 3
@@ -70,7 +70,7 @@ def keep_inside(theta: NDArray[np.float64], bound: float, exact: bool) -> None:
     theta[n_samples + 2] = max(theta[n_samples + 2], floor_of(theta[n_samples], exact))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def sensible(theta: NDArray[np.float64], longest_step: float, exact: bool) -> bool:
     """Tell whether the parameters can be told from those of Gaussians of one width."""
     n_samples = theta.size - 3
@@ -86,7 +86,7 @@ def sensible(theta: NDArray[np.float64], longest_step: float, exact: bool) -> bo
     return fine
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def find_held(
     theta: NDArray[np.float64],
     dark: NDArray[np.bool_],
@@ -106,7 +106,7 @@ def find_held(
     held[n_samples + 2] = theta[n_samples + 2] <= floor + 1e-12 and push <= 0.0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def joint_em_step(
     samples: Samples, theta: NDArray[np.float64], answers: Answers, bound: float, out: NDArray[np.float64]
 ) -> bool:
@@ -130,7 +130,7 @@ def joint_em_step(
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _newton_step(
     answers: Answers, held: NDArray[np.bool_], share: float, step: NDArray[np.float64]
 ) -> tuple[float, float]:
@@ -145,7 +145,7 @@ def _newton_step(
     return 0.5 * squared, share
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _take_step(
     theta: NDArray[np.float64], step: NDArray[np.float64], bound: float, exact: bool, out: NDArray[np.float64]
 ) -> float:
@@ -163,7 +163,7 @@ def _take_step(
     return factor
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def same_place(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
     """Tell whether two points belong to one maximum: bias and mean of the brightest sample within 0.3 e-."""
     n = left.size - 3
@@ -176,7 +176,7 @@ def same_place(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
     return same
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def climb_joint(
     samples: Samples,
     middle: int,
@@ -257,7 +257,7 @@ def climb_joint(
     return NOT_CONVERGED, loglik, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _beside(which: int, samples: Samples, theta: NDArray[np.float64], out: NDArray[np.float64]) -> bool:
     """Fill ``out`` with a neighbour of ``theta``: one electron fewer or more (odd ``which``).
 
@@ -287,7 +287,7 @@ def _beside(which: int, samples: Samples, theta: NDArray[np.float64], out: NDArr
     return most > _LEAST_BRIGHT
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def climb_beside(
     samples: Samples,
     middle: int,
@@ -332,7 +332,7 @@ def climb_beside(
     return best_loglik, runner_up, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def loglik_without_gain(samples: Samples) -> float:
     """Return the log-likelihood of Gaussians of one width, each at the mean of its sample: g to infinity."""
     n = square = 0.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.goodness_numba import FITTED_PARAMETERS, pearson
 from pchem_pipeline.model.fit.grown_numba import make_cells
 from pchem_pipeline.model.fit.joint_likelihood_numba import NO_ELECTRONS
@@ -26,7 +26,7 @@ from pchem_pipeline.model.law.estep_numba import evaluate
 from pchem_pipeline.model.law.grown_types_numba import N_THETA
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _expect(
     samples: Samples, j: int, middle: int, theta: NDArray[np.float64], exact: bool, bench: Bench
 ) -> NDArray[np.float64]:
@@ -61,7 +61,7 @@ def _expect(
     return row
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def joint_goodness(
     samples: Samples, middle: int, theta: NDArray[np.float64], exact: bool, bench: Bench
 ) -> tuple[float, int]:
@@ -82,7 +82,7 @@ def joint_goodness(
     return chi2, freedom
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def joint_side_lobe(samples: Samples, theta: NDArray[np.float64]) -> float:
     """Return the height of the side lobe at theta in units of its noise, of the largest sample."""
     n_samples = samples.dark.size

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.fisher_numba import back_substitute, cholesky
 from pchem_pipeline.model.fit.grown_numba import make_cells
 from pchem_pipeline.model.fit.joint_types_numba import (
@@ -38,7 +38,7 @@ NO_ELECTRONS = -60.0  # log H of a sample without electrons, where the cells are
 _SMALLEST_SHARE = 1e-10  # of the complete-data information: less is lost in rounding
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _gaussian(n: float, mean: float, variance: float, theta: NDArray[np.float64], space: Workspace) -> float:
     """Evaluate a sample without electrons, of so many frames; ``mean`` is counted as ``theta[2]`` is."""
     inverse = math.exp(-theta[3])
@@ -60,7 +60,7 @@ def _gaussian(n: float, mean: float, variance: float, theta: NDArray[np.float64]
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _density(samples: Samples, j: int, own: NDArray[np.float64], bench: Bench, out: Answers) -> float:
     """Evaluate one sample with the density of the PCD."""
     facts, space = samples.facts[j], bench.space
@@ -90,7 +90,7 @@ def _density(samples: Samples, j: int, own: NDArray[np.float64], bench: Bench, o
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _exact(
     samples: Samples, j: int, middle: int, own: NDArray[np.float64], bench: Bench, out: Answers
 ) -> float:
@@ -115,7 +115,7 @@ def _exact(
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def evaluate_joint(
     samples: Samples,
     middle: int,
@@ -159,7 +159,7 @@ def evaluate_joint(
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def solve_arrow(
     answers: Answers,
     share: float,
@@ -223,7 +223,7 @@ def solve_arrow(
     return squared
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def joint_covariance(
     answers: Answers,
     theta: NDArray[np.float64],
@@ -284,7 +284,7 @@ def joint_covariance(
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _spread(
     factors: NDArray[np.float64],
     own: NDArray[np.float64],

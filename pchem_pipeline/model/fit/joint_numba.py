@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.joint_climb_numba import floor_of
 from pchem_pipeline.model.fit.joint_likelihood_numba import joint_covariance
 from pchem_pipeline.model.fit.joint_search_numba import EXACT, FIT_NOT_CONVERGED, fit_joint_pixel
@@ -40,7 +40,7 @@ EXPOSURE_AT_BOUND = int(FitStatus.EXPOSURE_AT_BOUND)
 _ROUNDING = 1.0 / 12.0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _write(
     samples: Samples,
     middle: int,
@@ -75,7 +75,7 @@ def _write(
     return status | EXPOSURE_AT_BOUND if at_bound else status
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _describe(
     samples: Samples, middle: int, moments: NDArray[np.float64], words: NDArray[np.int64]
 ) -> tuple[float, int, float]:
@@ -97,7 +97,7 @@ def _describe(
     return least, occupied, span
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fit_joint_tile(
     counts: NDArray[np.generic],
     places: NDArray[np.int64],

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.goodness_numba import normal_score
 from pchem_pipeline.model.fit.joint_climb_numba import (
     climb_beside,
@@ -52,7 +52,7 @@ _ROUNDING = 1.0 / 12.0
 _LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _keep(
     trial: NDArray[np.float64], loglik: float, kept: NDArray[np.float64], heights: NDArray[np.float64]
 ) -> None:
@@ -75,7 +75,7 @@ def _keep(
     copy(trial, kept[place])
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _rank_starts(
     samples: Samples,
     middle: int,
@@ -119,7 +119,7 @@ def _rank_starts(
     return any_clear, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _climb_from(
     samples: Samples,
     middle: int,
@@ -141,7 +141,7 @@ def _climb_from(
     return outcome, loglik, used + count
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _climb_kept(
     samples: Samples,
     middle: int,
@@ -189,7 +189,7 @@ def _climb_kept(
     return best_loglik, runner_up, used, degenerate
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fit_joint_pixel(
     samples: Samples,
     middle: int,

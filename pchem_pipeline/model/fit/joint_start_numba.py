@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.joint_climb_numba import floor_of
 from pchem_pipeline.model.fit.joint_types_numba import (
     CENTRE,
@@ -36,7 +36,7 @@ _SCAN_FIRST, _SCAN_RATIO = 0.62, 1.035  # DN per electron; finer than the width 
 _SCAN_NOISES = (0.2, 0.36)  # e-
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fill_theta(
     samples: Samples, a: float, bias: float, noise2: float, exact: bool, theta: NDArray[np.float64]
 ) -> bool:
@@ -76,7 +76,7 @@ def fill_theta(
     return brightest > _SMALLEST_EXPOSURE
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def variance_line(samples: Samples) -> tuple[float, float, float]:
     """Return the slope of the variances against the means, and the point (mean, variance) that it is through.
 
@@ -101,7 +101,7 @@ def variance_line(samples: Samples) -> tuple[float, float, float]:
     return (xy / xx if xx > 0.0 else 0.0), x0, y0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def line_start(
     which: int, samples: Samples, line: tuple[float, float, float], exact: bool, theta: NDArray[np.float64]
 ) -> bool:
@@ -122,7 +122,7 @@ def line_start(
     return answer
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def scan_start(which: int, samples: Samples, theta: NDArray[np.float64]) -> bool:
     """Fill ``theta`` with one of the `N_SCAN` starts of a single sample at few DN per electron.
 
@@ -140,7 +140,7 @@ def scan_start(which: int, samples: Samples, theta: NDArray[np.float64]) -> bool
     return answer
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def single_start(
     which: int,
     j: int,

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.grown_types_numba import Law, Room, make_room
 from pchem_pipeline.model.law.workspace_numba import Histogram, Workspace, load, make_rows, make_workspace
 
@@ -78,7 +78,7 @@ class Bench(NamedTuple):
     lobes: NDArray[np.float64]
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def make_answers(n_samples: int) -> Answers:
     """Return room for the answers of so many samples."""
     return Answers(
@@ -90,7 +90,7 @@ def make_answers(n_samples: int) -> Answers:
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def make_samples(n_samples: int, n_bins: int, dark: NDArray[np.bool_]) -> Samples:
     """Return room for the histograms of a pixel."""
     return Samples(
@@ -102,13 +102,13 @@ def make_samples(n_samples: int, n_bins: int, dark: NDArray[np.bool_]) -> Sample
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def make_bench(n_bins: int, law: Law, lobes: NDArray[np.float64]) -> Bench:
     """Return scratch for histograms of at most so many bins."""
     return Bench(make_workspace(make_rows(n_bins)), make_room(n_bins), law, lobes)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def load_samples(
     counts: NDArray[np.generic],
     places: NDArray[np.int64],
@@ -139,7 +139,7 @@ def load_samples(
     return middle
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def histogram_of(samples: Samples, j: int) -> Histogram:
     """Return one sample as the loops of a single fit take it."""
     facts = samples.facts[j]
@@ -154,7 +154,7 @@ def histogram_of(samples: Samples, j: int) -> Histogram:
     )
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def copy_joint(source: Answers, target: Answers) -> None:
     """Copy all answers."""
     for j in range(source.score.shape[0]):

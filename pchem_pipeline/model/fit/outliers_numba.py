@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.workspace_numba import Histogram
 
 _CORE_TAIL = 0.02  # share of the frames beyond either end of the core
@@ -21,7 +21,7 @@ _FAR = 0.6  # widths of the core: a wider gap beyond it makes a sample far
 _FEW_DN = 4.0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def outlying(
     weights: NDArray[np.float64], expectations: NDArray[np.float64], n_bins: int, floor: float
 ) -> float:
@@ -33,7 +33,7 @@ def outlying(
     return found
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def core_ends(histogram: Histogram) -> tuple[int, int]:
     """Return first and end of the bins that no gap cuts off from the core, which holds 96 % of the frames.
 
@@ -62,7 +62,7 @@ def core_ends(histogram: Histogram) -> tuple[int, int]:
     return first, last + 1
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def inner_ends(histogram: Histogram, share: float) -> tuple[int, int]:
     """Return first and end of the bins left when a share of the frames is cut off, half at each end."""
     cumulative, n_bins, n = histogram.cumulative, histogram.n_bins, histogram.n
@@ -74,14 +74,14 @@ def inner_ends(histogram: Histogram, share: float) -> tuple[int, int]:
     return low, high
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def cut(row: NDArray[np.generic], first: int, end: int, kept: NDArray[np.generic]) -> None:
     """Copy a histogram between two bins to ``kept``, 0 elsewhere."""
     for i in range(row.size):
         kept[i] = row[i] if first <= i < end else 0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def leave_out(
     row: NDArray[np.generic],
     expectations: NDArray[np.float64],
@@ -113,7 +113,7 @@ def leave_out(
     return changed
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def total(row: NDArray[np.generic]) -> float:
     """Return the number of frames in a histogram."""
     found = 0.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.candidates_numba import N_OTHERS, first_start, other_start
 from pchem_pipeline.model.fit.goodness_numba import normal_score, pearson
 from pchem_pipeline.model.fit.outliers_numba import outlying
@@ -54,13 +54,13 @@ _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding 
 _COARSE_STEP = 2.5
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def log_likelihood_gaussian(n: float, variance: float) -> float:
     """Return the log-likelihood of the best single Gaussian, the limit g to infinity."""
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(variance, 1.0 / 12.0)))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def climb_neighbours(
     histogram: Histogram,
     best: NDArray[np.float64],
@@ -114,7 +114,7 @@ def climb_neighbours(
     return best_loglik, runner_up, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def side_lobe(histogram: Histogram, theta: NDArray[np.float64]) -> float:
     """Return the height exp(-2 pi^2 s_e^2) of the ECF's side lobe in units of its noise, 1/sqrt(N).
 
@@ -124,7 +124,7 @@ def side_lobe(histogram: Histogram, theta: NDArray[np.float64]) -> float:
     return math.sqrt(histogram.n) * math.exp(-2.0 * math.pi**2 * noise2)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def expected_gap(n: float, theta: NDArray[np.float64]) -> float:
     """Return how many nats the likelier neighbour (H -+ 1, mu +- 1/g) of a right answer is expected below it.
 
@@ -138,7 +138,7 @@ def expected_gap(n: float, theta: NDArray[np.float64]) -> float:
     return gap
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _judge(
     best: NDArray[np.float64], loglik: float, runner_up: float, gaussian: float, limits: NDArray[np.float64]
 ) -> int:
@@ -157,7 +157,7 @@ def _judge(
     return status
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _examine(
     histogram: Histogram,
     theta: NDArray[np.float64],
@@ -175,7 +175,7 @@ def _examine(
     return loglik, freedom, normal_score(out[CHI2], freedom)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fit_pixel(
     histogram: Histogram,
     basis: NDArray[np.float64],

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.fisher_numba import back_substitute, cholesky
 from pchem_pipeline.model.law.estep_numba import evaluate
 from pchem_pipeline.model.law.workspace_numba import (
@@ -47,13 +47,13 @@ _LEAST_SHARE = 1e-5  # of the complete-data information in a damped step
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def min_log_variance(a: float) -> float:
     """Return the lower bound of log sigma^2 for a step a: rounding, and a floor in e-."""
     return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def em_step(
     n: float, theta: NDArray[np.float64], total: NDArray[np.float64], bound: float, out: NDArray[np.float64]
 ) -> bool:
@@ -80,7 +80,7 @@ def em_step(
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def add_complete(
     n: float,
     theta: NDArray[np.float64],
@@ -99,7 +99,7 @@ def add_complete(
     matrix[3, 3] += share * 0.5 * total[SUM_EE] / s2
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def newton_step(
     n: float,
     theta: NDArray[np.float64],
@@ -137,7 +137,7 @@ def newton_step(
     return 0.5 * back_substitute(lower, step), share
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _bounded(
     theta: NDArray[np.float64], step: NDArray[np.float64], bound: float, out: NDArray[np.float64]
 ) -> float:
@@ -152,7 +152,7 @@ def _bounded(
     return factor
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def degenerate(theta: NDArray[np.float64], longest_step: float) -> bool:
     """Tell whether the parameters left the range in which a PCD can be told from one Gaussian."""
     noise = math.exp(0.5 * theta[3]) / theta[1]
@@ -161,14 +161,14 @@ def degenerate(theta: NDArray[np.float64], longest_step: float) -> bool:
     )
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def same_maximum(left: NDArray[np.float64], right: NDArray[np.float64]) -> bool:
     """Tell whether two points belong to one maximum: bias within 0.3 e-, step within 10 %."""
     same: bool = abs(left[2] - right[2]) < 0.3 * left[1] and abs(left[1] - right[1]) < 0.1 * left[1]
     return same
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def polish(
     histogram: Histogram,
     theta: NDArray[np.float64],
@@ -245,7 +245,7 @@ def polish(
     return NOT_CONVERGED, loglik, used
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def em_path(
     histogram: Histogram,
     theta: NDArray[np.float64],

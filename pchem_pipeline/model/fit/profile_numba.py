@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.fisher_numba import back_substitute, cholesky, invert
 from pchem_pipeline.model.fit.polish_numba import MAX_ELECTRON_NOISE, MIN_ELECTRON_NOISE, MIN_LOG_VARIANCE
 from pchem_pipeline.model.law.estep_numba import evaluate
@@ -30,7 +30,7 @@ _ENOUGH = 1e-6  # nats of the inner maximisation
 _CLOSE = 1e-4  # of the root of the drop
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def to_theta(phi: NDArray[np.float64], target: int, theta: NDArray[np.float64]) -> bool:
     """Turn the coordinates of a target into theta; False outside of what the likelihood is defined for."""
     copy(phi, theta)
@@ -43,7 +43,7 @@ def to_theta(phi: NDArray[np.float64], target: int, theta: NDArray[np.float64]) 
     return inside
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def to_coordinates(space: Workspace, phi: NDArray[np.float64], target: int) -> None:
     """Turn score and information in theta, in place, into those in the coordinates of a target."""
     if target != _NOISE_E:
@@ -59,7 +59,7 @@ def to_coordinates(space: Workspace, phi: NDArray[np.float64], target: int) -> N
     information[1, 1] += extra
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def maximise_others(
     histogram: Histogram,
     phi: NDArray[np.float64],
@@ -109,7 +109,7 @@ def maximise_others(
     return math.nan
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def find_end(
     histogram: Histogram,
     best: NDArray[np.float64],
@@ -164,7 +164,7 @@ def find_end(
     return math.nan
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def profile_tile(
     counts: NDArray[np.generic],
     origin: NDArray[np.int64],

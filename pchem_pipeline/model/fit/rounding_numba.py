@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.fisher_numba import back_substitute, cholesky, invert
 from pchem_pipeline.model.law.estep_numba import evaluate
 from pchem_pipeline.model.law.pcd_numba import masses
@@ -17,7 +17,7 @@ _ROUNDING = 1.0 / 12.0
 _REACH = 8.0  # standard deviations
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def rounding_bias(
     exposure: float, a: float, bias: float, sigma: float, n: float, shift: NDArray[np.float64]
 ) -> bool:
@@ -76,7 +76,7 @@ def rounding_bias(
     return True
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def rounding_tile(parameters: NDArray[np.float64], n: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Fill the bias of every pixel with finite parameters.
 

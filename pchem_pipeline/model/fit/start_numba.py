@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.simd_numba import LANES, counting, fused, load_lanes, store_lanes
 from pchem_pipeline.model.law.workspace_numba import Histogram
 
@@ -36,7 +36,7 @@ def regression_basis() -> NDArray[np.float64]:
     return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / lobe[None, :]))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def ecf_power(
     histogram: Histogram,
     step: float,
@@ -73,7 +73,7 @@ def ecf_power(
         store_lanes(work, 0, m + 2 * LANES, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
     weights = histogram.weights
@@ -88,7 +88,7 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     return math.hypot(real, imag), math.atan2(imag, real)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _regress(
     basis: NDArray[np.float64],
     power: NDArray[np.float64],
@@ -154,7 +154,7 @@ def _regress(
     return lobe, best_exposure
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def assemble(
     histogram: Histogram,
     a: float,
@@ -194,7 +194,7 @@ def assemble(
     return True, clear
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def start_regression(
     histogram: Histogram,
     basis: NDArray[np.float64],
@@ -217,7 +217,7 @@ def start_regression(
     return answer
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def start_peak(
     histogram: Histogram,
     work: NDArray[np.float64],
@@ -247,7 +247,7 @@ def start_peak(
     return found
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def start_cumulants(
     histogram: Histogram,
     theta: NDArray[np.float64],

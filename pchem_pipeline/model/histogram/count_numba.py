@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = [
     "count_frames",
@@ -25,7 +26,7 @@ __all__ = [
 _Array = NDArray[Any]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def update_range(frames: _Array, low: _Array, high: _Array) -> None:
     """Lower ``low`` and raise ``high`` (y, x) to the smallest and largest DN of each pixel."""
     n_frames, ny, nx = frames.shape
@@ -38,7 +39,7 @@ def update_range(frames: _Array, low: _Array, high: _Array) -> None:
                 row_high[x] = max(row_high[x], row[x])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def update_extremes(frames: _Array, low: _Array, high: _Array) -> None:
     """Update the smallest and largest DN of each pixel, (depth, y, x), sorted, the most extreme first."""
     n_frames, ny, nx = frames.shape
@@ -61,7 +62,7 @@ def update_extremes(frames: _Array, low: _Array, high: _Array) -> None:
                     moved[x] = smaller
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def count_frames(frames: _Array, origin: _Array, counts: _Array, under: _Array, over: _Array) -> None:
     """Add frames to ``counts`` (y, x, bin), or to ``under`` or ``over`` if they lie outside of the window."""
     n_frames, ny, nx = frames.shape
@@ -81,7 +82,7 @@ def count_frames(frames: _Array, origin: _Array, counts: _Array, under: _Array, 
                     over[y, x] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def shift_counts(counts: _Array, shift: int) -> None:
     """Move the counts of one pixel (bin,) down by ``shift`` bins (up if negative); what falls off is zero."""
     bins = counts.shape[0]
@@ -95,13 +96,13 @@ def shift_counts(counts: _Array, shift: int) -> None:
         counts[: min(bins, -shift)] = 0
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _centred(low: int, high: int, bins: int) -> int:
     """Return the origin of the window of ``bins`` DN with ``low..high`` in its middle; not below 0."""
     return max(0, low - (bins - (high - low + 1)) // 2)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def densest_origin(values: _Array, bins: int) -> int:
     """Return the origin of a window of ``bins`` DN that holds most of the values, these in its middle."""
     ordered = np.sort(values)
@@ -116,7 +117,7 @@ def densest_origin(values: _Array, bins: int) -> int:
     return origin
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def place_windows(
     frames: _Array,
     low: _Array,
@@ -172,7 +173,7 @@ def place_windows(
             origin[y, x] = target
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def recentre(counts: _Array, origin: _Array, minimum: _Array, maximum: _Array, fixed: _Array) -> None:
     """Centre the windows of all pixels that fit, so that they do not depend on the way that led there."""
     ny, nx, bins = counts.shape

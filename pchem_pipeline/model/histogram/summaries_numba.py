@@ -9,15 +9,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 __all__ = ["add_products", "sum_lines"]
 
 _Array = NDArray[Any]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def sum_lines(
     frames: _Array, group: int, row_sum: _Array, row_sum_square: _Array, column_sum: _Array
 ) -> None:
@@ -44,7 +45,7 @@ def sum_lines(
                 columns[x] += row[x]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def add_products(
     frames: _Array, before: _Array, reference: _Array, group: int, chosen: _Array, work: _Array, sums: _Array
 ) -> None:

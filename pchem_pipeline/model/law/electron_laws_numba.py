@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 # laws of the electron number
 POISSON, NEGATIVE_BINOMIAL, BOREL = 0, 1, 2
@@ -16,7 +17,7 @@ STEPS = 128
 FARTHEST = 38.0
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _log_rising(dispersion: float, k: float) -> float:
     """Return ``sum_{j<k} log(1 + j a)``; a sum of logarithms where those of gamma functions would cancel."""
     total = 0.0
@@ -29,7 +30,7 @@ def _log_rising(dispersion: float, k: float) -> float:
     return total
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[float, float, float]:
     """Return log P(k) at mean ``exposure`` and its first two derivatives in log exposure."""
     log_factorial = math.lgamma(k + 1.0)
@@ -52,7 +53,7 @@ def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[fl
     return k * math.log(exposure) - exposure - log_factorial, k - exposure, -exposure
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def electron_number(
     law: int,
     dispersion: float,
@@ -94,7 +95,7 @@ def electron_number(
     return mass, slope, bend
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def fill_normal_table(table: NDArray[np.float64]) -> None:
     """Fill the upper tail and the density of the normal law at z = 0, 1/STEPS, ..., shape (n, 2)."""
     for j in range(table.shape[0]):
@@ -103,7 +104,7 @@ def fill_normal_table(table: NDArray[np.float64]) -> None:
         table[j, 1] = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def normal_tail(z: float, table: NDArray[np.float64]) -> tuple[float, float]:
     """Return the nearer tail of the normal law, negative above the middle, and the density at z.
 

@@ -18,10 +18,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, lanes_exp, lanes_log
 from pchem_pipeline.model.law.simd_numba import (
     LANES,
@@ -66,7 +66,7 @@ LOG_2PI = math.log(2.0 * math.pi)
 def _table_kernel(width: int) -> Callable[..., Any]:
     """Make the loop over the columns for a fixed number of components (0: given at run time)."""
 
-    @nb.njit(nogil=True, cache=True, error_model="numpy")
+    @kernel
     def table_sums(
         table: NDArray[np.float64],
         columns: int,
@@ -126,8 +126,8 @@ def _table_kernel(width: int) -> Callable[..., Any]:
         for number_of, value in enumerate(second):
             totals[_V11 + number_of] += sum_lanes(value)
 
-    kernel: Callable[..., Any] = table_sums
-    return kernel
+    compiled: Callable[..., Any] = table_sums
+    return compiled
 
 
 table_sums_3 = _table_kernel(3)
@@ -137,7 +137,7 @@ table_sums_9 = _table_kernel(9)
 table_sums_any = _table_kernel(0)
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _half_width(electron_noise: float, exposure: float, first: int, last: int) -> int:
     """Return how many components matter on either side of the nearest one."""
     variance = electron_noise * electron_noise
@@ -148,7 +148,7 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int) -
     return min(half, (MAX_COMPONENTS - 1) // 2)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure: float) -> None:
     """Fill ``H / k`` of k from ``first`` on, its inverse and its logarithm, by the eight; 1 / k of k = 0."""
     exposure = math.exp(log_exposure)
@@ -160,7 +160,7 @@ def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure:
         store_lanes(rows, _LOG_RISE, i, log_exposure - lanes_log(k))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fill_coefficients(
     table: NDArray[np.float64],
     filled: int,
@@ -200,7 +200,7 @@ def _fill_coefficients(
             store_lanes(table, _COEFFICIENT + place - step, filled + i, coefficient)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sum_table(
     table: NDArray[np.float64],
     filled: int,
@@ -232,7 +232,7 @@ def _sum_table(
         _expect(table, filled, width, a, inverse, frames, expected, end - filled)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _expect(
     table: NDArray[np.float64],
     filled: int,
@@ -261,7 +261,7 @@ def _expect(
         out[start + i] = table[_WEIGHT, i]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _finish(
     histogram: Histogram, theta: NDArray[np.float64], totals: NDArray[np.float64], space: Workspace
 ) -> None:
@@ -309,7 +309,7 @@ def _finish(
             information[row, column] = information[column, row]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fill(
     table: NDArray[np.float64],
     filled: int,
@@ -333,7 +333,7 @@ def _fill(
         store_lanes(table, _LEVEL, filled + i, level)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace, frames: float) -> float:
     """Evaluate log-likelihood, E-step sums, score and observed information of one pixel.
 

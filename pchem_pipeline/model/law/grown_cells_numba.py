@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.electron_laws_numba import FARTHEST, electron_number, normal_tail
 from pchem_pipeline.model.law.grown_types_numba import (
     BIAS,
@@ -46,13 +46,13 @@ _LEAST_MASS = 1e-300
 _LEAST_VARIANCE = 1e-6  # DN^2
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def _level(k: float, cells: Cells, law: Law) -> float:
     """Return the level of k electrons, e-."""
     return cells.level_scale * k * (1.0 + 0.5 * law.curvature * (k - 1.0)) + cells.level_shift
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def component(
     k: float, lobe: int, theta: NDArray[np.float64], cells: Cells, law: Law, reach: float
 ) -> Component:
@@ -76,7 +76,7 @@ def component(
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _list_numbers(
     theta: NDArray[np.float64], cells: Cells, law: Law, reach: float, cut: float, numbers: NDArray[np.float64]
 ) -> int:
@@ -121,7 +121,7 @@ def _list_numbers(
     return count
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fill_edges(
     edges: NDArray[np.float64], part: Component, table: NDArray[np.float64], out: NDArray[np.float64]
 ) -> int:
@@ -139,7 +139,7 @@ def _fill_edges(
     return middle
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _add_masses(
     theta: NDArray[np.float64], cells: Cells, law: Law, reach: float, cut: float, room: Room
 ) -> int:
@@ -187,7 +187,7 @@ def _add_masses(
     return count
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> tuple[int, float]:
     """Fill mass and slopes of the cells, exact also where an occupied one lies far out.
 
@@ -207,19 +207,19 @@ def masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> tu
     return count, _REACH[stage]
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def near_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> None:
     """Fill mass and slopes of the cells, only as far out as most samples lie."""
     _add_masses(theta, cells, law, _REACH[0], _CUT[0], room)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def all_masses(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room, stage: int) -> None:
     """Fill mass and slopes of the cells, to the ends of the tails (stage 2) or as far as 1e-50 (stage 1)."""
     _add_masses(theta, cells, law, _REACH[stage], _CUT[stage], room)
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sum_up(cells: Cells, law: Law, room: Room) -> float:
     """Return the log-likelihood of the masses in ``room``; fill score, empirical information and ratio."""
     score, empirical, slopes = room.score, room.empirical, room.slopes
@@ -249,7 +249,7 @@ def _sum_up(cells: Cells, law: Law, room: Room) -> float:
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def glance(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
     """Return the log-likelihood; fill the score, and the empirical information also for the observed one."""
     masses(theta, cells, law, room)
@@ -257,7 +257,7 @@ def glance(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> fl
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def evaluate(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> float:
     """Return the log-likelihood at ``theta``; fill score, empirical and observed information."""
     count, reach = masses(theta, cells, law, room)
@@ -266,7 +266,7 @@ def evaluate(theta: NDArray[np.float64], cells: Cells, law: Law, room: Room) -> 
     return loglik
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _hermite_sums(
     cells: Cells, law: Law, part: Component, room: Room
 ) -> tuple[float, float, float, float, float]:
@@ -294,7 +294,7 @@ def _hermite_sums(
     return s0, s1, s2, s3, s4
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _subtract_curvature(
     theta: NDArray[np.float64], cells: Cells, law: Law, reach: float, count: int, room: Room
 ) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 # places in theta: log H, 1/g (DN per electron), mu - centre (DN), log sigma_R^2 (DN^2), weight of free lobes
 N_THETA = 5
@@ -133,7 +134,7 @@ class Component(NamedTuple):
     high: int
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def make_room(n_bins: int) -> Room:
     """Return scratch for histograms of at most so many bins."""
     return Room(

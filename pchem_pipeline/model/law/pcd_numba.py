@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 _NEGLIGIBLE = 41.0  # nats: exp(-41) is below the resolution of a double
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def log_term(k: int, y: float, exposure: float, step: float, sigma: float) -> float:
     """Return log(P_k phi(y; k step, sigma^2)) without the constant -H - log(sigma sqrt(2 pi))."""
     e = (y - k * step) / sigma
     return k * math.log(exposure) - math.lgamma(k + 1.0) - 0.5 * e * e
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def largest_term(y: float, exposure: float, step: float, sigma: float) -> int:
     """Return the k of the largest term; the terms are log-concave in k, so a climb finds it."""
     guess = y / step
@@ -42,7 +43,7 @@ def largest_term(y: float, exposure: float, step: float, sigma: float) -> int:
     return k
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def log_density(y: float, exposure: float, step: float, sigma: float) -> float:
     """Return the log density of the PCD at ``y = x - mu`` (DN), with ``step = 1/g`` (DN)."""
     constant: float = -exposure - math.log(sigma) - 0.5 * math.log(2.0 * math.pi)
@@ -69,7 +70,7 @@ def log_density(y: float, exposure: float, step: float, sigma: float) -> float:
     return answer
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def log_densities(
     x: NDArray[np.float64],
     exposure: NDArray[np.float64],
@@ -87,7 +88,7 @@ def log_densities(
             out[i] = math.nan
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _cell(low: float, high: float) -> float:
     """Return the standard normal mass of [low, high], without cancellation in either tail."""
     root = math.sqrt(0.5)
@@ -98,7 +99,7 @@ def _cell(low: float, high: float) -> float:
     return 0.5 * (math.erf(high * root) - math.erf(low * root))
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def masses(
     x: NDArray[np.float64],
     exposure: NDArray[np.float64],

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
-
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.simd_numba import Lanes, exponent_of, fused, nearest, scaled
 
 LN2 = math.log(2.0)
@@ -27,7 +26,7 @@ _EXP = (
 )
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def artanh_series(z: Lanes) -> Lanes:
     """Return ``artanh(q) / q`` of ``z = q^2``."""
     top, rest = _ARTANH
@@ -35,7 +34,7 @@ def artanh_series(z: Lanes) -> Lanes:
     return fused(z, fused(z, fused(z, fused(z, series, rest[0]), rest[1]), rest[2]), rest[3])
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def lanes_log(x: Lanes) -> Lanes:
     """Return log(x) of positive normal numbers.
 
@@ -47,7 +46,7 @@ def lanes_log(x: Lanes) -> Lanes:
     return fused(exponent, LN2, 2.0 * q * artanh_series(q * q))
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def lanes_exp(x: Lanes) -> Lanes:
     """Return exp(x) of numbers between -700 and 700: ``2^n`` and a polynomial for the rest."""
     top, middle, rest = _EXP

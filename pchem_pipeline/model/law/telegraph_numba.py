@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
 
 _SMALL = 1e-200  # a probability below this is taken to its logarithm
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _forward(state: NDArray[np.float64], share: NDArray[np.float64], kept: NDArray[np.float64]) -> None:
     """Let the probabilities of the states pass over a gap.
 
@@ -28,7 +29,7 @@ def _forward(state: NDArray[np.float64], share: NDArray[np.float64], kept: NDArr
                 state[low | bit] = kept[d] * up + share[d] * lost
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _backward(state: NDArray[np.float64], share: NDArray[np.float64], kept: NDArray[np.float64]) -> None:
     """Turn what follows after a gap, given the states after it, into what does given those before it."""
     for d in range(share.size):
@@ -41,13 +42,13 @@ def _backward(state: NDArray[np.float64], share: NDArray[np.float64], kept: NDAr
                 state[low | bit] = kept[d] * up + mean
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _kept_over(gap: int, tau: NDArray[np.float64], kept: NDArray[np.float64]) -> None:
     for d in range(tau.size):
         kept[d] = math.exp(-gap / tau[d])
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def filtered(
     emission: NDArray[np.float64],
     samples: NDArray[np.int64],
@@ -94,7 +95,7 @@ def filtered(
     return total
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def smooth(
     emission: NDArray[np.float64],
     samples: NDArray[np.int64],

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.simd_numba import LANES
 
 # places in `Workspace.total`, the sums that an evaluation leaves besides score and information
@@ -66,13 +66,13 @@ class Workspace(NamedTuple):
     held: NDArray[np.bool_]
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def make_rows(n_bins: int) -> NDArray[np.float64]:
     """Return scratch rows for histograms of at most so many bins."""
     return np.empty((N_ROWS, n_bins + _MIN_COLUMNS))
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def make_workspace(rows: NDArray[np.float64]) -> Workspace:
     """Return a workspace with these rows."""
     table = np.empty((MAX_COMPONENTS + 5, CAPACITY + LANES))
@@ -80,21 +80,21 @@ def make_workspace(rows: NDArray[np.float64]) -> Workspace:
     return Workspace(rows, table, np.empty(N_TOTAL), np.empty(4), np.empty((4, 4)), small, held)
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def share_workspace(space: Workspace) -> Workspace:
     """Return a workspace of the same scratch, which keeps nothing between calls, with its own answers."""
     total, score, information = np.empty(N_TOTAL), np.empty(4), np.empty((4, 4))
     return Workspace(space.rows, space.table, total, score, information, space.small, space.held)
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def copy(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
     """Copy a vector; a plain loop, since slice assignment compiles slowly."""
     for i in range(source.size):
         target[i] = source[i]
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def copy_answers(source: Workspace, target: Workspace) -> None:
     """Copy totals, score and information."""
     copy(source.total, target.total)
@@ -103,7 +103,7 @@ def copy_answers(source: Workspace, target: Workspace) -> None:
         copy(source.information[i], target.information[i])
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def load(
     counts: NDArray[np.generic], weights: NDArray[np.float64], cumulative: NDArray[np.float64]
 ) -> tuple[Histogram, int, int]:
