@@ -67,7 +67,7 @@ def embedded(data: ReportData) -> Embedded | None:
 
 def script() -> str:
     """Return the inspector's script."""
-    folder = importlib.resources.files("pchem_pipeline.render") / "templates"
+    folder = importlib.resources.files("pchem_pipeline.report") / "templates"
     return (folder / "inspector.js").read_text(encoding="utf-8")
 
 

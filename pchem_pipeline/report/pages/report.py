@@ -94,7 +94,7 @@ def _discrepancy_page(data: ReportData, view: DiscrepancyView[Picture]) -> str:
 
 def template(name: str) -> jinja2.Template:
     """Return a template of this package's pages."""
-    folder = importlib.resources.files("pchem_pipeline.render") / "templates"
+    folder = importlib.resources.files("pchem_pipeline.report") / "templates"
     environment = jinja2.Environment(
         autoescape=True,
         undefined=jinja2.StrictUndefined,
