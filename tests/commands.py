@@ -1,7 +1,10 @@
 """Running ``pchem`` as a user does, and comparing what it leaves."""
 
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +34,16 @@ class Result:
         return self.stderr.strip().splitlines()[-1] if self.stderr.strip() else ""
 
 
+@contextmanager
+def sigint(handler) -> Iterator[None]:
+    """Set what Ctrl-C does for a moment: a process inherits that it is ignored, whoever started the tests."""
+    old = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, old)
+
+
 @dataclass
 class Shell:
     """Runs ``pchem`` in a folder."""
@@ -38,23 +51,29 @@ class Shell:
     folder: Path
     environment: dict[str, str]
 
-    def start(self, *arguments, **options):
-        """Start the command and return the process."""
-        return subprocess.Popen(
-            [PCHEM, *map(str, arguments)],
-            cwd=self.folder,
-            env=self.environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            **options,
-        )
+    @contextmanager
+    def start(self, *arguments, hears_ctrl_c: bool = True) -> Iterator[subprocess.Popen[str]]:
+        """Start the command as on a terminal, or as in the background of a script; leave none behind."""
+        with sigint(signal.default_int_handler if hears_ctrl_c else signal.SIG_IGN):
+            process = subprocess.Popen(
+                [PCHEM, *map(str, arguments)],
+                cwd=self.folder,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        with process:
+            try:
+                yield process
+            finally:
+                process.kill()
 
     def __call__(self, *arguments) -> Result:
         """Run the command to its end."""
-        process = self.start(*arguments)
-        stdout, stderr = process.communicate(timeout=300)
+        with self.start(*arguments) as process:
+            stdout, stderr = process.communicate(timeout=300)
         return Result(process.returncode, stdout, stderr)
 
     def ok(self, *arguments) -> Result:

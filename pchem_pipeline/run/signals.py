@@ -40,7 +40,11 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Turn the first SIGINT or SIGTERM into a request; a second one ends the process at once."""
+    """Turn the first SIGINT or SIGTERM into a request; a second one ends the process at once.
+
+    A signal that the process was started to ignore stays ignored: a shell does that to what a script puts
+    into the background, so that Ctrl-C ends the script alone.
+    """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield request
@@ -52,7 +56,8 @@ def stop_on_signals() -> Iterator[StopRequest]:
             signal.raise_signal(number)
         request.signal = number
 
-    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+    old = {number: signal.signal(number, handle) for number in heard}
     try:
         yield request
     finally:

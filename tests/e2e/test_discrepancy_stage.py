@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import time
 
 import numpy as np
@@ -108,15 +107,12 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, tmp_path, moment)
     (tmp_path / "run.yaml").write_text(CAMERA)
     other.ok("simulate", "run.yaml")
     other.ok("ingest", "run.yaml")
-    process = other.start("discrepancy", "run.yaml", "--no-refit")
-    markers = tmp_path / "run.zarr" / ".pchem" / "done" / "discrepancy"
-    wanted = int(12 * moment)
-    while process.poll() is None and len(list(markers.glob("*/*"))) < wanted:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
-    process.stderr.close()
+    with other.start("discrepancy", "run.yaml", "--no-refit") as process:
+        markers = tmp_path / "run.zarr" / ".pchem" / "done" / "discrepancy"
+        wanted = int(12 * moment)
+        while process.poll() is None and len(list(markers.glob("*/*"))) < wanted:
+            time.sleep(0.02)
+        process.kill()
     assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
     other.ok("discrepancy", "run.yaml", "--no-refit")
     assert verdict(other) == verdict(shell)

@@ -2,6 +2,7 @@
 
 import random
 import signal
+import subprocess
 import time
 
 import pytest
@@ -17,20 +18,27 @@ def run(shell, frames):
     return shell
 
 
+def wait_for_stage(run, process):
+    """Wait until the histograms are begun."""
+    stages = run.folder / "run.zarr" / ".pchem" / "stages"
+    deadline = time.monotonic() + 120
+    while not (stages / "histogram.json").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
 def test_killed_again_and_again_it_ends_with_the_same_bits(run, finished):
     rng = random.Random(4)
     killed = 0
     for _ in range(12):
-        process = run.start("run", "run.yaml", *UNTIL, "--quiet", "--workers", "2")
-        try:
-            process.communicate(timeout=rng.uniform(1.5, 5))
-        except Exception:
-            process.kill()
-            process.communicate()
-            killed += 1
-        else:
-            assert process.returncode == 0
-            break
+        with run.start("run", "run.yaml", *UNTIL, "--quiet", "--workers", "2") as process:
+            try:
+                process.wait(timeout=rng.uniform(1.5, 5))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                killed += 1
+                continue
+        assert process.returncode == 0
+        break
     run.ok("run", "run.yaml", *UNTIL)
     assert killed >= 1
     assert_same_results(finished, run.folder / "run.zarr")
@@ -38,16 +46,22 @@ def test_killed_again_and_again_it_ends_with_the_same_bits(run, finished):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_stops_with_its_code_and_the_run_goes_on_later(run, finished, number, code):
-    process = run.start("run", "run.yaml", *UNTIL)
-    store = run.folder / "run.zarr" / ".pchem" / "stages"
-    deadline = time.monotonic() + 120
-    while not (store / "histogram.json").exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(number)
-    _, stderr = process.communicate(timeout=120)
+    with run.start("run", "run.yaml", *UNTIL) as process:
+        wait_for_stage(run, process)
+        process.send_signal(number)
+        _, stderr = process.communicate(timeout=120)
     assert process.returncode == code
     assert stderr.strip().splitlines()[-1].startswith(f"pchem: stopped by {signal.Signals(number).name}")
     run.ok("run", "run.yaml", *UNTIL)
+    assert_same_results(finished, run.folder / "run.zarr")
+
+
+def test_in_the_background_of_a_script_ctrl_c_stops_nothing(run, finished):
+    with run.start("run", "run.yaml", *UNTIL, hears_ctrl_c=False) as process:
+        wait_for_stage(run, process)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=120)
+    assert process.returncode == 0
     assert_same_results(finished, run.folder / "run.zarr")
 
 

@@ -204,13 +204,13 @@ def test_runs_without_a_report_are_said(finished, tmp_path):
 
 
 def test_the_command_ends_well_with_ctrl_c(shell, finished):
-    process = shell.start("view", finished)
-    address = process.stdout.readline().strip()
-    assert address.startswith("http://127.0.0.1:")
-    client = Client(int(address.rstrip("/").rsplit(":")[-1]))
-    assert client.ask("GET", "/")[0] == 200
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    with shell.start("view", finished) as process:
+        address = process.stdout.readline().strip()
+        assert address.startswith("http://127.0.0.1:")
+        client = Client(int(address.rstrip("/").rsplit(":")[-1]))
+        assert client.ask("GET", "/")[0] == 200
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
     assert (process.returncode, out, err) == (0, "", "")
 
 

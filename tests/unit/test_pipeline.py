@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import sigint
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.compute.executor import SerialExecutor
@@ -268,6 +269,17 @@ def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
         with pytest.raises(InterruptedRunError):
             stop.check()
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_what_the_shell_ignores_stays_ignored():
+    with sigint(signal.SIG_IGN), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal is None
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.signal == signal.SIGTERM
+    with sigint(signal.default_int_handler), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal == signal.SIGINT
 
 
 def test_a_full_disk_stops_the_run_at_once(make, monkeypatch):
