@@ -17,7 +17,8 @@ from pathlib import Path
 
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.session import Command, find_run, run_stages
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import find_run
 
 
 def main() -> None:

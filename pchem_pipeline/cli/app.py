@@ -17,6 +17,7 @@ from pchem_pipeline.base.errors import ExitCode, PchEmError
 from pchem_pipeline.cli.methods import methods
 from pchem_pipeline.cli.options import Progress, Quiet, Target, Workers, region_of, takes_command
 from pchem_pipeline.cli.plan import plan
+from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
@@ -38,7 +39,8 @@ def _stage_command(name: str, summary: str) -> None:
 
     @takes_command()
     def stage(target: Target, *, command: Command) -> None:
-        from pchem_pipeline.run.session import find_run, run_stages
+        from pchem_pipeline.run.session import run_stages
+        from pchem_pipeline.run.target import find_run
 
         run_stages(find_run(target), [name], command)
 
@@ -74,7 +76,8 @@ def ingest(
     command: Command,
 ) -> None:
     """Check the camera files; copy or reference their frames."""
-    from pchem_pipeline.run.session import cropped, find_run, run_stages
+    from pchem_pipeline.run.session import cropped, run_stages
+    from pchem_pipeline.run.target import find_run
 
     run = find_run(target)
     if append:
@@ -86,16 +89,9 @@ def ingest(
         run_stages(run, ["ingest"], command)
 
 
-for _name, _summary in {
-    "simulate": "Write a simulated camera's frames, and its truth.",
-    "histogram": "Count every pixel's DN; keep summaries in time and space.",
-    "fit": "Fit H, g, mu and sigma of every pixel by PCH-EM.",
-    "maps": "Make the maps, with units, standard errors and quality.",
-    "ensemble": "Predict the ensemble from the maps; compare with the data.",
-    "report": "Write report.html, report.json and the figures.",
-    "electrons": "Write the stack of electron numbers into the store.",
-}.items():
-    _stage_command(_name, _summary)
+for _stage in STAGES.values():
+    if _stage.summary:
+        _stage_command(_stage.name, _stage.summary)
 
 
 @app.command()
@@ -116,9 +112,8 @@ def run(
         typer.Option(help="camera files: copy them into the store, or leave them where they are"),
     ] = None,
     until: Annotated[
-        Literal["simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report"],
-        typer.Option(help="last stage to be done"),
-    ] = "report",
+        str, typer.Option(help="last stage to be done", metavar=f"[{'|'.join(pipeline())}]")
+    ] = pipeline()[-1],
     *,
     command: Command,
 ) -> None:
@@ -135,7 +130,7 @@ def run(
     target, is_new = find_or_start(targets, store, known, wanted.roi, write=not wanted.dry_run)
     if is_new:
         target, command = cropped(target, command)
-    stages = up_to(until, target.stages)
+    stages = up_to(until, pipeline_of(target.config))
     run_stages(target, stages, command)
     if not wanted.dry_run:
         typer.echo(target.store / "report.html" if "report" in stages else target.store)
@@ -162,7 +157,7 @@ def discrepancy(
     Simulates the fitted model many times and compares. What is named goes into model.effects of the YAML.
     """
     from pchem_pipeline.commands.discrepancy import find_and_grow
-    from pchem_pipeline.run.session import find_run
+    from pchem_pipeline.run.target import find_run
 
     command = replace(command, options=replace(command.options, roi=region_of(roi)))
     text = find_and_grow(find_run(target), command, refit=refit)
@@ -209,7 +204,7 @@ def status(
 ) -> None:
     """Print how far each stage is, and why one is stale."""
     from pchem_pipeline.commands.watch import watch as follow
-    from pchem_pipeline.run.session import find_run
+    from pchem_pipeline.run.target import find_run
 
     terminal = sys.stdout.isatty()
     follow(find_run(target), typer.echo, follow=watch, as_json=as_json, terminal=terminal)

@@ -39,7 +39,7 @@ def methods(
     Photon transfer, EMVA 1288, PCH peaks and valleys, cumulants and others, on the same pixels and simulated.
     """
     from pchem_pipeline.commands.methods import compare_methods
-    from pchem_pipeline.run.session import find_run
+    from pchem_pipeline.run.target import find_run
 
     given = {"with_runs": with_runs, "pixels": pixels, "study_pixels": study_pixels}
     known = {name: value for name, value in given.items() if value is not None}

@@ -14,27 +14,31 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
+from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.read_once import ReadOnce
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.summaries import block_starts
+from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
-from pchem_pipeline.run.runner import cpu_seconds, execute, setting_values
-from pchem_pipeline.run.session import Command, Target, working_run
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.session import Command, working_run
 from pchem_pipeline.run.stage import StageContext, Swept, open_store
 from pchem_pipeline.stages.fit.start import keep_fit
 from pchem_pipeline.stages.histogram.counting import BandCounter
 from pchem_pipeline.stages.histogram.dry_run import allowed_bytes, sweep_bytes, sweep_rows
 from pchem_pipeline.stages.histogram.single_pass import block_tasks, do_all, whole_mebibytes
 from pchem_pipeline.stages.histogram.stream import Sweep, cut_rows
+from pchem_pipeline.stages.table import STAGES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.run.runner import StageState
+    from pchem_pipeline.run.fingerprint import StageState
+    from pchem_pipeline.run.target import Target
 
 __all__ = ["append_frames"]
 
@@ -69,7 +73,7 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         keep_fit(context)
         files = kept["files"] + _go_on(context, frames, added)["files"]
         keep_identity(context, quick, {"files": files, "digest": digest_of(files)})
-        context.swept = Swept(frozenset(_STAGES), frames, clock)
+        context.swept = Swept(_STAGES, frames, clock)
         return [execute(name, context) for name in _STAGES]
 
 
@@ -81,7 +85,7 @@ def _check_run(context: StageContext) -> None:
         finished = record is not None and record.finished
         if record is None or not finished or len(context.tiles_done(name)) < record.keys:
             raise StoreError(f"{store.path}: {name} is not complete; run: pchem run {quoted(store.path)}")
-        if record.content.get("settings") != setting_values(name, context):
+        if record.content.get("settings") != setting_values(STAGES[name], context):
             raise StoreError(
                 f"{store.path}: {name} was done with other settings; to do all frames again: "
                 f"pchem run {quoted(store.path)}"

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Command, Target, find_run, run_stages, run_status
+from pchem_pipeline.run.session import Command, run_stages, run_status
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.store.run_store import RunStore
 

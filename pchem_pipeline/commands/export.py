@@ -14,7 +14,8 @@ from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Target, find_run, run_status
+from pchem_pipeline.run.session import run_status
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 

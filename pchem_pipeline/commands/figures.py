@@ -19,7 +19,8 @@ from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Target, find_run, run_status
+from pchem_pipeline.run.session import run_status
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.store.files import storage_error, write_atomic

@@ -10,8 +10,8 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.config.joint import JointConfig, as_run, dump_joint, load_joint, make_joint
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import JOINT_STAGES
-from pchem_pipeline.run.session import Command, Target, find_run, run_stages
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.joint.samples import check_runs, describe_samples, write_samples
 from pchem_pipeline.store.files import read_json, write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
@@ -111,7 +111,7 @@ def run_joint(joint: JointRun, command: Command) -> None:
         if joint.is_new and not joint.store.exists():
             joint.path.unlink(missing_ok=True)
         raise
-    run_stages(target, JOINT_STAGES, command)
+    run_stages(target, ["joint", "joint_report"], command)
 
 
 def _histogrammed(joint: JointRun, command: Command) -> Target:

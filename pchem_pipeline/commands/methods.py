@@ -12,7 +12,8 @@ from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from pchem_pipeline.run.session import Command, Target
+    from pchem_pipeline.run.session import Command
+    from pchem_pipeline.run.target import Target
 
 __all__ = ["compare_methods"]
 
@@ -28,8 +29,8 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     Raises:
         PchEmError: the comparison cannot be made.
     """
-    from pchem_pipeline.run.other_runs import open_other_runs
     from pchem_pipeline.run.session import run_stages, run_status
+    from pchem_pipeline.stages.methods.other_runs import open_other_runs
 
     values = dict(given)
     if "with_runs" in values:

@@ -10,8 +10,8 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.config.load import dump_config, make_config, parse_config
 from pchem_pipeline.config.template import commented_config
-from pchem_pipeline.run.runner import STAGES
-from pchem_pipeline.run.session import Target, find_run
+from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore

@@ -29,7 +29,8 @@ from pchem_pipeline.report.figures.pixel_figures import cluster_edges, has_fit, 
 from pchem_pipeline.report.style.style import COLUMN_MM
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Target, find_run, run_status
+from pchem_pipeline.run.session import run_status
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.report.report import read_pixels
 from pchem_pipeline.store.run_store import RunStore
 

@@ -111,7 +111,7 @@ def make_plan(request: PlanRequest) -> str:
 
 def _median_pixel(run: Path) -> dict[str, float]:
     """Return the medians of a run's maps."""
-    from pchem_pipeline.run.session import find_run
+    from pchem_pipeline.run.target import find_run
 
     store = RunStore.open(find_run(run).store)
     summary = store.attributes("maps").get("summary")

@@ -26,7 +26,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
 from pchem_pipeline.report.inspector.inspector import served_page
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import find_run
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.stages.report.inspected_pixels import ChosenPixels
 from pchem_pipeline.stages.report.inspector import Listed, listed_maps, packed_map, read_sample
 from pchem_pipeline.store.run_store import RunStore

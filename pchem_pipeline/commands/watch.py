@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from pchem_pipeline.run.runner import StageState
-from pchem_pipeline.run.session import Target, run_status
+from pchem_pipeline.run.fingerprint import StageState
+from pchem_pipeline.run.session import run_status
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.progress_file import read_beacon
 
 __all__ = ["json_line", "pace_words", "rows", "watch"]

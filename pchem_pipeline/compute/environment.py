@@ -9,7 +9,7 @@ import tempfile
 import zlib
 from pathlib import Path
 
-__all__ = ["available_memory", "available_workers", "peak_rss_bytes", "prepare_environment"]
+__all__ = ["available_memory", "available_workers", "cpu_seconds", "peak_rss_bytes", "prepare_environment"]
 
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLOSC_NTHREADS", "NUMBA_NUM_THREADS")
 
@@ -86,6 +86,12 @@ def available_memory() -> int | None:
     except (OSError, ValueError):
         pass
     return max(0, min(free)) if free else None
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of this process and its finished children."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def peak_rss_bytes() -> int:

@@ -8,49 +8,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, StoreError
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
-from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config
-from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.run.declaration import imported
+from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.progress import ProgressMode, Reporter
-from pchem_pipeline.run.runner import (
-    JOINT_STAGES,
-    OPTIONAL_STAGES,
-    StageState,
-    declaration_of,
-    execute,
-    pipeline_of,
-    status,
-)
+from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest, stop_on_signals
 from pchem_pipeline.run.stage import Options, StageContext
-from pchem_pipeline.store.files import read_json, write_json
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.stages.table import STAGES, pipeline_of
+from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.progress_file import Beacon
-from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Command", "Target", "cropped", "find_run", "run_stages", "run_status", "up_to", "working_run"]
-
-
-@dataclass(frozen=True)
-class Target:
-    """A run: its configuration, the folder its paths refer to, its store, and its YAML file if it has one."""
-
-    config: RunConfig
-    base_dir: Path
-    store: Path
-    config_path: Path | None = None
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The stages of this run, in order."""
-        return pipeline_of(self.config)
-
-    def changed(self, section: str, **values: object) -> Target:
-        """Return the same run with other values in a section of its configuration."""
-        content = self.config.model_dump(by_alias=True)
-        content[section] = {**content[section], **values}
-        return replace(self, config=make_config(content, "the command line"))
+__all__ = ["Command", "cropped", "run_stages", "run_status", "up_to", "working_run"]
 
 
 @dataclass(frozen=True)
@@ -74,35 +47,6 @@ class Command:
     quiet: bool = False
     log_json: Path | None = None
     max_memory: int | None = None
-
-
-def find_run(path: Path) -> Target:
-    """Return the run that a YAML file or a store belongs to.
-
-    Raises:
-        ConfigError: neither a YAML file nor a store, or its content is wrong.
-        StoreError: the store is damaged.
-    """
-    path = place_of(path)
-    if path.is_dir():
-        store = RunStore.open(path)
-        text = store.config_text()
-        if text is None:
-            raise StoreError(f"{path} holds no configuration; give the YAML file that made it")
-        location = read_json(path / ".pchem" / "location.json") or {}
-        written = location.get("config")
-        return Target(
-            parse_config(text, str(path)),
-            Path(location.get("base_dir", path.parent)),
-            path,
-            None if written is None else Path(written),
-        )
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        what = "is neither a YAML file nor a run" if path.exists() else "does not exist"
-        raise ConfigError(f"{path} {what}; give a config.yaml or the store of a run")
-    config = load_config(path)
-    base_dir = path.resolve().parent
-    return Target(config, base_dir, place_of(config.run.store, base_dir), path.resolve())
 
 
 def with_overrides(target: Target, command: Command) -> Target:
@@ -148,18 +92,16 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
         if failed:
             raise IncompleteRunError("; ".join(failed) + "; the rest is kept, run again to retry")
-        for name in ("fit", "joint"):
-            if name in stages:
-                _check_failed_pixels(context, f"{name}/fit_status")
+        for words in filter(None, (STAGES[name].status_words for name in stages)):
+            _check_failed_pixels(context, words)
     return states
 
 
 def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageState:
-    """Bring a stage up to date; where the input and the histograms are wanted, by one pass over the files."""
-    if name == "ingest" and "histogram" in stages:
-        from pchem_pipeline.stages.histogram.single_pass import sweep_input
-
-        sweep_input(context)
+    """Bring a stage up to date; with those after it, where one pass does the work of all."""
+    single_pass = STAGES[name].single_pass
+    if single_pass is not None and set(single_pass.stages) <= set(stages):
+        imported(single_pass.run)(context)
     return execute(name, context)
 
 
@@ -203,21 +145,21 @@ def _location(target: Target) -> dict[str, str]:
 
 
 def run_status(target: Target) -> list[StageState]:
-    """Return the state of every stage, and of ``electrons`` where it was run, without changing anything."""
+    """Return the state of every stage, of those on demand where they were run, without changing anything."""
     stages = pipeline_of(target.config)
     if not (target.store / "zarr.json").exists():
         return [StageState(name, "missing") for name in stages]
     context = _reading_context(target, Reporter("off", quiet=True), Options())
-    if context.store.records.read(JOINT_STAGES[0]) is not None:
-        stages = JOINT_STAGES
-    stages += tuple(name for name in OPTIONAL_STAGES if context.store.records.read(name) is not None)
+    if "samples" in context.store.attributes("samples"):
+        stages = ()  # a joint fit
+    done = (name for name in STAGES if context.store.records.read(name) is not None)
+    stages += tuple(name for name in done if STAGES[name].on_demand)
     states: list[StageState] = []
     stale: set[str] = set()
     for name in stages:
-        stage = declaration_of(name)
+        stage = STAGES[name]
         state = status(stage, context)
-        # what a simulation writes, ingest reads
-        above = [upstream for upstream in stage.UPSTREAM or ("simulate",) if upstream in stale]
+        above = [upstream for upstream in (*stage.upstream, *stage.follows) if upstream in stale]
         if above and state.state in ("complete", "partial"):
             state = StageState(name, "stale", f"{above[0]} is stale", state.done, state.total)
         if state.state == "stale":
@@ -244,16 +186,10 @@ def _is_to_do(states: Mapping[str, StageState], name: str, command: Command) -> 
 
 
 def _plan(target: Target, todo: Sequence[str], command: Command) -> list[str]:
-    """Say what it takes to go through the camera files, where that is to be done and they are there."""
-    from pchem_pipeline.frames.histogram_files import is_histogram_input
-
+    """Say what the stages that are to be done will take, as far as they can tell."""
     target = with_overrides(target, command)
-    config = target.config
-    if "histogram" not in todo or "simulate" in todo or is_histogram_input(config.input, target.base_dir):
-        return []
-    from pchem_pipeline.stages.histogram.dry_run import make_plan
-
-    return make_plan(config, target.base_dir).words()
+    plans = [plan for plan in (STAGES[name].plan for name in todo) if plan is not None]
+    return [line for plan in plans for line in imported(plan)(target.config, target.base_dir, todo)]
 
 
 def _reading_context(target: Target, reporter: Reporter, options: Options) -> StageContext:

@@ -1,21 +1,11 @@
-"""What every stage is made of, and what it is given.
+"""What a stage is given, and how its units are done.
 
-A stage is a module of this package with
-
-* ``NAME`` (``"fit"``) and ``VERSION`` (raised when its algorithm changes, which makes old results stale);
-* ``UPSTREAM``: the stages whose results it needs; ``SETTINGS``: the dotted config keys that it reads
-  (``("fit", "run.tile")``): a change of any of them, or upstream, makes its results stale;
-* ``READS`` and ``WRITES``: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``); what it
-  writes is removed when it starts anew;
-* a pure ``*_tile`` function, arrays in and arrays out;
-* ``run(context)``: makes its arrays (``context.create``), then calls
-  ``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
-  ``functools.partial`` of one) that takes a unit, opens the store by path
-  (``open_store(path)``), writes whole chunks and returns a small JSON-able summary. The marker of a
-  unit is set, in the worker, after its task returned;
-* optionally ``identity(context)``: JSON data that joins its fingerprint (the content of the camera files).
-
-The first four, and ``identity``, are declared in :mod:`pchem_pipeline.run.declared`, which is light.
+A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with a pure ``*_tile`` function, arrays in
+and arrays out, and ``run(context)``. That makes its arrays (``context.create``), then calls
+``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
+``functools.partial`` of one) that takes a unit, opens the store by path (``open_store(path)``), writes whole
+chunks and returns a small JSON-able summary. The marker of a unit is set, in the worker, after its task
+returned.
 
 A unit is anything picklable with ``key``, the words for messages, and ``keys``, the markers that it sets: a
 :class:`~pchem_pipeline.store.tiles.Tile`, a band of tiles, or a block of frames. A stage without
@@ -112,12 +102,12 @@ class Swept:
     """What one pass over the input did for several stages at once; they have but to mark their units.
 
     Attributes:
-        stages: the stages whose arrays are written.
+        stages: the stages whose arrays are written, in order; the last one's record takes the clock.
         frames: the opened camera files.
         clock: wall and CPU time when the pass began.
     """
 
-    stages: frozenset[str]
+    stages: tuple[str, ...]
     frames: FrameSequence
     clock: tuple[float, float]
 
@@ -335,23 +325,3 @@ class StageContext:
         # camera files that vanished or changed are gone for all units, too
         if full or isinstance(error, InputError):
             fatal.append(error)
-
-
-class StageModule(Protocol):
-    """The names that a stage module offers; see the top of this file."""
-
-    NAME: str
-    VERSION: int
-    UPSTREAM: tuple[str, ...]
-    SETTINGS: tuple[str, ...]
-    READS: tuple[str, ...]
-    WRITES: tuple[str, ...]
-
-    def run(self, context: StageContext) -> None:
-        """Do the stage."""
-
-
-def identity_of(stage: object, context: StageContext) -> Any:
-    """Return what the stage adds to its fingerprint, if anything."""
-    identity = getattr(stage, "identity", None)
-    return None if identity is None else identity(context)

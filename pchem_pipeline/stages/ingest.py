@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, nothing_left, open_store
@@ -27,23 +26,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.reader import FrameReader
     from pchem_pipeline.frames.sequence import FrameSequence
 
-__all__ = [
-    "NAME",
-    "READS",
-    "SETTINGS",
-    "UPSTREAM",
-    "VERSION",
-    "WRITES",
-    "CopyUnit",
-    "frames_tile",
-    "identity",
-    "run",
-]
-
-_THIS = DECLARED["ingest"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
-identity = _THIS.identity
+__all__ = ["CopyUnit", "frames_tile", "run"]
 
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)

@@ -16,19 +16,13 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery, poores
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.stage import StageContext, open_store
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "identity", "maps_tile", "run"]
-
-_THIS = DECLARED["maps"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
-identity = _THIS.identity
+__all__ = ["maps_tile", "run"]
 
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")
 _NO_TIME = "integration time is not known: no dark current; give input.integration_time, s"

@@ -22,7 +22,6 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.frames.writing import WRITERS, write_frames
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
@@ -33,11 +32,7 @@ from pchem_pipeline.store.files import storage_error, write_atomic
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "frames_tile", "run"]
-
-_THIS = DECLARED["simulate"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+__all__ = ["frames_tile", "run"]
 
 TRUTH_FILE = "truth.npz"
 # memory for the frames in the making, over all workers

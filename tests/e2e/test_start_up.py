@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
-from pchem_pipeline.run.declared import DECLARED
-from pchem_pipeline.run.runner import OPTIONAL_STAGES, STAGES, load_stage
+from pchem_pipeline.cli.app import app
+from pchem_pipeline.run.declaration import imported
+from pchem_pipeline.stages.table import STAGES
 
 COMMAND = """
 import sys
@@ -30,7 +31,7 @@ MIDDLING = {"numpy", "zarr", "pydantic", "yaml"}
 
 
 @pytest.fixture
-def imported(finished, tmp_path, kernels):
+def libraries(finished, tmp_path, kernels):
     """Call a command on a copy of a finished run, and return the libraries that it imported."""
     store = tmp_path / "run.zarr"
     shutil.copytree(finished, store)
@@ -49,29 +50,30 @@ def imported(finished, tmp_path, kernels):
     return call
 
 
-def test_help_imports_next_to_nothing(imported):
-    assert not imported("--help") & (HEAVY | MIDDLING)
+def test_help_imports_next_to_nothing(libraries):
+    assert not libraries("--help") & (HEAVY | MIDDLING)
     # the command line library loads pydantic by itself where it is installed
-    assert not imported("run", "--help") & (HEAVY | MIDDLING - {"pydantic", "numpy"})
+    assert not libraries("run", "--help") & (HEAVY | MIDDLING - {"pydantic", "numpy"})
 
 
-def test_status_imports_nothing_that_computes(imported):
-    found = imported("status", "{store}")
+def test_status_imports_nothing_that_computes(libraries):
+    found = libraries("status", "{store}")
     assert not found & HEAVY
     assert found >= MIDDLING  # the list of imports is read right
 
 
-def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(imported):
-    found = imported("fit", "{store}", "--force", "--quiet", "--backend", "serial")
+def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(libraries):
+    found = libraries("fit", "{store}", "--force", "--quiet", "--backend", "serial")
     assert "numba" in found
     assert not found & (HEAVY - {"numba", "scipy"})
 
 
-def test_stages_are_what_they_declare():
-    assert set(DECLARED) >= {*STAGES, *OPTIONAL_STAGES}  # and those of joint runs
-    for name, declared in DECLARED.items():
-        stage = load_stage(name)
-        assert (name, declared.VERSION) == (stage.NAME, stage.VERSION)
-        assert (stage.UPSTREAM, stage.SETTINGS) == (declared.UPSTREAM, declared.SETTINGS)
-        assert (stage.READS, stage.WRITES) == (declared.READS, declared.WRITES)
-        assert getattr(stage, "identity", None) is declared.identity
+@pytest.mark.parametrize("name", STAGES)
+def test_every_function_that_a_row_names_is_there(name):
+    stage = STAGES[name]
+    single_pass = None if stage.single_pass is None else stage.single_pass.run
+    for place in (stage.run, stage.identity, stage.plan, single_pass):
+        assert place is None or callable(imported(place))
+    commands = {command.name or command.callback.__name__ for command in app.registered_commands}
+    assert name in commands or name == "joint_report"
+    assert {*stage.upstream, *stage.follows} < set(STAGES)

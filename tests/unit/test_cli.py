@@ -11,8 +11,10 @@ from pchem_pipeline.commands import new_run
 from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
 from pchem_pipeline.run import session
-from pchem_pipeline.run.session import Command, Target
+from pchem_pipeline.run import target as run_target
+from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.target import Target
 
 CONFIG = "input: {files: [a.tif]}\n"
 
@@ -21,7 +23,7 @@ CONFIG = "input: {files: [a.tif]}\n"
 def calls(monkeypatch):
     seen = []
     target = Target(parse_config(CONFIG), Path("/x"), Path("/x/run.zarr"))
-    monkeypatch.setattr(session, "find_run", lambda path: target)
+    monkeypatch.setattr(run_target, "find_run", lambda path: target)
     monkeypatch.setattr(new_run, "find_run", lambda path: target)
     monkeypatch.setattr(session, "run_stages", lambda *args: seen.append(args))
     return seen

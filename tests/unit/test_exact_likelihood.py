@@ -12,7 +12,8 @@ from pchem_pipeline.model.fit.pchem import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
-from pchem_pipeline.run.session import Command, find_run, run_stages
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.store.run_store import RunStore
 
 EXACT, AUTO = FitSettings(likelihood="exact"), FitSettings(likelihood="auto")

@@ -18,8 +18,9 @@ from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_execu
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import input_identity
+from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import StageState, execute, status
+from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store

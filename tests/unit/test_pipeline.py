@@ -3,7 +3,6 @@
 import functools
 import json
 import signal
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +12,10 @@ from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.load import parse_config
 from pchem_pipeline.run import runner
+from pchem_pipeline.run.declaration import Stage
+from pchem_pipeline.run.fingerprint import differences, status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import differences, execute, status
+from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest, stop_on_signals
 from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
@@ -53,9 +54,7 @@ def ensemble_run(context):
 
 
 def stage(name, upstream, settings, writes, run):
-    return SimpleNamespace(
-        NAME=name, VERSION=1, UPSTREAM=upstream, SETTINGS=settings, READS=(), WRITES=writes, run=run
-    )
+    return Stage(name, 1, upstream, settings, (), writes, f"{__name__}:{run.__name__}")
 
 
 FAKES = {
@@ -67,7 +66,7 @@ FAKES = {
 
 @pytest.fixture
 def make(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "load_stage", FAKES.__getitem__)
+    monkeypatch.setattr(runner, "STAGES", FAKES)
     CALLS.clear()
     BROKEN.clear()
     open_store.cache_clear()

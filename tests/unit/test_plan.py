@@ -26,7 +26,8 @@ import json, sys
 from pchem_pipeline.compute.environment import peak_rss_bytes, prepare_environment
 prepare_environment()
 from pathlib import Path
-from pchem_pipeline.run.session import Command, find_run, run_stages
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import find_run
 target = find_run(Path(sys.argv[1]))
 states = run_stages(target, ["ingest", "histogram"], Command(quiet=True))
 print(json.dumps([peak_rss_bytes(), *[state.state for state in states]]))

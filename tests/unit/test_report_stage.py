@@ -19,8 +19,9 @@ from pchem_pipeline.report.figures.plan_exhibits import PLAN_FIGURE
 from pchem_pipeline.report.pages.report import RenderedReport
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.verdict import flags
+from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute, status
+from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.report.report import choose_pixels, gather, report

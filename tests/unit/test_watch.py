@@ -12,9 +12,9 @@ from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands import watch as watch_module
 from pchem_pipeline.commands.watch import pace_words, rows, watch
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.run import session
-from pchem_pipeline.run.runner import StageState
-from pchem_pipeline.run.session import Target
+from pchem_pipeline.run import target
+from pchem_pipeline.run.fingerprint import StageState
+from pchem_pipeline.run.target import Target
 
 TARGET = Target(parse_config("input: {files: [a.tif]}\n"), Path("/x"), Path("/x/run.zarr"))
 PACE = {"stage": "fit", "unit": "tile", "done": 8, "total": 64, "rate": 2.0, "remaining": 28.0}
@@ -81,7 +81,7 @@ def test_json_lines_and_ctrl_c(looks: list[float]) -> None:
 
 
 def test_the_command_looks_once_unless_asked(looks: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "find_run", lambda path: TARGET)
+    monkeypatch.setattr(target, "find_run", lambda path: TARGET)
     result = CliRunner().invoke(app.app, ["status", "run.yaml"], catch_exceptions=False)
     assert result.stdout.splitlines() == rows([DONE, PART], PACE)
     result = CliRunner().invoke(app.app, ["status", "run.yaml", "--json"], catch_exceptions=False)

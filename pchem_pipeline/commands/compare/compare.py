@@ -26,7 +26,7 @@ from pchem_pipeline.report.pages.compare_page import (
 from pchem_pipeline.report.style.wording import count, short, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Target, find_run
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore

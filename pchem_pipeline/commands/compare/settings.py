@@ -8,7 +8,7 @@ from typing import Any
 
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.pages.compare_data import Setting
-from pchem_pipeline.run.declared import DECLARED
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["settings_that_differ", "versions_that_differ"]
@@ -40,7 +40,7 @@ def versions_that_differ(one: RunStore, other: RunStore) -> list[Setting]:
 def _versions(store: RunStore) -> dict[str, Any]:
     """Return the versions of a run; of a program all that its stages were done with."""
     found: dict[str, set[str]] = {}
-    for stage in DECLARED:
+    for stage in STAGES:
         record = store.records.read(stage)
         if record is not None and stage not in ("report", "electrons", "discrepancy"):
             found.setdefault(f"algorithm of {stage}", set()).add(str(record.version))
@@ -69,7 +69,7 @@ def _readers(name: str) -> tuple[str, ...]:
     if name in _BESIDE:
         return _BESIDE[name]
     return tuple(
-        stage
-        for stage, declared in DECLARED.items()
-        if any(name == key or name.startswith(f"{key}.") for key in declared.SETTINGS)
+        name_of_stage
+        for name_of_stage, stage in STAGES.items()
+        if any(name == key or name.startswith(f"{key}.") for key in stage.settings)
     )

@@ -10,7 +10,9 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.session import Command, find_run, run_stages
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import find_run
+from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
@@ -44,7 +46,7 @@ def run_demo(output: Path, *, size: int, n_frames: int, seed: int, quiet: bool =
     path = output / "demo.yaml"
     write_atomic(path, dump_config(config).encode())
     target = find_run(path)
-    run_stages(target, target.stages, Command(quiet=quiet))
+    run_stages(target, pipeline_of(target.config), Command(quiet=quiet))
     table = comparison_table(RunStore.open(target.store))
     return f"{table}\n\nreport: {target.store / 'report.html'}"
 

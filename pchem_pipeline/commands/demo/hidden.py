@@ -20,12 +20,14 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.frames.writing import write_frames
-from pchem_pipeline.run.session import Command, find_run, run_stages
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.stages.discrepancy.result import read_result
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
+from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import read_json, write_atomic, write_json
 from pchem_pipeline.store.run_store import RunStore
 
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.run.session import Target
+    from pchem_pipeline.run.target import Target
     from pchem_pipeline.simulate.truth import TruthMaps
 
 __all__ = ["RANDOM", "SEALED_KEY", "hidden_effect", "run_hidden_demo"]
@@ -85,7 +87,7 @@ def run_hidden_demo(
         _run_plain(output, command)
     run_stages(find_run(output / _YAML), ["discrepancy"], command)
     grown = find_run(output / _YAML)
-    run_stages(grown, grown.stages, command)
+    run_stages(grown, pipeline_of(grown.config), command)
     return _text(output, grown)
 
 
@@ -201,7 +203,7 @@ def _unpacked(path: Path) -> dict[str, NDArray[Any]]:
 def _run_plain(output: Path, command: Command) -> None:
     """Run every stage with the plain model, and keep its maps: the grown model replaces them."""
     target = find_run(output / _YAML)
-    run_stages(target, [name for name in target.stages if name != "report"], command)
+    run_stages(target, [name for name in pipeline_of(target.config) if name != "report"], command)
     write_atomic(output / _PLAIN_MAPS, _packed(_maps(target)))
 
 

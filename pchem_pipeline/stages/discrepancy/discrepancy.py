@@ -24,21 +24,15 @@ from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.fit.added_exposure import write_added_exposure
 from pchem_pipeline.stages.histogram.frame_source import FrameSource, open_source
 from pchem_pipeline.store.files import write_atomic
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "Window", "choose_window", "run"]
+__all__ = ["Window", "choose_window", "run"]
 
-_THIS = DECLARED["discrepancy"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
-identity = _THIS.identity
-
-_RESULT = "discrepancy.json"
+_STAGE, _RESULT = "discrepancy", "discrepancy.json"
 # frames tell more than pixels about what happens in time; pixels more about what is rare
 _FRAMES_WANTED = 6000
 
@@ -141,7 +135,7 @@ def _run_histograms(context: StageContext) -> None:
     """Do the same with ready-made histograms, in one unit."""
     if not context.store.has("histogram/counts"):
         place = quoted(context.store.path)
-        raise StoreError(f"{NAME} of histograms needs them in the store; run: pchem histogram {place}")
+        raise StoreError(f"{_STAGE} of histograms needs them in the store; run: pchem histogram {place}")
     before = context.config.model.effects
     counts = context.store.read("histogram/counts")
     found = find_in_histograms(
@@ -220,10 +214,10 @@ def _write(
         found.code_grown,
     )
     for name, array in arrays.items():
-        context.store.write_array(f"{NAME}/{name}", array)
+        context.store.write_array(f"{_STAGE}/{name}", array)
     context.store.write_file(_RESULT, json.dumps(result, indent=1, ensure_ascii=False).encode())
     context.store.set_attributes(
-        NAME,
+        _STAGE,
         {
             "model_before": _dump(before),
             "model_after": _dump(found.model),

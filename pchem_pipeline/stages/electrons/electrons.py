@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.electrons.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.electrons.tile_bands import tile_bands
 from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
@@ -29,11 +28,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.histogram.bands import Band
     from pchem_pipeline.stages.histogram.frame_source import FrameSource
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "electrons_tile", "run"]
-
-_THIS = DECLARED["electrons"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+__all__ = ["electrons_tile", "run"]
 
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128

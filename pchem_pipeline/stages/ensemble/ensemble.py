@@ -23,7 +23,6 @@ from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_a
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.maps.pixels import PixelParameters
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.electrons.tile_bands import tile_bands
 from pchem_pipeline.stages.ensemble.result import pixels_of, write_result
@@ -38,11 +37,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.histogram.frame_source import FrameSource
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "ensemble_tile", "run"]
-
-_THIS = DECLARED["ensemble"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+__all__ = ["ensemble_tile", "run"]
 
 #: Frames read at a time, and bytes of histograms of a band.
 _BLOCK_FRAMES = 64

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.run.identities import known_added_exposure
+from pchem_pipeline.stages.identities import known_added_exposure
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore

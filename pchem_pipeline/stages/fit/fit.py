@@ -25,7 +25,6 @@ from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.law.sample_law import MarginalModel
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.added_exposure import read_added_exposure
 from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
@@ -34,13 +33,9 @@ from pchem_pipeline.stages.fit.together import judge_sensor
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "fit_tile", "identity", "run"]
+__all__ = ["fit_tile", "run"]
 
-_THIS = DECLARED["fit"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
-identity = _THIS.identity
-
+_HISTOGRAM = ("counts", "origin", "under", "over")
 #: Pixels of which effects are told nothing: no value, or one electron off.
 _UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
 
@@ -198,7 +193,7 @@ def _do_tile(
 ) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels."""
     run_store = open_store(store)
-    histogram = {name.split("/")[1]: run_store.read(name, tile.region) for name in READS}
+    histogram = {name: run_store.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM}
     start = kept_fit(store, tile.region)
     ny, nx = run_store.array("histogram/origin").shape
     added = read_added_exposure(run_store, effects, (ny, nx), tile.region)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.run.runner import setting_values
+from pchem_pipeline.run.fingerprint import setting_values
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 
@@ -33,7 +34,8 @@ def keep_fit(context: StageContext) -> None:
     """
     store = context.store
     record = store.records.read("fit")
-    if record is None or not record.finished or record.content["settings"] != setting_values("fit", context):
+    settings = setting_values(STAGES["fit"], context)
+    if record is None or not record.finished or record.content["settings"] != settings:
         drop_fit(store.path)
         return
     names = (*PARAMETERS, "likelihood_gap")

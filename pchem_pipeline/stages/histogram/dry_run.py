@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.environment import available_memory, available_workers
+from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RangeAccumulator, choose_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
 from pchem_pipeline.stages.histogram.bands import bytes_per_row
 from pchem_pipeline.stages.ingest import chunk_shape
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pchem_pipeline.config.tree import RunConfig
@@ -27,6 +29,7 @@ __all__ = [
     "allowed_bytes",
     "band_bytes",
     "make_plan",
+    "plan_lines",
     "sweep_bytes",
     "sweep_rows",
     "worker_count",
@@ -142,6 +145,19 @@ class Plan:
             f"{self.allowed_bytes / 2**20:.0f} MiB are allowed",
             f"plan: about {max(self.seconds, 1):.0f} s on a quiet machine",
         ]
+
+
+def plan_lines(config: RunConfig, base_dir: Path, todo: Sequence[str]) -> list[str]:
+    """Return what it takes to go through the camera files, where they are there; else nothing.
+
+    Args:
+        config: of the run.
+        base_dir: folder to which its paths refer.
+        todo: the stages that are to be done.
+    """
+    if "simulate" in todo or is_histogram_input(config.input, base_dir):
+        return []
+    return make_plan(config, base_dir).words()
 
 
 def make_plan(config: RunConfig, base_dir: Path) -> Plan:

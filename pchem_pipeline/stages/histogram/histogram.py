@@ -28,7 +28,6 @@ from pchem_pipeline.model.histogram.summaries import (
     block_starts,
     frame_statistics,
 )
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.histogram.bands import (
     CHUNK_BLOCKS,
@@ -48,20 +47,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.histogram.settings import HistogramSettings
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = [
-    "NAME",
-    "READS",
-    "SETTINGS",
-    "UPSTREAM",
-    "VERSION",
-    "WRITES",
-    "histogram_tile",
-    "run",
-]
-
-_THIS = DECLARED["histogram"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
+__all__ = ["histogram_tile", "run"]
 
 _MAPS = ("origin", "under", "over", "minimum", "maximum")
 _COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.open import open_frames
@@ -27,13 +28,13 @@ from pchem_pipeline.frames.read_once import ReadOnce
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.model.histogram.count import RangeAccumulator, choose_bins
 from pchem_pipeline.run.input_identity import identity_is_new, keep_identity
-from pchem_pipeline.run.runner import cpu_seconds
 from pchem_pipeline.run.stage import StageContext, Swept, open_store
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.histogram import histogram
 from pchem_pipeline.stages.histogram.counting import BandCounter
 from pchem_pipeline.stages.histogram.dry_run import allowed_bytes, sweep_bytes, sweep_rows
 from pchem_pipeline.stages.histogram.stream import Parts, Sweep, cut_rows
+from pchem_pipeline.stages.table import STAGES
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -74,7 +75,7 @@ def sweep_input(context: StageContext) -> None:
         return  # the files changed meanwhile: the stages look at them again
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         keep_identity(context, quick, identity)
-        context.swept = Swept(frozenset(_STAGES), frames, clock)
+        context.swept = Swept(_STAGES, frames, clock)
 
 
 def _is_wanted(context: StageContext) -> bool:
@@ -162,7 +163,7 @@ def _choose_bins(context: StageContext, pool: ThreadPoolExecutor, parts: Parts) 
 def _create(context: StageContext, frames: FrameSequence, bins: int) -> None:
     """Make the arrays of both stages anew."""
     context.fresh = True
-    for name in (*ingest.WRITES, *histogram.WRITES):
+    for name in (path for stage in _STAGES for path in STAGES[stage].writes):
         context.store.delete(name)
     ingest.sensor_of(frames, context, {}).write(context.store)
     if context.config.input.mode == "copy":

@@ -17,7 +17,6 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.joint_maps import LINE_MAPS, SHARED_MAPS, joint_maps
 from pchem_pipeline.model.maps.maps import status_counts, summarise
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.joint.samples import Sample, read_samples
@@ -26,11 +25,7 @@ from pchem_pipeline.store.run_store import RunStore
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "joint_tile", "run"]
-
-NAME = "joint"
-VERSION, UPSTREAM, SETTINGS = DECLARED[NAME].VERSION, DECLARED[NAME].UPSTREAM, DECLARED[NAME].SETTINGS
-READS, WRITES, identity = DECLARED[NAME].READS, DECLARED[NAME].WRITES, DECLARED[NAME].identity
+__all__ = ["joint_tile", "run"]
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
 _LINE = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "linearity_p")

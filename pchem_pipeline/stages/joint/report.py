@@ -15,7 +15,6 @@ from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.report.pages.joint_data import JointData, JointSample, middle
 from pchem_pipeline.report.pages.joint_page import JOINT_EXHIBIT_NAMES, render_joint
 from pchem_pipeline.report.style.pictures import DrawAll
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
@@ -26,11 +25,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["NAME", "READS", "SETTINGS", "UPSTREAM", "VERSION", "WRITES", "gather_joint", "run"]
-
-NAME = "joint_report"
-VERSION, UPSTREAM, SETTINGS = DECLARED[NAME].VERSION, DECLARED[NAME].UPSTREAM, DECLARED[NAME].SETTINGS
-READS, WRITES, identity = DECLARED[NAME].READS, DECLARED[NAME].WRITES, DECLARED[NAME].identity
+__all__ = ["gather_joint", "run"]
 
 _NOT_SHOWN = ("covariance",)
 
@@ -41,7 +36,7 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: an array is missing or the store cannot be written.
     """
-    draw = draw_by_workers(context.executor.workers, context.reporter, NAME)
+    draw = draw_by_workers(context.executor.workers, context.reporter, context.stage)
     task = functools.partial(_write, context.store.path, context.config, context.config_path, draw)
     context.run_units([WHOLE], task, unit_name="report")
 

@@ -9,7 +9,7 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.config.joint import JointConfig
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Target
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["Sample", "check_runs", "describe_samples", "read_samples", "write_samples"]

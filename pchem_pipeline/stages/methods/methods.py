@@ -23,31 +23,14 @@ from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.run.declared import DECLARED
-from pchem_pipeline.run.other_runs import open_other_runs
 from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.methods.other_runs import open_other_runs
 from pchem_pipeline.stages.methods.result import METHODS_FILE
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = [
-    "NAME",
-    "READS",
-    "SETTINGS",
-    "UPSTREAM",
-    "VERSION",
-    "WRITES",
-    "choose",
-    "identity",
-    "methods_tile",
-    "run",
-]
-
-_THIS = DECLARED["methods"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
-identity = _THIS.identity
+__all__ = ["choose", "methods_tile", "run"]
 
 #: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
 _NO_REFERENCE = FAILED | FitStatus.BIAS_AMBIGUOUS

@@ -24,7 +24,6 @@ from pchem_pipeline.report.figures.plan_exhibits import PLAN_FIGURE
 from pchem_pipeline.report.pages.captions import case_name
 from pchem_pipeline.report.pages.discrepancy_page import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
-from pchem_pipeline.run.declared import DECLARED
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import read_discrepancy
 from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
@@ -33,6 +32,7 @@ from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
 from pchem_pipeline.stages.report.drawing import draw_by_workers
 from pchem_pipeline.stages.report.inspector import gather_inspector
 from pchem_pipeline.stages.report.plan_section import plan_section
+from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -43,24 +43,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.records import StageRecord
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = [
-    "NAME",
-    "READS",
-    "SETTINGS",
-    "UPSTREAM",
-    "VERSION",
-    "WRITES",
-    "choose_pixels",
-    "identity",
-    "read_pixels",
-    "report_tile",
-    "run",
-]
-
-_THIS = DECLARED["report"]
-NAME, VERSION, UPSTREAM = _THIS.NAME, _THIS.VERSION, _THIS.UPSTREAM
-SETTINGS, READS, WRITES = _THIS.SETTINGS, _THIS.READS, _THIS.WRITES
-identity = _THIS.identity
+__all__ = ["choose_pixels", "read_pixels", "report_tile", "run"]
 
 _FIT_MAPS = ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share")
 #: Maps that are no parameters.
@@ -146,7 +129,7 @@ def run(context: StageContext) -> None:
         context.config,
         context.integration_time,
         _stage_rows(context),
-        draw_by_workers(context.executor.workers, context.reporter, NAME),
+        draw_by_workers(context.executor.workers, context.reporter, context.stage),
     )
     context.run_units([WHOLE], task, unit_name="report")
 
@@ -352,7 +335,7 @@ def _grown_mass(
 
 
 def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[str, Any]:
-    record = store.records.read(NAME)
+    record = store.records.read("report")
     facts: dict[str, Any] = {
         "store": store.path.name,
         "input": f"{sensor.kind}, {sensor.mode}" if sensor.kind == "frames" else "ready-made histograms",
@@ -373,10 +356,9 @@ def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[s
 
 def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
     """Return what the table of stages shows, the report itself left out."""
-    from pchem_pipeline.run.runner import STAGES
-
-    records = [(name, context.store.records.read(name)) for name in STAGES if name != NAME]
-    return [_stage_row(context.store, record) for _, record in records if record is not None]
+    names = [name for name in pipeline() if name != context.stage]
+    records = [context.store.records.read(name) for name in names]
+    return [_stage_row(context.store, record) for record in records if record is not None]
 
 
 def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:

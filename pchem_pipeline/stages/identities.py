@@ -86,7 +86,7 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
 def other_samples(context: StageContext) -> dict[str, Any]:
     """Return which other runs join a comparison of methods, and their state."""
-    from pchem_pipeline.run import other_runs
+    from pchem_pipeline.stages.methods import other_runs
 
     return {**adc_limits(context), "with_runs": other_runs.other_samples(context)}
 

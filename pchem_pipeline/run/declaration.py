@@ -1,0 +1,81 @@
+"""What a stage declares about itself: a row of the table in :mod:`pchem_pipeline.stages.table`.
+
+Rows import nothing that computes: functions are named as ``"module:function"`` and imported when called.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
+
+__all__ = ["SinglePass", "Stage", "imported"]
+
+
+def imported(place: str) -> Callable[..., Any]:
+    """Import and return the function that ``"package.module:function"`` names."""
+    module, _, name = place.partition(":")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function
+
+
+@dataclass(frozen=True)
+class SinglePass:
+    """Several stages whose work can be done in one pass over the input.
+
+    Attributes:
+        stages: their names, in order.
+        run: ``"module:function"`` that takes the context of the run, does the work where that is possible,
+            and then sets ``context.swept``.
+    """
+
+    stages: tuple[str, ...]
+    run: str
+
+
+def _every_run(_: RunConfig) -> bool:
+    return True
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of a run.
+
+    Attributes:
+        name: what commands, records and messages call it.
+        version: of its algorithm; raised when that changes, which makes old results stale.
+        upstream: the stages whose results it needs.
+        settings: dotted config keys that it reads; a change of any makes its results stale.
+        reads: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``).
+        writes: likewise; what it writes is removed when it starts anew.
+        run: ``"module:function"`` that takes the context and does the stage.
+        identity: likewise; returns JSON data that joins its fingerprint (the content of the camera files).
+        summary: help of its command; empty where the command line gives it options of its own.
+        applies: tells from the configuration whether a run has the stage.
+        on_demand: done only where it is asked for by name.
+        follows: stages that write the files which this one reads as input.
+        single_pass: what does its work, and that of the stages after it, in one pass over the input.
+        plan: ``"module:function"`` that takes (configuration, folder, stages to be done) and returns lines
+            which say what the stage will take.
+        status_words: array of status words that it writes; too many failed pixels end a command in an error.
+    """
+
+    name: str
+    version: int
+    upstream: tuple[str, ...]
+    settings: tuple[str, ...]
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    run: str
+    identity: str | None = None
+    summary: str = ""
+    applies: Callable[[RunConfig], bool] = _every_run
+    on_demand: bool = False
+    follows: tuple[str, ...] = ()
+    single_pass: SinglePass | None = None
+    plan: str | None = None
+    status_words: str | None = None

@@ -1,0 +1,137 @@
+"""What decides the result of a stage: how far it is, what is stale, and why."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pchem_pipeline.config.load import setting_of
+from pchem_pipeline.run.declaration import Stage, imported
+from pchem_pipeline.store.records import StageRecord, fingerprint_of
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.stage import StageContext
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["StageState", "differences", "fingerprint_content", "setting_values", "status"]
+
+
+@dataclass(frozen=True)
+class StageState:
+    """How far a stage is.
+
+    Attributes:
+        stage: its name.
+        state: missing, partial, stale, complete or failed.
+        why: reason, for people.
+        done: finished units.
+        total: units of the complete stage (0 where not known yet).
+    """
+
+    stage: str
+    state: str
+    why: str = ""
+    done: int = 0
+    total: int = 0
+
+    def words(self) -> str:
+        """Return the state as ``pchem status`` prints it."""
+        count = f" {self.done} of {self.total}" if self.state == "partial" and self.total else ""
+        return f"{self.state}{count}" + (f" - {self.why}" if self.why else "")
+
+
+def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
+    """Return all that decides the result of a stage, as JSON data."""
+    upstream: dict[str, str | None] = {}
+    for name in stage.upstream:
+        record = context.store.records.read(name)
+        upstream[name] = None if record is None else _state_of_record(context.store, record)
+    return {
+        "stage": stage.name,
+        "version": stage.version,
+        "settings": setting_values(stage, context),
+        "upstream": upstream,
+        "input": None if stage.identity is None else imported(stage.identity)(context),
+    }
+
+
+def setting_values(stage: Stage, context: StageContext) -> dict[str, Any]:
+    """Return the settings that a stage reads, as JSON data."""
+    return {key: setting_of(context.config, key) for key in stage.settings}
+
+
+def _state_of_record(store: RunStore, record: StageRecord) -> str:
+    """Return the fingerprint of a stage; for one that lacks units, also which it has."""
+    done = store.records.done(record.stage, record.fingerprint)
+    if len(done) >= record.keys > 0:
+        return record.fingerprint
+    return f"{record.fingerprint}+{hashlib.sha256(' '.join(sorted(done)).encode()).hexdigest()[:16]}"
+
+
+def status(stage: Stage, context: StageContext) -> StageState:
+    """Return how far a stage is under the present configuration and input."""
+    record = context.store.records.read(stage.name)
+    if record is None:
+        return StageState(stage.name, "missing")
+    done = len(context.store.records.done(stage.name, record.fingerprint))
+    content = fingerprint_content(stage, context)
+    if fingerprint_of(content) != record.fingerprint and not _grew(content, record):
+        return StageState(
+            stage.name, "stale", "; ".join(differences(record.content, content)), done, record.keys
+        )
+    if done < record.keys or record.keys == 0:
+        reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
+        return StageState(stage.name, "partial", reason, done, record.keys)
+    if not record.finished:
+        return StageState(stage.name, "partial", "interrupted", done, record.keys)
+    return StageState(stage.name, "complete", "", done, record.keys)
+
+
+def _grew(content: dict[str, Any], record: StageRecord) -> bool:
+    """Tell whether the only change is that upstream stages finished more units of the same work.
+
+    Tiled stages then keep what they have and do the rest; undivided ones start again.
+    """
+    if record.keys == 1 or {**content, "upstream": 0} != {**record.content, "upstream": 0}:
+        return False
+    old, new = record.content.get("upstream", {}), content["upstream"]
+    return all(_base(old.get(name)) == _base(new[name]) for name in new)
+
+
+def _base(fingerprint: str | None) -> str | None:
+    return None if fingerprint is None else fingerprint.partition("+")[0]
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Say in words why two fingerprint contents differ."""
+    words: list[str] = []
+    if old.get("version") != new["version"]:
+        words.append(f"algorithm version {old.get('version')} -> {new['version']}")
+    before: dict[str, Any] = old.get("settings", {})
+    for key in sorted(before.keys() | new["settings"].keys()):
+        words += _changes(key, before.get(key), new["settings"].get(key))
+    for name in new["upstream"]:
+        if old.get("upstream", {}).get(name) != new["upstream"][name]:
+            words.append(f"{name} was done again")
+    if old.get("input") != new["input"]:
+        words += _input_changes(old.get("input"), new["input"])
+    return words
+
+
+def _input_changes(old: Any, new: Any) -> list[str]:
+    """Say which facts of the input changed; digests are no words."""
+    facts = {**(old or {}), **(new or {})}
+    if "content" in facts:
+        return ["the content of the input changed"]
+    return _changes("input", old or {}, new or {})
+
+
+def _changes(key: str, old: Any, new: Any) -> list[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        return [
+            word
+            for name in sorted(old.keys() | new.keys())
+            for word in _changes(f"{key}.{name}", old.get(name), new.get(name))
+        ]
+    return [] if old == new else [f"{key} {old} -> {new}"]

@@ -1,0 +1,60 @@
+"""Which run is meant: its configuration, the folder of its paths, its store, its YAML file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.config.load import load_config, make_config, parse_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.remote_path import place_of
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["Target", "find_run"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A run: its configuration, the folder its paths refer to, its store, and its YAML file if it has one."""
+
+    config: RunConfig
+    base_dir: Path
+    store: Path
+    config_path: Path | None = None
+
+    def changed(self, section: str, **values: object) -> Target:
+        """Return the same run with other values in a section of its configuration."""
+        content = self.config.model_dump(by_alias=True)
+        content[section] = {**content[section], **values}
+        return replace(self, config=make_config(content, "the command line"))
+
+
+def find_run(path: Path) -> Target:
+    """Return the run that a YAML file or a store belongs to.
+
+    Raises:
+        ConfigError: neither a YAML file nor a store, or its content is wrong.
+        StoreError: the store is damaged.
+    """
+    path = place_of(path)
+    if path.is_dir():
+        store = RunStore.open(path)
+        text = store.config_text()
+        if text is None:
+            raise StoreError(f"{path} holds no configuration; give the YAML file that made it")
+        location = read_json(path / ".pchem" / "location.json") or {}
+        written = location.get("config")
+        return Target(
+            parse_config(text, str(path)),
+            Path(location.get("base_dir", path.parent)),
+            path,
+            None if written is None else Path(written),
+        )
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        what = "is neither a YAML file nor a run" if path.exists() else "does not exist"
+        raise ConfigError(f"{path} {what}; give a config.yaml or the store of a run")
+    config = load_config(path)
+    base_dir = path.resolve().parent
+    return Target(config, base_dir, place_of(config.run.store, base_dir), path.resolve())

@@ -1,0 +1,201 @@
+"""The table of stages: what each needs, reads and writes, which settings decide it, and what does it.
+
+The runner, the session and the command line know the stages from here only. A new stage is a row and a module
+with a pure ``*_tile`` function and ``run(context)``. Nothing that computes is imported here, so that ``pchem
+status`` answers at once.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from pchem_pipeline.run.declaration import SinglePass, Stage
+
+if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
+
+__all__ = ["STAGES", "pipeline", "pipeline_of"]
+
+_HERE = "pchem_pipeline.stages"
+
+_INPUT_SETTINGS = (
+    "format",
+    "mode",
+    "shape",
+    "dtype",
+    "byte_order",
+    "header_bytes",
+    "frame_padding_bytes",
+    "dataset",
+    "bit_shift",
+    "bit_depth",
+    "roi",
+    "frame_range",
+    "on_bad_file",
+)
+
+_SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:sweep_input")
+
+
+def _is_simulated(config: RunConfig) -> bool:
+    return config.simulate is not None
+
+
+_ALL = (
+    Stage(
+        "simulate",
+        version=1,
+        upstream=(),
+        settings=("simulate",),
+        reads=(),
+        writes=("truth",),
+        run=f"{_HERE}.simulate:run",
+        summary="Write a simulated camera's frames, and its truth.",
+        applies=_is_simulated,
+    ),
+    Stage(
+        "ingest",
+        version=1,
+        upstream=(),
+        # not files: their content counts; not integration_time: it changes no frame
+        settings=tuple(f"input.{name}" for name in _INPUT_SETTINGS),
+        reads=(),
+        writes=("frames",),
+        run=f"{_HERE}.ingest:run",
+        identity=f"{_HERE}.identities:input_content",
+        follows=("simulate",),
+        single_pass=_SINGLE_PASS,
+    ),
+    Stage(
+        "histogram",
+        version=1,
+        upstream=("ingest",),
+        # not band_memory: it changes no result
+        settings=(
+            "histogram.block_frames",
+            "histogram.window_frames",
+            "histogram.max_bins",
+            "histogram.summaries",
+            "run.tile",
+        ),
+        reads=("frames",),
+        writes=("histogram", "summary"),
+        run=f"{_HERE}.histogram.histogram:run",
+        summary="Count every pixel's DN; keep summaries in time and space.",
+        plan=f"{_HERE}.histogram.dry_run:plan_lines",
+    ),
+    Stage(
+        "fit",
+        version=5,
+        upstream=("histogram",),
+        settings=("fit", "model", "run.tile"),
+        reads=("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),
+        writes=("fit",),
+        run=f"{_HERE}.fit.fit:run",
+        identity=f"{_HERE}.identities:fit_inputs",
+        summary="Fit H, g, mu and sigma of every pixel by PCH-EM.",
+        status_words="fit/fit_status",
+    ),
+    Stage(
+        "maps",
+        version=3,
+        upstream=("fit",),
+        settings=("maps", "run.tile"),
+        reads=("fit",),
+        writes=("maps",),
+        run=f"{_HERE}.maps:run",
+        identity=f"{_HERE}.identities:integration_time",
+        summary="Make the maps, with units, standard errors and quality.",
+    ),
+    Stage(
+        "ensemble",
+        version=2,
+        upstream=("histogram", "fit"),
+        settings=("ensemble", "run.tile"),
+        reads=("frames", "histogram", "fit", "truth"),
+        writes=("ensemble", "ensemble_tiles"),
+        run=f"{_HERE}.ensemble.ensemble:run",
+        summary="Predict the ensemble from the maps; compare with the data.",
+    ),
+    Stage(
+        "report",
+        version=2,
+        upstream=("histogram", "fit", "maps", "ensemble"),
+        settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
+        reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "truth"),
+        writes=(),
+        run=f"{_HERE}.report.report:run",
+        identity=f"{_HERE}.identities:verdict",
+        summary="Write report.html, report.json and the figures.",
+    ),
+    Stage(
+        "electrons",
+        version=1,
+        upstream=("ingest", "fit"),
+        settings=("run.tile",),
+        reads=("frames", "fit"),
+        writes=("electrons",),
+        run=f"{_HERE}.electrons.electrons:run",
+        summary="Write the stack of electron numbers into the store.",
+        on_demand=True,
+    ),
+    Stage(
+        "discrepancy",
+        version=4,
+        upstream=("ingest",),
+        settings=("discrepancy",),
+        reads=("frames",),
+        writes=("discrepancy",),
+        run=f"{_HERE}.discrepancy.discrepancy:run",
+        identity=f"{_HERE}.identities:search_start",
+        on_demand=True,
+    ),
+    Stage(
+        "methods",
+        version=1,
+        upstream=("histogram", "fit"),
+        settings=("methods",),
+        reads=("histogram", "fit", "truth"),
+        writes=("methods",),
+        run=f"{_HERE}.methods.methods:run",
+        identity=f"{_HERE}.identities:other_samples",
+        on_demand=True,
+    ),
+    # of a joint fit, whose samples are other runs
+    Stage(
+        "joint",
+        version=1,
+        upstream=(),
+        settings=("fit", "maps", "run.tile"),
+        reads=(),
+        writes=("joint", "maps"),
+        run=f"{_HERE}.joint.joint:run",
+        identity=f"{_HERE}.identities:joint_samples",
+        on_demand=True,
+        status_words="joint/fit_status",
+    ),
+    Stage(
+        "joint_report",
+        version=1,
+        upstream=("joint",),
+        settings=("report", "run.title", "run.allowed_failed_pixels"),
+        reads=("joint", "maps"),
+        writes=(),
+        run=f"{_HERE}.joint.report:run",
+        on_demand=True,
+    ),
+)
+
+#: Each stage by its name, in the order of the data.
+STAGES = MappingProxyType({stage.name: stage for stage in _ALL})
+
+
+def pipeline() -> tuple[str, ...]:
+    """Return the stages that ``pchem run`` may do, in their order."""
+    return tuple(stage.name for stage in _ALL if not stage.on_demand)
+
+
+def pipeline_of(config: RunConfig) -> tuple[str, ...]:
+    """Return the stages that ``pchem run`` does in a run of this configuration, in their order."""
+    return tuple(name for name in pipeline() if STAGES[name].applies(config))
