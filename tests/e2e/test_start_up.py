@@ -13,7 +13,7 @@ from pchem_pipeline.stages.table import STAGES
 
 COMMAND = """
 import sys
-from pchem_pipeline.cli.app import app
+from pchem_pipeline.cli import app
 try:
     app.main(sys.argv[1:])
 except SystemExit as end:

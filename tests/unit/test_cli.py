@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.cli.app import app
+from pchem_pipeline.cli import app
 from pchem_pipeline.commands import new_run
 from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config

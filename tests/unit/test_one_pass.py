@@ -22,8 +22,7 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.histogram import dry_run
-from pchem_pipeline.stages.histogram.histogram import single_pass
+from pchem_pipeline.stages.histogram import dry_run, single_pass
 from pchem_pipeline.stages.histogram.stream import Sweep, cut_rows
 from pchem_pipeline.store.run_store import RunStore
 

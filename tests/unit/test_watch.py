@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pchem_pipeline.cli.app import app
+from pchem_pipeline.cli import app
 from pchem_pipeline.commands import watch as watch_module
 from pchem_pipeline.commands.watch import pace_words, rows, watch
 from pchem_pipeline.config.load import parse_config
