@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
+from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import Command, run_stages, run_status
 from pchem_pipeline.run.target import Target, find_run
@@ -42,7 +41,9 @@ def find_and_grow(target: Target, command: Command, *, refit: bool) -> str:
         stages = [name for name in _AFTERWARDS if name in done]
         if stages:
             run_stages(grown, stages, without_choice(command))
-    return verdict_text(read_verdict(grown.store)) + f"\n\n{grown.store / 'discrepancy.json'}"
+    found = read_verdict(grown.store)
+    assert found is not None
+    return f"{verdict_text(found)}\n\n{grown.store / VERDICT_FILE}"
 
 
 def _of_histograms(target: Target) -> bool:
@@ -56,9 +57,3 @@ def _of_histograms(target: Target) -> bool:
 def without_choice(command: Command) -> Command:
     """Return the command without --force and --roi, which were meant for the search alone."""
     return replace(command, options=replace(command.options, force=False, roi=None))
-
-
-def read_verdict(store: Path) -> dict[str, object]:
-    """Return the content of ``discrepancy.json``."""
-    content: dict[str, object] = json.loads((store / "discrepancy.json").read_text(encoding="utf-8"))
-    return content

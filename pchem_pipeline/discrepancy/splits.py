@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.verdict import Examined
 
 __all__ = ["MINIMUM_FRAMES", "Splits", "block_length", "split_frames"]
 
@@ -35,11 +35,16 @@ class Splits:
     final: NDArray[np.int64]
     block_frames: int
 
-    def examined(self, shape: tuple[int, ...]) -> dict[str, Any]:
-        """Return what was looked at of a stack of a shape (frame, y, x), as ``discrepancy.json`` has it."""
-        parts = {"train": self.train, "test": self.test, "final": self.final}
-        sizes = {name: int(part.size) for name, part in parts.items()}
-        return {"frames": shape[0], "rows": [0, shape[1]], "columns": [0, shape[2]], **sizes}
+    def examined(self, shape: tuple[int, ...]) -> Examined:
+        """Return what was looked at of a stack of a shape (frame, y, x)."""
+        return Examined(
+            frames=shape[0],
+            rows=(0, shape[1]),
+            columns=(0, shape[2]),
+            train=self.train.size,
+            test=self.test.size,
+            final=self.final.size,
+        )
 
 
 def block_length(n_frames: int, wanted: int | None = None) -> int:

@@ -1,294 +1,438 @@
-"""What the workflow found, as ``discrepancy.json`` tells it."""
+"""The verdict of a search for missing effects: the content of ``discrepancy.json``, written and read here.
+
+The keys of the JSON are the names of the fields; a number that is not known is ``null`` there and NaN here.
+Whoever adds a key adds it here, and nowhere else; one that older files lack has a default, or raises
+:data:`SCHEMA_VERSION` and is filled in by :func:`_from_1` or a function like it.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
-from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.catalogue import VERSION as STATISTICS_VERSION
-from pchem_pipeline.discrepancy.where import Place
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["Candidate", "Discrepancy", "Pull", "Residual", "Step", "Verdict", "unit_of"]
+__all__ = [
+    "SCHEMA_VERSION",
+    "VERDICT_FILE",
+    "Candidate",
+    "Change",
+    "Discrepancy",
+    "Examined",
+    "Families",
+    "GapChange",
+    "Measured",
+    "Moved",
+    "Place",
+    "Pull",
+    "Rival",
+    "State",
+    "Step",
+    "Verdict",
+    "parameters_of",
+    "read_verdict",
+]
 
-Verdict = Literal["named", "ambiguous", "unexplained", "consistent"]
-SCHEMA = 1
+#: As the field ``schema_version`` of :class:`Verdict` has it.
+SCHEMA_VERSION = 2
+#: File of the verdict in the folder of a run.
+VERDICT_FILE = "discrepancy.json"
+
+State = Literal["named", "ambiguous", "unexplained", "consistent"]
+
+_NAN = float("nan")
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """An effect that was compared.
+def _number(value: Any) -> Any:
+    return _NAN if value is None else value
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+Number = Annotated[float, BeforeValidator(_number), PlainSerializer(_finite, when_used="json")]
+Interval = tuple[Number, Number]
+
+
+class _Part(BaseModel):
+    """A frozen part of the verdict; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Measured(_Part):
+    """A number of an effect with its standard error; NaN for one that was not fitted."""
+
+    value: Number
+    stderr: Number = _NAN
+    unit: str = ""
+
+
+class Candidate(_Part):
+    """An effect that was compared, and how well it explains samples that it was not fitted to.
 
     Attributes:
-        effect: with its fitted parameters.
+        effect: its tag.
         score: held-out log score against the chosen one, nats (0 for the chosen one).
         stderr: of that difference, nats.
         probability: among all candidates.
+        parameters: the fields of the effect.
     """
 
-    effect: Effect
-    score: float
-    stderr: float
-    probability: float
+    effect: str
+    score: Number
+    stderr: Number
+    probability: Number
+    parameters: dict[str, Any] = {}
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON data."""
-        return {
-            "effect": self.effect.tag,
-            "score": self.score,
-            "stderr": self.stderr,
-            "probability": self.probability,
-            "parameters": self.effect.model_dump(mode="json", exclude={"tag"}),
-        }
+    @classmethod
+    def of(cls, effect: Effect, score: float, stderr: float, probability: float) -> Candidate:
+        """Return an effect with its score."""
+        return cls(
+            effect=effect.tag,
+            score=score,
+            stderr=stderr,
+            probability=probability,
+            parameters=effect.model_dump(mode="json", exclude={"tag"}),
+        )
 
 
-@dataclass(frozen=True)
-class Pull:
-    """Deviation of one statistic before and after, in standard deviations."""
+class Rival(_Part):
+    """Another effect added in the place of the named one, and the gap that it leaves, nats per sample."""
+
+    effect: str
+    gap_after: Number
+
+
+class Moved(_Part):
+    """Change of the median of a delivered parameter, in its unit and in standard errors of a pixel."""
+
+    median: Number
+    in_stderr: Number
+    unit: str = ""
+
+
+class Pull(_Part):
+    """A statistic before and after effects were added, in standard deviations of chance."""
 
     statistic: str
-    before: float
-    after: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON data."""
-        sentence = STATISTICS[self.statistic].sentence
-        return {"statistic": self.statistic, "sentence": sentence, "before": self.before, "after": self.after}
+    sentence: str
+    before: Number
+    after: Number
 
 
-@dataclass(frozen=True)
-class Residual:
-    """Samples of some codes that the model does not account for.
+class Place(_Part):
+    """A disagreement of data and model: a statistic, and the pixels, codes or frames that carry it.
 
     Attributes:
-        words: where, which way and how many.
-        direction: "+" (more than the model has) or "-".
-        z: signed root of the Poisson deviance, standard deviations.
-        p: chance of one like it anywhere.
-        dn: first and last code, DN.
-        seen, expected: samples.
-        share: of the gap that is left.
+        statistic: its name in the catalogue.
+        sentence: what it says.
+        channel: charge, readout, ...
+        direction: "+" or "-".
+        z: deviation from what the model gives, standard deviations.
+        p: probability of any statistic deviating so much by chance.
+        pixels: (y, x) on the sensor, where it is a matter of few pixels.
+        dn: first and last code, where it is a matter of codes.
+        frames: frame numbers, where it is a matter of few frames.
+        seen, expected: samples in these codes, where they were counted.
+        share_of_gap: share of the gap that is left, where it was measured.
     """
 
-    words: str
-    direction: str
-    z: float
-    p: float
-    dn: tuple[int, int]
-    seen: float
-    expected: float
-    share: float
+    statistic: str
+    sentence: str = ""
+    channel: str = ""
+    direction: str = ""
+    z: Number = _NAN
+    p: Number = _NAN
+    pixels: tuple[tuple[int, int], ...] = ()
+    dn: tuple[int, int] | None = None
+    frames: tuple[int, ...] = ()
+    seen: Number = _NAN
+    expected: Number = _NAN
+    share_of_gap: Number = _NAN
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON data."""
-        return {
-            "statistic": "code.smooth",
-            "channel": STATISTICS["code.smooth"].channel,
-            "sentence": self.words,
-            "direction": self.direction,
-            "z": self.z,
-            "p": self.p,
-            "dn": list(self.dn),
-            "seen": self.seen,
-            "expected": self.expected,
-            "share_of_gap": self.share,
-        }
+    @classmethod
+    def of(cls, statistic: str, z: float, **more: Any) -> Place:
+        """Return a place with the sentence and the channel that the catalogue has for its statistic."""
+        known = STATISTICS[statistic]
+        words = {"sentence": known.sentence, "channel": known.channel, "direction": "+" if z > 0 else "-"}
+        return cls(statistic=statistic, z=z, **{**words, **more})
 
 
-@dataclass(frozen=True)
-class Step:
-    """One effect added to the model, or one that could not be told from others.
+class Families(_Part):
+    """The contribution of each family of statistics to the gap before and after, nats per sample."""
+
+    before: dict[str, Number] = {}
+    after: dict[str, Number] = {}
+
+
+class GapChange(_Part):
+    """The gap of the model on samples that no fit has seen, before and after effects were added."""
+
+    unit: str = "nats/sample"
+    before: Number
+    after: Number
+    floor: Number
+    closed_fraction: Number
+    interval_before: Interval = (_NAN, _NAN)
+    interval_after: Interval = (_NAN, _NAN)
+
+
+class Change(_Part):
+    """A number before and after effects were added."""
+
+    before: Number
+    after: Number
+
+
+class Examined(_Part):
+    """What was looked at.
 
     Attributes:
-        effect: the named effect; None where it is ambiguous or does not fit.
-        candidates: those compared, the likeliest first.
-        strength_stderr: standard error of its strength.
-        before, after: gap on the final frames without and with it.
-        runner_up, placebo: (tag, gap) of the next best candidate and of one that has nothing to do with it,
-            fitted the same way; None where there is none.
-        pulls: the statistics that moved most.
-        fits: whether it explains what it moves itself; where not, the candidates are the nearest known.
-        moved: change of each parameter map by its refit with the effect: median, and in standard errors.
+        frames: number of them; of histograms the samples of the fullest.
+        rows, columns: first, and end, on the sensor.
+        train, test, final: frames (of histograms: samples) to find with, to score on, and for the last gap.
+        histograms: number of those compared, where frames are not known.
     """
 
-    effect: Effect | None
-    candidates: tuple[Candidate, ...]
-    strength_stderr: float
-    before: Gap
-    after: Gap
-    runner_up: tuple[str, float] | None
-    placebo: tuple[str, float] | None
-    pulls: tuple[Pull, ...]
-    fits: bool = True
-    moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    frames: int
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    train: int
+    test: int
+    final: int
+    histograms: int | None = None
 
     @property
-    def verdict(self) -> Verdict:
-        """Verdict of this step alone."""
-        if not self.fits:
-            return "unexplained"
-        return "ambiguous" if self.effect is None else "named"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON data."""
-        shown = self.effect if self.effect is not None else self.candidates[0].effect
-        separate = dict(type(shown).separate)
-        rivals = {c.effect.tag for c in self.candidates}
-        return {
-            "effect": None if self.effect is None else self.effect.tag,
-            "verdict": self.verdict,
-            "candidates": [c.to_json() for c in self.candidates],
-            "parameters": _parameters(shown, self.strength_stderr),
-            "gap_before": self.before.value,
-            "gap_after": self.after.value,
-            "gap_floor": self.after.floor,
-            "gap_interval_after": list(self.after.interval),
-            "families": {"before": self.before.families, "after": self.after.families},
-            "runner_up": _tagged(self.runner_up),
-            "placebo": _tagged(self.placebo),
-            "moved": {name: dict(change) for name, change in self.moved.items()},
-            "separate": {t: m for t, m in separate.items() if t in rivals or self.effect is not None},
-            "pulls": [p.to_json() for p in self.pulls],
-        }
+    def origin(self) -> tuple[int, int]:
+        """First row and column."""
+        return self.rows[0], self.columns[0]
 
 
-@dataclass(frozen=True)
-class Discrepancy:
-    """The result of the workflow.
+class Step(_Part):
+    """An effect added to the model, or several that could not be told apart.
+
+    Attributes:
+        effect: tag of the named effect; None where it is ambiguous or does not fit.
+        verdict: of this step alone.
+        candidates: those compared, the likeliest first.
+        parameters: numbers of the named or the likeliest effect.
+        gap_before, gap_after, gap_floor: on the final samples without and with it, nats per sample.
+        gap_interval_after: 95 % interval of the gap with it.
+        families: the gap by family of statistics.
+        runner_up: the next best candidate, fitted in its place.
+        placebo: an effect that has nothing to do with it, fitted in its place.
+        moved: change of each parameter map by its refit with the effect.
+        separate: by effect, the measurement that would tell it apart.
+        pulls: the statistics that it moves most.
+    """
+
+    effect: str | None
+    verdict: State
+    candidates: tuple[Candidate, ...]
+    parameters: dict[str, Measured]
+    gap_before: Number
+    gap_after: Number
+    gap_floor: Number
+    gap_interval_after: Interval = (_NAN, _NAN)
+    families: Families = Families()
+    runner_up: Rival | None = None
+    placebo: Rival | None = None
+    moved: dict[str, Moved] = {}
+    separate: dict[str, str] = {}
+    pulls: tuple[Pull, ...] = ()
+
+    @property
+    def likeliest(self) -> str:
+        """Tag of the named effect, else of the likeliest candidate; empty without any."""
+        return self.effect or next((c.effect for c in self.candidates), "")
+
+
+class Verdict(_Part):
+    """The content of ``discrepancy.json``.
 
     Attributes:
         verdict: named, ambiguous, unexplained or consistent.
-        sentence: the verdict for people.
+        sentence: the same for people.
+        effects: tags of the named effects.
+        model_effects: all effects that the model has afterwards, as the YAML holds them.
         steps: what was added, in order of weight.
-        model: effects that the model has now, those it had before included.
-        gap_before, gap_after: on the final frames, with no new effect and with all.
-        where: the disagreements found.
-        unexplained: statistics that still deviate: name, and standard deviations.
-        untestable: effects that such frames cannot show, and why.
-        left_out: candidates that failed, and why.
-        global_p: chance of the largest deviation, before and after.
-        examined: frames, rows and columns looked at.
-        n_replicates: simulated stacks in all.
-        maps: parameters of the pixels examined, under the final model.
-        evidence: of the train frames.
-        statistics: names, and deviations before and after, for pictures.
-        residuals: codes that the final model does not account for (ready-made histograms).
-        set_aside: codes that its fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
+        gap: with no new effect, and with all.
+        where: the disagreements with the model as it was.
+        unexplained: those that are left.
+        set_aside: codes that the fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
             limit.
-        added: exposure that the effects add to single pixels beside the H of ``maps``; None: nothing.
-        code_grown: samples expected at each code of ``evidence.code`` from the final model; None where
-            nothing was added or the model gives no law.
+        untestable: effects that such data cannot show, and why.
+        left_out: candidates that failed, and why.
+        examined: what was looked at.
+        p_global: chance of the largest deviation.
+        replicates: simulated stacks or histograms in all.
+        versions: of what a verdict depends on.
     """
 
-    verdict: Verdict
+    schema_version: Literal[2] = 2
+    verdict: State
     sentence: str
+    effects: tuple[str, ...]
+    model_effects: tuple[dict[str, Any], ...]
     steps: tuple[Step, ...]
-    model: tuple[Effect, ...]
-    gap_before: Gap
-    gap_after: Gap
+    gap: GapChange
     where: tuple[Place, ...]
-    unexplained: tuple[tuple[str, float], ...]
-    untestable: Mapping[str, str]
-    left_out: Mapping[str, str]
-    global_p: tuple[float, float]
-    examined: Mapping[str, Any]
-    n_replicates: int
-    maps: PixelMaps
-    evidence: Evidence
-    statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
-    residuals: tuple[Residual, ...] = ()
+    unexplained: tuple[Place, ...]
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
-    code_grown: NDArray[np.float64] | None = None
-    added: AddedExposure | None = None
+    untestable: dict[str, str]
+    left_out: dict[str, str]
+    examined: Examined
+    p_global: Change
+    replicates: int
+    versions: dict[str, int | str]
 
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Tags of the named effects."""
-        return tuple(s.effect.tag for s in self.steps if s.effect is not None)
-
-    @property
-    def closed_fraction(self) -> float:
-        """Fraction of the gap that the added effects closed; 0 where there was none."""
-        before = self.gap_before.value
-        if before <= 0.0 or not self.steps:
-            return 0.0
-        return 1.0 - max(self.gap_after.value, 0.0) / before
-
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> str:
         """Return the content of ``discrepancy.json``."""
-        return {
-            "schema": SCHEMA,
-            "verdict": self.verdict,
-            "sentence": self.sentence,
-            "effects": list(self.effects),
-            "model_effects": [e.model_dump(mode="json") for e in self.model],
-            "steps": [s.to_json() for s in self.steps],
-            "gap": {
-                "unit": "nats/sample",
-                "before": self.gap_before.value,
-                "after": self.gap_after.value,
-                "floor": self.gap_after.floor,
-                "closed_fraction": self.closed_fraction,
-                "interval_before": list(self.gap_before.interval),
-                "interval_after": list(self.gap_after.interval),
-            },
-            "where": [_place(p) for p in self.where],
-            "untestable": list(self.untestable),
-            "untestable_reasons": dict(self.untestable),
-            "unexplained": [r.to_json() for r in self.residuals]
-            + [{"statistic": n, "z": z, "sentence": STATISTICS[n].sentence} for n, z in self.unexplained],
-            "set_aside": [list(interval) for interval in self.set_aside],
-            "examined": dict(self.examined),
-            "left_out": dict(self.left_out),
-            "p_global": {"before": self.global_p[0], "after": self.global_p[1]},
-            "replicates": self.n_replicates,
-            "versions": {"statistics": STATISTICS_VERSION},
-        }
+        return self.model_dump_json(indent=1)
+
+    @classmethod
+    def from_json(cls, text: str, source: str = VERDICT_FILE) -> Verdict:
+        """Read the content of ``discrepancy.json``, of this schema or an earlier one.
+
+        Args:
+            text: the content.
+            source: where it comes from, for the message.
+
+        Raises:
+            StoreError: it is damaged, or of a later schema.
+        """
+        cure = "run pchem discrepancy with --force"
+        try:
+            content = json.loads(text)
+        except ValueError as error:
+            raise StoreError(f"{source} is damaged ({error}); {cure}") from error
+        if not isinstance(content, dict):
+            raise StoreError(f"{source} holds no verdict; {cure}")
+        version = content.get("schema_version", content.get("schema"))
+        if isinstance(version, int) and version > SCHEMA_VERSION:
+            raise StoreError(
+                f"{source} holds a verdict of schema {version}, this program knows those up to "
+                f"{SCHEMA_VERSION}; use the version that wrote it, or {cure}"
+            )
+        try:
+            return cls.model_validate(_from_1(content) if version == 1 else content)
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(str(part) for part in first["loc"])
+            raise StoreError(f"{source} is damaged ({place}: {first['msg']}); {cure}") from error
+
+    def added(self, step: Step) -> str:
+        """Return what a step added to the model for its gap: an effect, or the likeliest of several."""
+        if step.effect:
+            return step.effect
+        rivals = list(dict.fromkeys(c.effect for c in step.candidates))[:3]
+        if not rivals or self.verdict == "consistent":
+            return ""
+        return f"nearest: {rivals[0]}" if self.verdict == "unexplained" else " or ".join(rivals)
+
+    def on_sensor(self, rows: tuple[int, int], columns: tuple[int, int]) -> Verdict:
+        """Return it with pixels counted from the corner of the sensor, not from that of a window.
+
+        Args:
+            rows: of the window, first and end.
+            columns: likewise.
+        """
+
+        def moved(places: tuple[Place, ...]) -> tuple[Place, ...]:
+            return tuple(
+                place.model_copy(
+                    update={"pixels": tuple((y + rows[0], x + columns[0]) for y, x in place.pixels)}
+                )
+                for place in places
+            )
+
+        examined = self.examined.model_copy(update={"rows": rows, "columns": columns})
+        return self.model_copy(update={"examined": examined, "where": moved(self.where)})
 
 
-def _place(place: Place) -> dict[str, Any]:
-    statistic = STATISTICS[place.statistic]
-    return {
-        "statistic": place.statistic,
-        "channel": statistic.channel,
-        "direction": place.direction,
-        "z": place.z,
-        "p": place.p,
-        "sentence": statistic.sentence,
-        "pixels": [list(pixel) for pixel in place.pixels],
-        "dn": list(place.dn),
-        "frames": list(place.frames),
-    }
+def read_verdict(folder: Path) -> Verdict | None:
+    """Read the verdict of a run, or return None where there is none.
+
+    Raises:
+        StoreError: it cannot be read.
+    """
+    path = folder / VERDICT_FILE
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise StoreError(f"{path} is damaged ({error}); run pchem discrepancy with --force") from error
+    return Verdict.from_json(text, str(path))
 
 
-def _tagged(item: tuple[str, float] | None) -> dict[str, Any] | None:
-    return None if item is None else {"effect": item[0], "gap_after": item[1]}
-
-
-def _parameters(effect: Effect, stderr: float) -> dict[str, Any]:
-    """Return the numbers of an effect; only its strength was fitted and has a standard error."""
-    found: dict[str, Any] = {}
-    for name, value in effect.model_dump(exclude={"tag"}).items():
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            fitted = name == effect.strength and np.isfinite(stderr)
-            found[name] = {
-                "value": value,
-                "stderr": float(stderr) if fitted else None,
-                "unit": unit_of(type(effect), name),
-            }
+def _from_1(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a file of version 0.1 as the present schema has it."""
+    found = {key: value for key, value in content.items() if key not in ("schema", "untestable_reasons")}
+    reasons = content.get("untestable_reasons") or {}
+    found["schema_version"] = SCHEMA_VERSION
+    found["untestable"] = {tag: reasons.get(tag, "") for tag in content.get("untestable", ())}
+    for key in ("where", "unexplained"):
+        found[key] = [{**place, "dn": place.get("dn") or None} for place in content.get(key, ())]
     return found
 
 
-def unit_of(effect: type[Effect], name: str) -> str:
+def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
+    """Return the numbers of an effect; only its strength was fitted and has a standard error.
+
+    Args:
+        effect: with its fitted parameters.
+        stderr: of its strength; NaN where there is none.
+    """
+    return {
+        name: Measured(
+            value=value, stderr=stderr if name == effect.strength else _NAN, unit=_unit(type(effect), name)
+        )
+        for name, value in effect.model_dump(exclude={"tag"}).items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+
+
+def _unit(effect: type[Effect], name: str) -> str:
     """Return the unit that the description of a field ends with, or nothing."""
     text = effect.model_fields[name].description or ""
     last = text.rpartition(",")[2].strip() if "," in text else ""
     return last if len(last) <= 20 and last != "no unit" else ""
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """A verdict with what it rests on.
+
+    Attributes:
+        verdict: what ``discrepancy.json`` holds.
+        model: effects that the model has now, those it had before included.
+        maps: parameters of the pixels examined, under the final model.
+        evidence: of the train samples.
+        statistics: names, and deviations before and after, for pictures.
+        code_grown: samples expected at each code of ``evidence.code`` from the final model; None where
+            nothing was added or the model gives no law.
+        added: exposure that the effects add to single pixels beside the H of ``maps``; None: nothing.
+    """
+
+    verdict: Verdict
+    model: tuple[Effect, ...]
+    maps: PixelMaps
+    evidence: Evidence
+    statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
+    code_grown: NDArray[np.float64] | None = None
+    added: AddedExposure | None = None

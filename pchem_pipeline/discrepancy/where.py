@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.by_simulation.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
-__all__ = ["Place", "locate"]
+__all__ = ["locate"]
 
 FloatArray = NDArray[np.float64]
 
@@ -19,29 +18,6 @@ _FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
 _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
-
-
-@dataclass(frozen=True)
-class Place:
-    """One disagreement.
-
-    Attributes:
-        statistic: its name; the catalogue has its sentence and channel.
-        direction: "+" or "-".
-        z: deviation from what the model gives, in standard deviations, train and test frames together.
-        p: probability of any statistic deviating so much by chance.
-        pixels: (y, x) of the pixels that carry it, where it is a matter of few pixels.
-        dn: first and last DN, where it is a matter of codes.
-        frames: frame numbers, where it is a matter of few frames.
-    """
-
-    statistic: str
-    direction: str
-    z: float
-    p: float
-    pixels: tuple[tuple[int, int], ...] = ()
-    dn: tuple[int, ...] = ()
-    frames: tuple[int, ...] = ()
 
 
 def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: float) -> list[Place]:
@@ -61,14 +37,13 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
             break
         name = null.names[index]
         places.append(
-            Place(
+            Place.of(
                 name,
-                "+" if pulls[index] > 0 else "-",
-                float(pulls[index]),
-                p,
-                _pixels(name, evidence),
-                _codes(name, evidence),
-                _frames(name, evidence),
+                z=float(pulls[index]),
+                p=p,
+                pixels=_pixels(name, evidence),
+                dn=_codes(name, evidence),
+                frames=_frames(name, evidence),
             )
         )
     return places
@@ -115,10 +90,10 @@ def _pixel_map(name: str, evidence: Evidence) -> NDArray[np.floating] | None:
     return None
 
 
-def _codes(name: str, evidence: Evidence) -> tuple[int, ...]:
+def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
     """Return the window of DN that stands out most, of any width."""
     if not name.startswith("code."):
-        return ()
+        return None
     code = evidence.code
     if name == "code.top":
         return (code.maximum, code.maximum)

@@ -63,7 +63,7 @@ def _look(case: Case, frames: NDArray[np.uint16], options: dict[str, Any]) -> di
     return {
         "seconds": time.perf_counter() - wall,
         "cpu_seconds": time.process_time() - cpu,
-        "verdict": found.to_json(),
+        "verdict": json.loads(found.verdict.to_json()),
         "found": found,
     }
 

@@ -56,11 +56,11 @@ def histograms(seed, *, hidden="", sigma_e=0.25, strength=0.0):
 
 
 def test_nothing_hidden_is_consistent():
-    found = find_in_histograms(*histograms(1), SETTINGS)
+    found = find_in_histograms(*histograms(1), SETTINGS).verdict
     assert found.verdict == "consistent"
-    assert found.model == ()
+    assert found.model_effects == ()
     assert found.effects == ()
-    assert found.gap_before.value < 3 * found.gap_before.floor
+    assert found.gap.before < 3 * found.gap.floor
     assert "row_noise" in found.untestable
     assert "no order in time and no neighbours" in found.untestable["row_noise"]
 
@@ -70,27 +70,27 @@ def test_nothing_hidden_is_consistent():
     [("branching_counts", 0.08, "branching"), ("signal_dependent_noise", 0.11, "noise_e")],
 )
 def test_what_is_hidden_is_named(hidden, strength, name):
-    found = find_in_histograms(*histograms(7, hidden=hidden, strength=strength), SETTINGS)
+    found = find_in_histograms(*histograms(7, hidden=hidden, strength=strength), SETTINGS).verdict
     assert found.verdict == "named", found.sentence
     assert found.effects == (hidden,)
-    step = found.to_json()["steps"][0]
-    fitted = step["parameters"][name]
-    assert abs(fitted["value"] - strength) < 5 * fitted["stderr"]
-    assert 0 < fitted["stderr"] < 0.2 * strength
+    [step] = found.steps
+    fitted = step.parameters[name]
+    assert abs(fitted.value - strength) < 5 * fitted.stderr
+    assert 0 < fitted.stderr < 0.2 * strength
     # the gap falls to what chance leaves, and a wrong effect in its place does not bring it there
-    assert step["gap_before"] > 3 * step["gap_floor"]
-    assert step["gap_after"] < 2 * step["gap_floor"]
-    assert step["runner_up"]["gap_after"] > step["gap_after"] + 0.5 * step["gap_floor"]
+    assert step.gap_before > 3 * step.gap_floor
+    assert step.gap_after < 2 * step.gap_floor
+    assert step.runner_up.gap_after > step.gap_after + 0.5 * step.gap_floor
     assert found.set_aside == ()
 
 
 def test_a_near_twin_is_told_apart_or_listed_beside_the_right_name():
-    found = find_in_histograms(*histograms(7, hidden="overdispersed_counts", strength=0.06), SETTINGS)
+    found = find_in_histograms(*histograms(7, hidden="overdispersed_counts", strength=0.06), SETTINGS).verdict
     assert found.verdict in ("named", "ambiguous"), found.sentence
-    listed = {c.effect.tag for s in found.steps for c in s.candidates[:2]}
+    listed = {c.effect for s in found.steps for c in s.candidates[:2]}
     assert "overdispersed_counts" in listed
     assert listed <= {"overdispersed_counts", "branching_counts"}
-    assert found.closed_fraction > 0.6
+    assert found.gap.closed_fraction > 0.6
 
 
 def test_an_effect_of_the_model_is_not_added_again_and_the_rest_is_consistent():
@@ -98,8 +98,8 @@ def test_an_effect_of_the_model_is_not_added_again_and_the_rest_is_consistent():
     found = find_in_histograms(
         *histograms(7, hidden="branching_counts", strength=0.08), SETTINGS, model=(present,)
     )
-    assert found.gap_before.value < 2 * found.gap_before.floor
-    assert found.effects == ()
+    assert found.verdict.gap.before < 2 * found.verdict.gap.floor
+    assert found.verdict.effects == ()
     assert found.model == (present,)
 
 
@@ -110,15 +110,15 @@ def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
     for row in counts:
         zero = np.argmax(row[:14]) + 7
         row[:zero] = rng.binomial(row[:zero], 0.1)
-    found = find_in_histograms(counts, origin, SETTINGS)
+    found = find_in_histograms(counts, origin, SETTINGS).verdict
     assert "branching_counts" in found.effects, found.sentence
     assert found.set_aside == ((None, 0.5),)
-    fitted = next(s.effect for s in found.steps if s.effect and s.effect.tag == "branching_counts")
-    assert fitted.branching == pytest.approx(0.2, abs=0.03)
-    first = found.to_json()["unexplained"][0]
-    assert first["direction"] == "-"
-    assert "0-electron peak" in first["sentence"]
-    assert found.gap_after.value < found.gap_before.value
+    fitted = next(s for s in found.steps if s.effect == "branching_counts")
+    assert fitted.parameters["branching"].value == pytest.approx(0.2, abs=0.03)
+    first = found.unexplained[0]
+    assert first.direction == "-"
+    assert "0-electron peak" in first.sentence
+    assert found.gap.after < found.gap.before
 
 
 def test_too_few_samples_are_refused_in_one_line():

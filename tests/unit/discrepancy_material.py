@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
@@ -206,7 +207,7 @@ def result(verdict: str) -> dict[str, Any]:
             "p": 0.0,
             "sentence": STATISTICS["space.row.readout.variance"].sentence,
             "pixels": [],
-            "dn": [],
+            "dn": None,
             "frames": [],
         },
         {
@@ -228,7 +229,7 @@ def result(verdict: str) -> dict[str, Any]:
             "p": 2e-3,
             "sentence": STATISTICS["shape.He4.cnt"].sentence,
             "pixels": [[3, 4], [10, 20], [30, 39]],
-            "dn": [],
+            "dn": None,
             "frames": [],
         },
         {
@@ -239,18 +240,18 @@ def result(verdict: str) -> dict[str, Any]:
             "p": 0.0,
             "sentence": STATISTICS["frame.readout.trend"].sentence,
             "pixels": [],
-            "dn": [],
+            "dn": None,
             "frames": [0, 1, 2],
         },
     ]
     return {
-        "schema": 1,
+        "schema_version": 2,
         "verdict": verdict,
         "sentence": {
             "named": "Row noise of 0.351 DN and a drift of the bias explain the disagreement.",
             "ambiguous": "Something is missing: row noise or periodic pickup; these data cannot tell which.",
             "unexplained": "Row noise is part of it; a comb of codes remains that no known effect explains.",
-            "consistent": "",
+            "consistent": "The data agree with the model within chance.",
         }[verdict],
         "effects": effects,
         "model_effects": [{"tag": tag} for tag in effects],
@@ -264,8 +265,7 @@ def result(verdict: str) -> dict[str, Any]:
             "interval_after": [0.5 * after, 1.6 * after],
         },
         "where": where if verdict != "consistent" else [],
-        "untestable": list(UNTESTABLE),
-        "untestable_reasons": UNTESTABLE,
+        "untestable": UNTESTABLE,
         "unexplained": [
             {"statistic": "code.alternating", "z": 22.5, "sentence": STATISTICS["code.alternating"].sentence}
         ]
@@ -278,6 +278,7 @@ def result(verdict: str) -> dict[str, Any]:
             "train": 1800,
             "test": 1800,
             "final": 400,
+            "histograms": None,
         },
         "left_out": {"odd_plugin": "ValueError: boom"} if verdict == "named" else {},
         "p_global": {
@@ -287,6 +288,11 @@ def result(verdict: str) -> dict[str, Any]:
         "replicates": 100,
         "versions": {"statistics": "1", "numpy": "2.1"},
     }
+
+
+def verdict_of(verdict: str, **changes: Any) -> Verdict:
+    """The same as typed values, some keys changed."""
+    return Verdict.model_validate({**result(verdict), **changes})
 
 
 def discrepancy_data(verdict: str = "named", **changes: Any) -> DiscrepancyData:
@@ -299,7 +305,7 @@ def discrepancy_data(verdict: str = "named", **changes: Any) -> DiscrepancyData:
         arrays["frame_readout_model"] = 0.12 * position
         arrays["frame_charge_model"] = 0.004 * position
     data = DiscrepancyData(
-        result={**result(verdict), **changes},
+        found=verdict_of(verdict, **changes),
         arrays=arrays,
         statistics={name: (s.channel, s.sentence) for name, s in STATISTICS.items()},
         titles={

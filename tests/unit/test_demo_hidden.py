@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from discrepancy_material import result
+from discrepancy_material import verdict_of
 from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError
@@ -17,7 +17,6 @@ from pchem_pipeline.commands.demo import hidden
 from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement
 from pchem_pipeline.commands.demo.hidden import RANDOM, SEALED_KEY, hidden_effect, run_hidden_demo
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
-from pchem_pipeline.report.pages.findings import findings
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 
@@ -99,13 +98,13 @@ def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
 )
 def test_the_judgement(verdict: str, tag: str, words: str) -> None:
     hidden = hidden_effect(tag, SETTINGS, draw_truth(SETTINGS))
-    assert judgement(findings(result(verdict)), hidden) == words
+    assert judgement(verdict_of(verdict), hidden) == words
 
 
 def test_named_alone_is_said_so() -> None:
-    alone = {**result("named"), "effects": ["row_noise"]}
+    alone = verdict_of("named", effects=["row_noise"])
     hidden = effect_class("row_noise").model_validate({"row_noise_dn": 0.35})
-    assert judgement(findings(alone), hidden) == "named, and nothing else"
+    assert judgement(alone, hidden) == "named, and nothing else"
 
 
 def maps(shift: dict[str, float], seed: int = 2) -> dict[str, Any]:
@@ -122,7 +121,7 @@ def maps(shift: dict[str, float], seed: int = 2) -> dict[str, Any]:
 def test_the_comparison_tells_parameters_and_biases() -> None:
     truth = dict.fromkeys(COMPARED, np.full((8, 8), 2.0))
     hidden = effect_class("row_noise").model_validate({"row_noise_dn": 0.36})
-    text = compare(result("named"), hidden, truth, maps({"read_noise_e": 0.5}), maps({}, 3))
+    text = compare(verdict_of("named"), hidden, truth, maps({"read_noise_e": 0.5}), maps({}, 3))
     rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.strip()}
     assert rows["row_noise_dn"] == ["0.36", "0.3512", "0.0041"]
     true, before, after, known, error = (float(word) for word in rows["read_noise_e,"][1:])
@@ -138,7 +137,7 @@ def test_the_comparison_tells_parameters_and_biases() -> None:
 def test_an_effect_that_cannot_be_shown_says_why() -> None:
     truth = dict.fromkeys(COMPARED, np.full((8, 8), 2.0))
     hidden = effect_class("charge_lag").typical()[0]
-    text = compare(result("consistent"), hidden, truth, maps({}), maps({}))
+    text = compare(verdict_of("consistent"), hidden, truth, maps({}), maps({}))
     assert "nothing was named, which is right" in text
     assert "such frames cannot show it: Poisson electrons" in text
 
@@ -147,7 +146,7 @@ def test_without_good_pixels_there_are_no_biases() -> None:
     nothing = {**maps({}), "quality": np.full((8, 8), 2)}
     hidden = effect_class("row_noise").model_validate({"row_noise_dn": 0.36})
     truth = dict.fromkeys(COMPARED, np.full((8, 8), 2.0))
-    assert "no biases" in compare({}, hidden, truth, nothing, nothing)
+    assert "no biases" in compare(verdict_of("consistent"), hidden, truth, nothing, nothing)
 
 
 @pytest.mark.parametrize(("options", "seed"), [([], None), (["--seed", "7"], 7)])

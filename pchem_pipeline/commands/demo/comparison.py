@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.variables import VARIABLES
-from pchem_pipeline.report.pages.findings import Findings, findings
+from pchem_pipeline.report.pages.discrepancy_text import parameter_texts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.effects.framework.effect import Effect
 
 __all__ = ["COMPARED", "compare", "judgement"]
@@ -25,17 +26,16 @@ COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 Maps = Mapping[str, "NDArray[Any]"]
 
 
-def compare(result: Mapping[str, Any], hidden: Effect, truth: Maps, before: Maps, after: Maps) -> str:
+def compare(found: Verdict, hidden: Effect, truth: Maps, before: Maps, after: Maps) -> str:
     """Return what was hidden, whether it was found, its parameters, and biases before and after.
 
     Args:
-        result: content of ``discrepancy.json``.
+        found: the verdict.
         hidden: the effect in the frames.
         truth: true maps of :data:`COMPARED`.
         before: maps of the plain model, with ``<name>_stderr`` and ``quality``.
         after: the same of the grown model.
     """
-    found = findings(result)
     title = type(hidden).title
     lines = [f"hidden was: {hidden.tag}{f' ({title})' if title else ''} - {judgement(found, hidden)}"]
     if type(hidden).untestable:
@@ -43,7 +43,7 @@ def compare(result: Mapping[str, Any], hidden: Effect, truth: Maps, before: Maps
     return "\n".join([*lines, *_parameters(found, hidden), *_biases(truth, before, after)])
 
 
-def judgement(found: Findings, hidden: Effect) -> str:
+def judgement(found: Verdict, hidden: Effect) -> str:
     """Return in words whether the verdict is right."""
     others = [tag for tag in found.effects if tag != hidden.tag]
     besides = f", and {', '.join(others)} besides, which is not there" if others else ""
@@ -58,16 +58,16 @@ def judgement(found: Findings, hidden: Effect) -> str:
     return f"not named{besides}"
 
 
-def _parameters(found: Findings, hidden: Effect) -> list[str]:
+def _parameters(found: Verdict, hidden: Effect) -> list[str]:
     """Return the table of the hidden effect's parameters; of an ambiguous one those of the candidate."""
     true: dict[str, Any] = hidden.model_dump(exclude={"tag"})
     estimated: dict[str, tuple[str, str]] = {}
     for step in found.steps:
         if step.effect == hidden.tag:
-            estimated = {p.name: (_number(p.value), _number(p.stderr)) for p in step.parameters}
+            estimated = {n: (_number(p.value), _number(p.stderr)) for n, p in step.parameters.items()}
         elif not step.effect and not estimated:
             mine = [c for c in step.candidates if c.effect == hidden.tag]
-            estimated = {name: (value, "") for c in mine[:1] for name, value in c.parameters}
+            estimated = {name: (value, "") for c in mine[:1] for name, value in parameter_texts(c)}
     head = f"{'parameter':<26}{'true':>14}{'estimated':>14}{'stderr':>12}"
     lines = ["", head, "-" * len(head)]
     for name, value in true.items():

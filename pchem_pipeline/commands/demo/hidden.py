@@ -18,6 +18,7 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.demo.comparison import COMPARED, compare
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.run.session import Command, run_stages
@@ -25,7 +26,6 @@ from pchem_pipeline.run.target import find_run
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.stages.discrepancy.result import read_result
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import read_json, write_atomic, write_json
@@ -214,15 +214,16 @@ def _maps(target: Target) -> dict[str, NDArray[Any]]:
 
 
 def _text(output: Path, target: Target) -> str:
-    result = read_result(target.store) or {}
+    found = read_verdict(target.store)
+    assert found is not None
     key = _unpacked(output / SEALED_KEY)
     effect: dict[str, Any] = json.loads(str(key.pop("effect")))
     hidden = effect_class(effect["tag"]).model_validate(effect)
-    comparison = compare(result, hidden, key, _unpacked(output / _PLAIN_MAPS), _maps(target))
+    comparison = compare(found, hidden, key, _unpacked(output / _PLAIN_MAPS), _maps(target))
     paths = {
         "verdict": target.store / "discrepancy.html",
         "report": target.store / "report.html",
         "pictures": target.store / "figures",
     }
     places = "\n".join(f"{name + ':':<10}{path}" for name, path in paths.items())
-    return f"{verdict_text(result)}\n\n{comparison}\n\n{places}"
+    return f"{verdict_text(found)}\n\n{comparison}\n\n{places}"

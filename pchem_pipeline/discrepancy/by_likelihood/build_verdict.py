@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.build_verdict import Addition, gap_change, step_of
 from pchem_pipeline.discrepancy.by_likelihood.gap import Meter, carried_over
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import LARGEST_REST, Explanation, Named
@@ -17,9 +18,20 @@ from pchem_pipeline.discrepancy.by_likelihood.views import electrons_of
 from pchem_pipeline.discrepancy.by_likelihood.words import closing, find_residuals, set_aside_residual
 from pchem_pipeline.discrepancy.by_simulation.null import NullModel
 from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import VERSION as STATISTICS_VERSION
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.verdict import Candidate, Discrepancy, Pull, Residual, Step, Verdict
-from pchem_pipeline.discrepancy.where import Place
+from pchem_pipeline.discrepancy.verdict import (
+    Candidate,
+    Change,
+    Discrepancy,
+    Examined,
+    Place,
+    Pull,
+    Rival,
+    State,
+    Verdict,
+)
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
@@ -75,57 +87,63 @@ class Measurements:
 
 def tell_histograms(measured: Measurements, found: Explanation | None) -> Discrepancy:
     """Put the verdict together."""
-    steps: tuple[Step, ...] = ()
+    additions: tuple[Addition, ...] = ()
     final_fit, after = measured.plain, measured.before
-    residuals: tuple[Residual, ...] = ()
+    residuals: tuple[Place, ...] = ()
     code_grown = None
     if found is not None:
         teller = _Teller(measured, found)
-        steps, after, final_fit = teller.steps()
+        additions, after, final_fit = teller.additions()
         code_grown = teller.codes(final_fit)
         if measured.still or after.value > after.floor:
             residuals = teller.residuals(final_fit)
-    verdict = _verdict(steps, found, measured.before, after)
+    verdict = _verdict(additions, found)
     pulls = [null.pulls(measured.mean, splits=2) for null in measured.nulls]
     rest = sorted(
         zip(measured.nulls[1].names, pulls[1].tolist(), strict=True), key=lambda item: -abs(item[1])
     )
-    named = tuple(s.effect for s in steps if s.effect is not None)
+    left = tuple(Place.of(name, z=z) for name, z in rest[:_MOST_UNEXPLAINED]) if measured.still else ()
+    named = tuple(a.effect for a in additions if a.named)
     keep = verdict in ("named", "ambiguous")
+    model = (*measured.model, *named) if keep else measured.model
+    p_values = [null.global_p(measured.mean, 2) for null in measured.nulls]
     return Discrepancy(
-        verdict=verdict,
-        sentence=_sentence(verdict, steps, found, measured.before, after, residuals),
-        steps=steps,
-        model=(*measured.model, *named) if keep else measured.model,
-        gap_before=measured.before,
-        gap_after=after,
-        where=measured.places,
-        unexplained=tuple(rest[:_MOST_UNEXPLAINED]) if measured.still else (),
-        untestable=measured.untestable,
-        left_out=measured.left_out,
-        global_p=(measured.nulls[0].global_p(measured.mean, 2), measured.nulls[1].global_p(measured.mean, 2)),
-        examined=_examined(measured),
-        n_replicates=measured.n_replicates,
+        verdict=Verdict(
+            verdict=verdict,
+            sentence=_sentence(verdict, additions, found, measured.before, after, residuals),
+            effects=tuple(e.tag for e in named),
+            model_effects=tuple(e.model_dump(mode="json") for e in model),
+            steps=tuple(step_of(added) for added in additions),
+            gap=gap_change(measured.before, after, grown=bool(additions)),
+            where=measured.places,
+            unexplained=(*residuals, *left),
+            set_aside=tuple((i.low, i.high) for i in found.set_aside) if found and named and keep else (),
+            untestable=dict(measured.untestable),
+            left_out=dict(measured.left_out),
+            examined=_examined(measured),
+            p_global=Change(before=p_values[0], after=p_values[1]),
+            replicates=measured.n_replicates,
+            versions={"statistics": STATISTICS_VERSION},
+        ),
+        model=model,
         maps=measured.maps(final_fit),
         evidence=measured.evidence,
         statistics=(measured.nulls[0].names, pulls[0], pulls[1]),
-        residuals=residuals,
-        set_aside=tuple((i.low, i.high) for i in found.set_aside) if found and named and keep else (),
         code_grown=code_grown,
     )
 
 
-def _examined(measured: Measurements) -> dict[str, Any]:
+def _examined(measured: Measurements) -> Examined:
     samples = [int(part.sum()) for part in measured.parts]
-    return {
-        "histograms": measured.n_pixels,
-        "frames": int(sum(part.sum(axis=1).max() for part in measured.parts)),
-        "rows": [0, 1],
-        "columns": [0, int(measured.evidence.maps.usable.size)],
-        "train": samples[0],
-        "test": samples[1],
-        "final": samples[2],
-    }
+    return Examined(
+        histograms=measured.n_pixels,
+        frames=int(sum(part.sum(axis=1).max() for part in measured.parts)),
+        rows=(0, 1),
+        columns=(0, int(measured.evidence.maps.usable.size)),
+        train=samples[0],
+        test=samples[1],
+        final=samples[2],
+    )
 
 
 @dataclass
@@ -144,20 +162,20 @@ class _Teller:
         count = max(self.measured.settings.grown_replicates, 40)
         self.meter = Meter(self.measured.parts[2], kept, carried, count, self.measured.rng)
 
-    def steps(self) -> tuple[tuple[Step, ...], Gap, FittedSet]:
-        """Return the steps, the last gap and the last fit."""
+    def additions(self) -> tuple[tuple[Addition, ...], Gap, FittedSet]:
+        """Return the added effects, the last gap and the last fit."""
         gap, fitted = self.measured.before, self.measured.plain
-        steps: list[Step] = []
+        additions: list[Addition] = []
         members: tuple[Member, ...] = ()
         for named in self.found.named:
             members = (*members, named.member)
             grown = self._refit(members)
             after = self.meter.gap(self._problem(members), grown.fit)
-            steps.append(self._step(named, members, gap, after, grown, fitted))
+            additions.append(self._addition(named, members, gap, after, grown, fitted))
             gap, fitted = after, grown
-        return tuple(steps), gap, fitted
+        return tuple(additions), gap, fitted
 
-    def residuals(self, fitted: FittedSet) -> tuple[Residual, ...]:
+    def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
         counts, kept = self.measured.both.astype(np.float64), self.found.kept
         problem = self._problem(fitted.members)
@@ -211,7 +229,7 @@ class _Teller:
     def _refit(self, members: Sequence[Member]) -> FittedSet:
         return self._arena().fit(members, self.found.best.fit.parameters)
 
-    def _step(
+    def _addition(
         self,
         named: Named,
         members: tuple[Member, ...],
@@ -219,7 +237,7 @@ class _Teller:
         after: Gap,
         grown: FittedSet,
         previous: FittedSet,
-    ) -> Step:
+    ) -> Addition:
         member = next(m for m in grown.members if m.tag == named.member.tag)
         candidates = self._candidates(named, member.effect)
         alone = not named.equals
@@ -227,18 +245,18 @@ class _Teller:
         chance = self.meter.chance(self._problem(grown.members), grown.fit)
         runner_up = self._gap_with(named, members, chance, relatives=True)
         placebo = self._gap_with(named, members, chance, relatives=False)
-        return Step(
-            effect=member.effect if alone and fits else None,
-            candidates=candidates
-            if alone
-            else tuple(c for c in candidates if c.effect.tag in (member.tag, *named.equals)),
+        open_ = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
+        return Addition(
+            effect=member.effect,
+            alone=alone,
+            fits=fits,
+            candidates=candidates if alone else open_,
             strength_stderr=_stderr(grown, member, named.apart),
             before=before,
             after=after,
             runner_up=runner_up,
             placebo=placebo,
             pulls=self._pulls(),
-            fits=fits,
             moved=_moved(previous, grown),
         )
 
@@ -254,12 +272,13 @@ class _Teller:
         weights = np.exp([min(score, 0.0) for _, score, _ in scored])
         weights /= weights.sum()
         return tuple(
-            Candidate(e, score, error, float(w)) for (e, score, error), w in zip(scored, weights, strict=True)
+            Candidate.of(e, score, error, float(w))
+            for (e, score, error), w in zip(scored, weights, strict=True)
         )
 
     def _gap_with(
         self, named: Named, members: tuple[Member, ...], chance: float, *, relatives: bool
-    ) -> tuple[str, float] | None:
+    ) -> Rival | None:
         """Return a rival (a relative of the effect, or one that has nothing to do with it) and its gap."""
         kin = set(type(named.member.effect).separate)
         for rival in named.rivals:
@@ -273,7 +292,8 @@ class _Teller:
                 fitted = self._refit((*others, other))
             except ValueError:
                 continue
-            return other.tag, self.meter.value(self._problem(fitted.members), fitted.fit, chance)
+            gap = self.meter.value(self._problem(fitted.members), fitted.fit, chance)
+            return Rival(effect=other.tag, gap_after=gap)
         return None
 
     def _pulls(self) -> tuple[Pull, ...]:
@@ -281,7 +301,15 @@ class _Teller:
         z = self.measured.z[2]
         before, after = first.pulls(z), last.pulls(z)
         telling = np.argsort(-np.abs(before))[:_MOST_PULLS]
-        return tuple(Pull(first.names[i], float(before[i]), float(after[i])) for i in telling)
+        return tuple(
+            Pull(
+                statistic=first.names[i],
+                sentence=STATISTICS[first.names[i]].sentence,
+                before=float(before[i]),
+                after=float(after[i]),
+            )
+            for i in telling
+        )
 
 
 def _stderr(grown: FittedSet, member: Member, apart: float) -> float:
@@ -307,23 +335,23 @@ def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
     }
 
 
-def _verdict(steps: Sequence[Step], found: Explanation | None, before: Gap, after: Gap) -> Verdict:
+def _verdict(additions: Sequence[Addition], found: Explanation | None) -> State:
     if found is None:
         return "consistent"
-    if not steps or any(not s.fits for s in steps):
+    if not additions or any(not a.fits for a in additions):
         return "unexplained"
-    return "ambiguous" if any(s.effect is None for s in steps) else "named"
+    return "ambiguous" if any(not a.named for a in additions) else "named"
 
 
 def _sentence(
-    verdict: Verdict,
-    steps: Sequence[Step],
+    verdict: State,
+    additions: Sequence[Addition],
     found: Explanation | None,
     before: Gap,
     after: Gap,
-    residuals: Sequence[Residual],
+    residuals: Sequence[Place],
 ) -> str:
-    titles = [type(s.effect).title or s.effect.tag for s in steps if s.effect is not None]
+    titles = [type(a.effect).title or a.effect.tag for a in additions if a.named]
     left = f"; what is left: {closing(residuals)}" if residuals else ""
     if found is not None and found.unsteady:
         stand_ins = ", ".join(m.tag for m in found.unsteady)
@@ -342,7 +370,7 @@ def _sentence(
             f"The model was missing {' and '.join(titles)}; with {them} the gap on unseen samples went {gaps}"
             f"{rest}{left}."
         )
-    sets = [" or ".join(c.effect.tag for c in s.candidates) for s in steps if s.effect is None]
+    sets = [" or ".join(c.effect for c in a.candidates) for a in additions if not a.named]
     also = f"{' and '.join(titles)} is missing, and " if titles else ""
     lacks = f"{also}{' and '.join(sets)}{rest}{left}"
     return f"The model lacks something that these histograms cannot tell apart: {lacks}."

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.verdict import Residual
+from pchem_pipeline.discrepancy.verdict import Place
 
 __all__ = ["find_residuals", "place_words", "set_aside_residual"]
 
@@ -36,7 +36,7 @@ def place_words(low: float, high: float) -> str:
 
 def find_residuals(
     observed: FloatArray, expected: FloatArray, electrons: FloatArray, parameters: FloatArray
-) -> list[Residual]:
+) -> list[Place]:
     """Scan for windows of codes that hold too many or too few samples, the most significant first.
 
     As in a bump hunt (Choudalakis 2011), windows of every place and width are tried, and each p-value counts
@@ -64,7 +64,7 @@ def find_residuals(
         windows += [(float(roots[i]), int(i), width) for i in np.argsort(-np.abs(roots))[:40]]
     windows.sort(key=lambda item: -abs(item[0]))
     taken = np.zeros(seen.size, np.bool_)
-    found: list[Residual] = []
+    found: list[Place] = []
     whole = max(float(_contribution(seen, wanted).sum()), 1e-12)
     for z, start, width in windows:
         place = slice(start, start + width)
@@ -85,7 +85,7 @@ def find_residuals(
 
 def set_aside_residual(
     low: float | None, high: float | None, seen: float, expected: float, parameters: FloatArray, share: float
-) -> Residual:
+) -> Place:
     """Return what a peak that was set aside holds, against what the model that fits the rest expects in it.
 
     Args:
@@ -112,13 +112,15 @@ def _residual(
     z: float,
     p: float,
     share: float,
-) -> Residual:
+) -> Place:
     more = "more" if z > 0 else "fewer"
     words = (
         f"{more} samples than the model has {place_words(low, high)} (DN {dn[0]} to {dn[1]}: "
         f"{seen:.3g} seen, {expected:.3g} expected)"
     )
-    return Residual(words, "+" if z > 0 else "-", z, p, dn, seen, expected, share)
+    return Place.of(
+        "code.smooth", z=z, sentence=words, p=p, dn=dn, seen=seen, expected=expected, share_of_gap=share
+    )
 
 
 def _contribution(seen: FloatArray, expected: FloatArray) -> FloatArray:
@@ -131,6 +133,6 @@ def _signed_root(seen: FloatArray, expected: FloatArray) -> FloatArray:
     return np.asarray(np.sign(seen - expected) * np.sqrt(2.0 * special.kl_div(seen, expected)))
 
 
-def closing(residuals: Sequence[Residual], most: int = 3) -> str:
+def closing(residuals: Sequence[Place], most: int = 3) -> str:
     """Return the residuals in one clause."""
-    return "; ".join(r.words for r in residuals[:most])
+    return "; ".join(r.sentence for r in residuals[:most])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.build_verdict import Addition, gap_change, step_of
 from pchem_pipeline.discrepancy.by_simulation.disagreement import Measured, contradicted, misfits
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Hypothesis,
@@ -17,12 +18,23 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
     tolerance,
 )
-from pchem_pipeline.discrepancy.by_simulation.naming import Choice, Rival
+from pchem_pipeline.discrepancy.by_simulation.naming import Choice, Contender
 from pchem_pipeline.discrepancy.by_simulation.null import NullModel
 from pchem_pipeline.discrepancy.gap import Gap, GapMetric
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import VERSION as STATISTICS_VERSION
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.verdict import Candidate, Discrepancy, Pull, Step, Verdict
-from pchem_pipeline.discrepancy.where import Place
+from pchem_pipeline.discrepancy.verdict import (
+    Candidate,
+    Change,
+    Discrepancy,
+    Examined,
+    Place,
+    Pull,
+    Rival,
+    State,
+    Verdict,
+)
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -73,37 +85,42 @@ def tell(
     still: bool,
     left_out: Mapping[str, str],
     n_replicates: int,
-    examined: Mapping[str, Any],
+    examined: Examined,
     code_grown: FloatArray | None = None,
 ) -> Discrepancy:
     """Put the verdict together; see :class:`~pchem_pipeline.discrepancy.verdict.Discrepancy`."""
-    n_samples = int(examined["final"]) * int(train.maps.usable.sum())
+    n_samples = examined.final * int(train.maps.usable.sum())
     metric = GapMetric(first, n_samples)
     before = metric.gap(z.final, first.mean, first.replicates)
     after = metric.gap(z.final, last.mean, last.replicates)
     both = z.both
     pulls = first.pulls(both, splits=2), last.pulls(both, splits=2)
     unfinished = still and after.value > max(after.floor, _LARGEST_REST * before.value)
-    steps = _steps(rounds, metric, z, settings, before, after, pulls[1] if unfinished else None)
+    additions = _additions(rounds, metric, z, settings, before, after, pulls[1] if unfinished else None)
     rest = [(name, float(pull)) for name, pull in zip(first.names, pulls[1], strict=True)]
     rest.sort(key=lambda item: -abs(item[1]))
-    verdict = _verdict(steps, still, unfinished)
-    named = {s.effect.tag for s in steps if s.effect is not None}
+    verdict = _verdict(additions, still, unfinished)
+    named = {added.effect.tag for added in additions if added.named}
     tentative = {h.tag for r in rounds for h in r.added.hypotheses} - named
+    kept = tuple(e for e in model if e.tag not in tentative)
     return Discrepancy(
-        verdict=verdict,
-        sentence=_sentence(verdict, steps, before, after, places),
-        steps=steps,
-        model=tuple(e for e in model if e.tag not in tentative),
-        gap_before=before,
-        gap_after=after,
-        where=tuple(places),
-        unexplained=tuple(rest[:_MOST_UNEXPLAINED]) if still else (),
-        untestable={tag: c.untestable for tag, c in effect_classes().items() if c.untestable},
-        left_out=dict(left_out),
-        global_p=(first.global_p(both, 2), last.global_p(both, 2)),
-        examined=dict(examined),
-        n_replicates=n_replicates,
+        verdict=Verdict(
+            verdict=verdict,
+            sentence=_sentence(verdict, additions, before, after, places),
+            effects=tuple(added.effect.tag for added in additions if added.named),
+            model_effects=tuple(e.model_dump(mode="json") for e in kept),
+            steps=tuple(step_of(added) for added in additions),
+            gap=gap_change(before, after, grown=bool(additions)),
+            where=tuple(places),
+            unexplained=tuple(Place.of(name, z=z) for name, z in rest[:_MOST_UNEXPLAINED]) if still else (),
+            untestable={tag: c.untestable for tag, c in effect_classes().items() if c.untestable},
+            left_out=dict(left_out),
+            examined=examined,
+            p_global=Change(before=first.global_p(both, 2), after=last.global_p(both, 2)),
+            replicates=n_replicates,
+            versions={"statistics": STATISTICS_VERSION},
+        ),
+        model=kept,
         maps=maps,
         evidence=train,
         statistics=(first.names, pulls[0], pulls[1]),
@@ -111,7 +128,7 @@ def tell(
     )
 
 
-def _steps(
+def _additions(
     rounds: Sequence[Round],
     metric: GapMetric,
     z: Measured,
@@ -119,12 +136,12 @@ def _steps(
     before: Gap,
     after: Gap,
     rest: FloatArray | None,
-) -> tuple[Step, ...]:
-    """Return one step for every added effect, the weightiest of a round first.
+) -> tuple[Addition, ...]:
+    """Return the added effects, the weightiest of a round first.
 
     ``rest``: the pulls that remain at the end, where they are too many to call the model complete.
     """
-    steps: list[Step] = []
+    additions: list[Addition] = []
     mean = metric.null.mean
     gap = before
     for index, this in enumerate(rounds):
@@ -146,16 +163,16 @@ def _steps(
             stands = rest is None or (
                 closed > after.value and not contradicted(this.null, parts[member], rest)
             )
-            steps.append(_step(this, int(member), metric, z, shift, gap, now, settings, stands))
+            additions.append(_addition(this, int(member), metric, z, shift, gap, now, settings, stands))
             gap = now
-    return tuple(steps)
+    return tuple(additions)
 
 
 def _weight(part: FloatArray, null: NullModel) -> float:
     return float(np.sum((part / null.std) ** 2))
 
 
-def _step(
+def _addition(
     this: Round,
     member: int,
     metric: GapMetric,
@@ -165,7 +182,7 @@ def _step(
     after: Gap,
     settings: DiscrepancySettings,
     stands: bool,
-) -> Step:
+) -> Addition:
     added = this.added.hypotheses[member]
     rivals = this.choice.rivals_of(added.tag)
     others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
@@ -174,21 +191,17 @@ def _step(
     allowed = tolerance(parts, settings.model_error)
     fits = stands and not misfits(this.grown, z, parts[member], settings.significance, allowed)
     named = len(kept) == 1 and fits
-    candidates = tuple(
-        Candidate(
-            added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect,
-            r.score,
-            r.stderr,
-            r.probability,
-        )
+    compared = [
+        (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)
         for r in (rivals if named else kept)
-    )
+    ]
 
-    def gap_with(hypothesis: Hypothesis) -> tuple[str, float]:
+    def gap_with(hypothesis: Hypothesis) -> Rival:
         noise = Noise(this.null.covariance / 2.0, settings.model_error)
         fit = fit_set([*others, hypothesis], shift, noise)
         mean = this.null.mean + fit.parts.sum(axis=0)
-        return hypothesis.tag, metric.gap(z.final, mean, this.null.replicates).value
+        gap = metric.gap(z.final, mean, this.null.replicates)
+        return Rival(effect=hypothesis.tag, gap_after=gap.value)
 
     runner_up, placebo = _comparisons(this, added, rivals)
     pull_before = (z.final - this.null.mean) / this.null.std
@@ -198,24 +211,33 @@ def _step(
     value = (
         getattr(added.effect, added.effect.strength, float("nan")) if added.effect.strength else float("nan")
     )
-    return Step(
-        effect=added.effect if named else None,
-        candidates=candidates,
+    return Addition(
+        effect=added.effect if named else compared[0][0],
+        alone=len(kept) == 1,
+        fits=fits,
+        candidates=tuple(Candidate.of(e, r.score, r.stderr, r.probability) for e, r in compared),
         strength_stderr=abs(float(value)) * factor_error / added.effect.power,
         before=before,
         after=after,
         runner_up=None if runner_up is None else gap_with(runner_up),
         placebo=None if placebo is None else gap_with(placebo),
-        pulls=tuple(Pull(this.null.names[i], float(pull_before[i]), float(pull_after[i])) for i in telling),
-        fits=fits,
+        pulls=tuple(
+            Pull(
+                statistic=this.null.names[i],
+                sentence=STATISTICS[this.null.names[i]].sentence,
+                before=float(pull_before[i]),
+                after=float(pull_after[i]),
+            )
+            for i in telling
+        ),
         moved=this.moved,
     )
 
 
-def _ambiguous_set(rivals: Sequence[Rival], certainty: float) -> list[Rival]:
+def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Contender]:
     """Return the likeliest rivals that together have the wanted share of what all have."""
     total = sum(r.probability for r in rivals)
-    kept: list[Rival] = []
+    kept: list[Contender] = []
     share = 0.0
     for rival in rivals:
         kept.append(rival)
@@ -228,7 +250,7 @@ def _ambiguous_set(rivals: Sequence[Rival], certainty: float) -> list[Rival]:
 
 
 def _comparisons(
-    this: Round, added: Hypothesis, rivals: Sequence[Rival]
+    this: Round, added: Hypothesis, rivals: Sequence[Contender]
 ) -> tuple[Hypothesis | None, Hypothesis | None]:
     """Return the runner-up, and a candidate that is no relative of the named effect, for a placebo."""
     runner_up = next((r.hypothesis for r in rivals if r.hypothesis.tag != added.tag), None)
@@ -243,20 +265,20 @@ def _comparisons(
     return runner_up, placebo
 
 
-def _verdict(steps: Sequence[Step], still: bool, unfinished: bool) -> Verdict:
-    if not steps:
+def _verdict(additions: Sequence[Addition], still: bool, unfinished: bool) -> State:
+    if not additions:
         return "unexplained" if still else "consistent"
-    if unfinished or any(not step.fits for step in steps):
+    if unfinished or any(not added.fits for added in additions):
         return "unexplained"
-    return "ambiguous" if any(s.effect is None for s in steps) else "named"
+    return "ambiguous" if any(not added.named for added in additions) else "named"
 
 
 def _sentence(
-    verdict: Verdict, steps: Sequence[Step], before: Gap, after: Gap, places: Sequence[Place]
+    verdict: State, additions: Sequence[Addition], before: Gap, after: Gap, places: Sequence[Place]
 ) -> str:
     gaps = [1e6 * value for value in (before.value, max(after.value, 0.0), after.floor)]
     closed = "{:.3g} -> {:.3g} micronats per sample (floor {:.2g})".format(*gaps)
-    titles = [type(s.effect).title or s.effect.tag for s in steps if s.effect is not None]
+    titles = [type(a.effect).title or a.effect.tag for a in additions if a.named]
     if verdict == "consistent":
         return "The frames agree with the model in every statistic tested."
     if verdict == "named" and before.at_floor:
@@ -265,11 +287,11 @@ def _sentence(
     if verdict == "named":
         return f"The model was missing {_and(titles)}; with it the gap on unseen frames went {closed}."
     if verdict == "ambiguous":
-        sets = [" or ".join(c.effect.tag for c in s.candidates) for s in steps if s.effect is None]
+        sets = [" or ".join(c.effect for c in a.candidates) for a in additions if not a.named]
         also = f"{_and(titles)} is missing, and " if titles else ""
         return f"The model lacks something that these frames cannot tell apart: {also}{_and(sets)}."
     lead = f" (largest in {places[0].statistic})" if places else ""
-    doubtful = [s.candidates[0].effect.tag for s in steps if not s.fits]
+    doubtful = [a.candidates[0].effect for a in additions if not a.fits]
     nearest = f"; nearest known: {_and(doubtful)}" if doubtful else ""
     besides = f" besides {_and(titles)}" if titles else ""
     return f"The frames disagree with the model{lead}, and no known effect explains it{besides}{nearest}."

@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     tolerance,
 )
 
-__all__ = ["Choice", "Rival", "ScoredSet", "choose", "score_set", "seen_beside"]
+__all__ = ["Choice", "Contender", "ScoredSet", "choose", "score_set", "seen_beside"]
 
 FloatArray = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ class ScoredSet:
 
 
 @dataclass(frozen=True)
-class Rival:
+class Contender:
     """An effect that could stand in the place of a chosen one.
 
     Attributes:
@@ -96,7 +96,7 @@ class Choice:
     """
 
     best: ScoredSet
-    rivals: tuple[tuple[Rival, ...], ...]
+    rivals: tuple[tuple[Contender, ...], ...]
     probability: tuple[float, ...]
     tried: tuple[ScoredSet, ...]
     advantage: float
@@ -110,7 +110,7 @@ class Choice:
         )
         return kept or self.best.hypotheses[:1]
 
-    def rivals_of(self, tag: str) -> tuple[Rival, ...]:
+    def rivals_of(self, tag: str) -> tuple[Contender, ...]:
         """Return who could stand in the place of an effect of the best set."""
         tags = [h.tag for h in self.best.hypotheses]
         return self.rivals[tags.index(tag)]
@@ -176,9 +176,9 @@ def _rivals(
     sets: Sequence[ScoredSet],
     weights: FloatArray,
     noise: Noise,
-) -> tuple[Rival, ...]:
+) -> tuple[Contender, ...]:
     """Return what could stand in the place of a hypothesis of the best set, by probability."""
-    found: dict[str, Rival] = {}
+    found: dict[str, Contender] = {}
     for scored, weight in zip(sets, weights, strict=True):
         new = scored.tags - others
         if not new or (not others <= scored.tags and len(new) > len(best.tags)):
@@ -190,14 +190,14 @@ def _rivals(
                 continue  # it comes beside the chosen one, not in its place
             if candidate.tag in found:
                 old = found[candidate.tag]
-                found[candidate.tag] = Rival(
+                found[candidate.tag] = Contender(
                     old.hypothesis, old.score, old.stderr, old.probability + float(weight)
                 )
             else:
                 apart = math.hypot(
                     *(a.distance(b, noise) for a, b in zip(best.fits, scored.fits, strict=True))
                 )
-                found[candidate.tag] = Rival(candidate, scored.worth - best.worth, apart, float(weight))
+                found[candidate.tag] = Contender(candidate, scored.worth - best.worth, apart, float(weight))
     return tuple(sorted(found.values(), key=lambda r: (-r.probability, -r.score)))
 
 

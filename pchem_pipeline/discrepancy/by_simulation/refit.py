@@ -103,7 +103,8 @@ def with_steady_exposure(
     try:
         added = added_exposures(found.model, stack, numbers, plain.maps)
     except ConfigError as error:
-        return replace(found, left_out={**found.left_out, "added exposure": str(error)})
+        left_out = {**found.verdict.left_out, "added exposure": str(error)}
+        return replace(found, verdict=found.verdict.model_copy(update={"left_out": left_out}))
     if added is None:
         return found
     fit = refit_maps(stack[seen], plain.maps, found.model, plain.covariance, added)

@@ -47,8 +47,8 @@ from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
-from pchem_pipeline.discrepancy.verdict import Discrepancy
-from pchem_pipeline.discrepancy.where import Place, locate
+from pchem_pipeline.discrepancy.verdict import Discrepancy, Place
+from pchem_pipeline.discrepancy.where import locate
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 

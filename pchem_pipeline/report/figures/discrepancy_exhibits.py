@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from pchem_pipeline.discrepancy.verdict import Pull, Verdict
 from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_maps, discrepancy_series
 from pchem_pipeline.report.figures.exhibits import Exhibit, drawing
 from pchem_pipeline.report.pages.discrepancy_data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.pages.discrepancy_text import CAPTIONS, gap_words
-from pchem_pipeline.report.pages.findings import Findings, Pull
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import count, short
@@ -51,24 +51,19 @@ def telling_pulls(data: DiscrepancyData) -> list[Pull]:
         for pull in step.pulls:
             known = rows.get(pull.statistic, pull)
             after = pull.after if math.isfinite(pull.after) else known.after
-            rows[pull.statistic] = Pull(pull.statistic, known.sentence or pull.sentence, known.before, after)
+            rows[pull.statistic] = known.model_copy(update={"after": after})
     if not rows and "z_before" in data.arrays:
         before = np.asarray(data.arrays["z_before"], dtype=np.float64)
         after_all = np.asarray(data.arrays.get("z_after", np.full(before.size, np.nan)), dtype=np.float64)
         for i, (name, (_, sentence)) in enumerate(data.statistics.items()):
             if i < before.size and np.isfinite(before[i]):
                 later = float(after_all[i]) if i < after_all.size else math.nan
-                rows[name] = Pull(name, sentence, float(before[i]), later)
+                rows[name] = Pull(statistic=name, sentence=sentence, before=float(before[i]), after=later)
 
     def far(pull: Pull) -> float:
         return max((abs(v) for v in (pull.before, pull.after) if math.isfinite(v)), default=0.0)
 
-    known_rows = [
-        pull if pull.sentence else Pull(pull.statistic, data.statistics.get(pull.statistic, ("", ""))[1],
-                                        pull.before, pull.after)
-        for pull in rows.values()
-    ]  # fmt: skip
-    return sorted(known_rows, key=far, reverse=True)[:_MOST_PULLS]
+    return sorted(rows.values(), key=far, reverse=True)[:_MOST_PULLS]
 
 
 def _has(data: DiscrepancyData, *names: str) -> bool:
@@ -98,7 +93,7 @@ def _maps(data: DiscrepancyData) -> list[Exhibit]:
         "where",
         "On the sensor",
         "Maps in standard deviations of chance. " + "; ".join(words).replace("-", "−") + ".",
-        drawing(discrepancy_maps.pixel_maps, maps, flagged=flagged, origin=data.found.origin),
+        drawing(discrepancy_maps.pixel_maps, maps, flagged=flagged, origin=data.found.examined.origin),
         raster=True,
     )
 
@@ -164,7 +159,7 @@ def _lines(data: DiscrepancyData) -> list[Exhibit]:
         "where",
         "Rows and columns",
         "Scatter of the means over the frames, relative to chance (1). " + "; ".join(words) + ".",
-        drawing(discrepancy_maps.line_pictures, data.arrays, origin=data.found.origin),
+        drawing(discrepancy_maps.line_pictures, data.arrays, origin=data.found.examined.origin),
         raster=True,
     )
 
@@ -213,7 +208,7 @@ def _gap(data: DiscrepancyData) -> list[Exhibit]:
     )
 
 
-def _gap_alt(found: Findings) -> str:
+def _gap_alt(found: Verdict) -> str:
     words = [
         f"{bar.words} {short(bar.gap)}"
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pchem_pipeline.report.pages.findings import Findings, Pull
+from pchem_pipeline.discrepancy.verdict import Pull, Verdict
 from pchem_pipeline.report.style.style import (
     BLACK,
     BLUE,
@@ -56,42 +56,34 @@ class GapBar:
     role: str
 
 
-def gap_bars(found: Findings) -> list[GapBar]:
+def gap_bars(found: Verdict) -> list[GapBar]:
     """Return the lines of the figure: the plain model, each grown model, then the rivals of the last step."""
-    first, *_ = (*found.steps, None)
-    before = found.gap.before
-    if math.isnan(before) and first is not None:
-        before = first.gap.before
-    bars = [_bar("plain model", before, found.gap.interval_before, "before")]
+    bars = [_bar("plain model", found.gap.before, found.gap.interval_before, "before")]
     grown = [(step, words) for step in found.steps if (words := found.added(step))]
     for i, (step, words) in enumerate(grown):
-        after, interval = step.gap.after, step.gap.interval_after
-        if i == len(grown) - 1 and not math.isnan(found.gap.after):
-            after, interval = found.gap.after, _known(found.gap.interval_after, interval)
+        after, interval = step.gap_after, step.gap_interval_after
+        if i == len(grown) - 1:
+            after, interval = found.gap.after, found.gap.interval_after
         lead = "" if words.startswith("nearest") else "with " if i == 0 else "… and "
         bars.append(_bar(f"{lead}{words}", after, interval, "after"))
     for step, _ in grown[-1:]:
         for rival, role in ((step.runner_up, "runner-up"), (step.placebo, "placebo")):
             if rival is not None:
-                bars.append(_bar(f"{role}: {rival.effect}", rival.gap_after, rival.interval, role))
+                bars.append(_bar(f"{role}: {rival.effect}", rival.gap_after, (math.nan, math.nan), role))
     return [bar for bar in bars if math.isfinite(bar.gap)]
-
-
-def _known(first: tuple[float, float], second: tuple[float, float]) -> tuple[float, float]:
-    return first if math.isfinite(first[0]) else second
 
 
 def _bar(words: str, value: float, interval: tuple[float, float], role: str) -> GapBar:
     return GapBar(words, MICRO * value, MICRO * interval[0], MICRO * interval[1], role)
 
 
-def families(found: Findings) -> list[tuple[str, float, float]]:
+def families(found: Verdict) -> list[tuple[str, float, float]]:
     """Return the gap of each family of statistics before and after, 1e-6 nats, largest first."""
-    with_families = [step for step in found.steps if step.families_before]
+    with_families = [step for step in found.steps if step.families.before]
     if not with_families:
         return []
-    before = with_families[0].families_before
-    after = next((step.families_after for step in reversed(with_families) if step.families_after), {})
+    before = with_families[0].families.before
+    after = next((step.families.after for step in reversed(with_families) if step.families.after), {})
     rows = [
         (_FAMILY_WORDS.get(name, name), MICRO * value, MICRO * after.get(name, math.nan))
         for name, value in before.items()
@@ -108,7 +100,7 @@ _ROLES = {
 
 
 @styled
-def gap(found: Findings, *, width_mm: float = PAGE_MM) -> Figure:
+def gap(found: Verdict, *, width_mm: float = PAGE_MM) -> Figure:
     """Draw the gap before and after against its floor, with runner-up and placebo, and by family.
 
     Args:
@@ -128,8 +120,6 @@ def gap(found: Findings, *, width_mm: float = PAGE_MM) -> Figure:
         figure = new_figure(width_mm, 22.0 + sum(heights))
         both = list(figure.subplots(2, 1, height_ratios=heights))
     floor = MICRO * found.gap.floor
-    if not math.isfinite(floor) and found.steps:
-        floor = MICRO * found.steps[-1].gap.floor
     left, right = _limits(bars, parts, floor)
     _gap_lines(both[0], bars, floor, left)
     if parts:

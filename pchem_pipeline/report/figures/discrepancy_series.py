@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pchem_pipeline.report.pages.findings import Place
+from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.report.style.style import (
     BLACK,
     BLUE,

@@ -1,15 +1,14 @@
-"""What the page of a discrepancy verdict is made of: the JSON, small arrays, and words of others."""
+"""What the page of a discrepancy verdict is made of: the verdict, small arrays, and names of effects."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 from numpy.typing import NDArray
 
-from pchem_pipeline.report.pages.findings import Findings, findings
+from pchem_pipeline.discrepancy.verdict import Verdict
 
 __all__ = ["CHANNELS", "DiscrepancyData"]
 
@@ -22,23 +21,18 @@ class DiscrepancyData:
     """All that the page shows.
 
     Attributes:
-        result: content of ``discrepancy.json``.
+        found: the verdict.
         arrays: arrays of group ``discrepancy`` by name; any may lack.
         statistics: name of each statistic, in the order of ``z_before``, to its channel and sentence.
         titles: tag of an effect to its name in the literature.
         sources: tag of an effect to where it is described.
     """
 
-    result: Mapping[str, Any]
+    found: Verdict
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     statistics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     titles: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
-
-    @cached_property
-    def found(self) -> Findings:
-        """The JSON as typed values."""
-        return findings(self.result)
 
     def title(self, tag: str) -> str:
         """Return the name of an effect in the literature, or its tag."""

@@ -11,7 +11,6 @@ from pchem_pipeline.report.figures.exhibits import Exhibit
 from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
 from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables
 from pchem_pipeline.report.pages.discrepancy_text import PARTS, KeyFact, key_facts, remarks, verdict_level
-from pchem_pipeline.report.pages.findings import headline
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.pages.verdict import Flag
 
@@ -73,7 +72,7 @@ def discrepancy_view(data: DiscrepancyData, draw: Callable[[Exhibit], Drawn]) ->
         rows = tables.get(id_, [])
         empty = "" if shown or rows else _EMPTY[id_]
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
-    sentence = headline(data.found).replace(" -> ", " → ")
+    sentence = data.found.sentence.replace(" -> ", " → ")
     return DiscrepancyView(level, name, sentence, key_facts(data.found), remarks(data), parts)
 
 

@@ -5,9 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from pchem_pipeline.discrepancy.verdict import Place, Step, Verdict
 from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
-from pchem_pipeline.report.pages.discrepancy_text import gap_words, parameter_name, probability_words
-from pchem_pipeline.report.pages.findings import Findings, Place, Step
+from pchem_pipeline.report.pages.discrepancy_text import (
+    gap_words,
+    parameter_name,
+    parameter_texts,
+    probability_words,
+)
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import count, measured, short, signed, unit_text
 
@@ -93,7 +98,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 measured(candidate.score, candidate.stderr),
                 short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
                 probability_words(candidate.probability),
-                ", ".join(f"{name} {value}" for name, value in candidate.parameters),
+                ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
             )
         )
     if step.effect:
@@ -124,10 +129,10 @@ def _separate(steps: Sequence[Step]) -> Table:
     )
 
 
-def _gaps(found: Findings) -> Table:
+def _gaps(found: Verdict) -> Table:
     rows = []
     for i, step in enumerate(found.steps):
-        low, high = step.gap.interval_after
+        low, high = step.gap_interval_after
         interval = f" ({gap_words(low)} to {gap_words(high)})" if math.isfinite(low) else ""
         rivals = [
             f"{gap_words(rival.gap_after)} ({rival.effect})" if rival is not None else ""
@@ -136,9 +141,9 @@ def _gaps(found: Findings) -> Table:
         rows.append(
             (
                 f"{i + 1}: {found.added(step) or step.verdict}",
-                gap_words(step.gap.before),
-                f"{gap_words(step.gap.after)}{interval}",
-                gap_words(step.gap.floor),
+                gap_words(step.gap_before),
+                f"{gap_words(step.gap_after)}{interval}",
+                gap_words(step.gap_floor),
                 *rivals,
             )
         )
@@ -155,14 +160,14 @@ def _gaps(found: Findings) -> Table:
 def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
         (
-            f"{tag}: {p.name}",
+            f"{tag}: {name}",
             measured(p.value, p.stderr, unit_text(p.unit)),
             data.title(tag) + ("" if step.effect else " (the likeliest)"),
             data.sources.get(tag, ""),
         )
         for step in data.found.steps
-        for tag in [step.effect or next((c.effect for c in step.candidates), "")]
-        for p in step.parameters
+        for tag in [step.likeliest]
+        for name, p in step.parameters.items()
         if tag and (step.effect or data.found.verdict == "ambiguous")
     )
     return Table(
@@ -177,12 +182,12 @@ def _parameters(data: DiscrepancyData) -> Table:
 def _moved(steps: Sequence[Step]) -> Table:
     rows = []
     for step in steps:
-        for each in step.moved:
+        for name, each in step.moved.items():
             unit = unit_text(each.unit)
             rows.append(
                 (
-                    f"{parameter_name(each.name)}{f' ({unit})' if unit else ''}",
-                    step.effect,
+                    f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
+                    step.effect or "",
                     short(each.median) if math.isfinite(each.median) else "not known",
                     signed(each.in_stderr),
                 )
@@ -241,12 +246,9 @@ def _examined(data: DiscrepancyData) -> Table:
         ("rows", "rows, first and after the last"),
         ("columns", "columns, first and after the last"),
     ):
-        value = found.examined.get(key)
-        if isinstance(value, list | tuple):
-            rows.append((words, " to ".join(str(v) for v in value)))
-        elif value is not None:
-            rows.append((words, f"{value:,}" if isinstance(value, int) else str(value)))
+        value = getattr(found.examined, key)
+        rows.append((words, " to ".join(map(str, value)) if isinstance(value, tuple) else f"{value:,}"))
     if found.replicates:
         rows.append(("simulated replicates", f"{found.replicates:,}"))
-    rows += [(f"version: {name}", version) for name, version in found.versions.items()]
+    rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
     return Table("discrepancy-examined", "What was examined", "", ("item", "value"), tuple(rows))

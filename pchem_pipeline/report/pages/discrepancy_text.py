@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pchem_pipeline.discrepancy.verdict import Candidate, GapChange, Moved, Rival, Step, Verdict
 from pchem_pipeline.report.figures.discrepancy_gap import MICRO
 from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
-from pchem_pipeline.report.pages.findings import Findings, Gap, Rival, Step
 from pchem_pipeline.report.pages.verdict import Flag, Level
 from pchem_pipeline.report.style.wording import measured, percent, short, symbol, unit_text
 
@@ -19,6 +20,7 @@ __all__ = [
     "gap_words",
     "key_facts",
     "parameter_name",
+    "parameter_texts",
     "parameter_words",
     "probability_words",
     "remarks",
@@ -119,7 +121,7 @@ class KeyFact:
     more: tuple[str, ...] = ()
 
 
-def verdict_level(found: Findings) -> tuple[Level, str]:
+def verdict_level(found: Verdict) -> tuple[Level, str]:
     """Return how grave a verdict is, and its name."""
     return VERDICT_WORDS.get(found.verdict, ("note", found.verdict.capitalize()))
 
@@ -138,7 +140,18 @@ def probability_words(p: float) -> str:
 
 def parameter_words(step: Step) -> list[str]:
     """Return the parameters of a step's effect, each as ``name value ± error unit``."""
-    return [f"{p.name} = {measured(p.value, p.stderr, unit_text(p.unit))}" for p in step.parameters]
+    return [
+        f"{name} = {measured(p.value, p.stderr, unit_text(p.unit))}" for name, p in step.parameters.items()
+    ]
+
+
+def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
+    """Return the fields of a candidate as text, numbers to four digits."""
+    return [
+        (name, f"{value:.4g}" if isinstance(value, int | float) else str(value or ""))
+        for name, value in candidate.parameters.items()
+        if not isinstance(value, list | dict)
+    ]
 
 
 def parameter_name(name: str) -> str:
@@ -149,12 +162,12 @@ def parameter_name(name: str) -> str:
         return name.replace("_", " ")
 
 
-def key_facts(found: Findings) -> list[KeyFact]:
+def key_facts(found: Verdict) -> list[KeyFact]:
     """Return the numbers of the first screen."""
     return [*_gap_fact(found), *_effect_facts(found), *_moved_fact(found), *_chance_fact(found)]
 
 
-def _gap_fact(found: Findings) -> list[KeyFact]:
+def _gap_fact(found: Verdict) -> list[KeyFact]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
@@ -166,52 +179,57 @@ def _gap_fact(found: Findings) -> list[KeyFact]:
     return [KeyFact("gap", value, tuple(more))]
 
 
-def _interval(gap: Gap) -> str:
+def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
     return f"; after: {gap_words(low)} to {gap_words(high)}"
 
 
-def _effect_facts(found: Findings) -> list[KeyFact]:
+def _effect_facts(found: Verdict) -> list[KeyFact]:
     facts = []
     for step in found.steps:
         if step.effect and step.parameters:
-            first, *rest = step.parameters
+            (name, first), *rest = step.parameters.items()
             facts.append(
                 KeyFact(
-                    f"{step.effect}: {first.name}",
+                    f"{step.effect}: {name}",
                     measured(first.value, first.stderr, unit_text(first.unit)),
-                    tuple(f"{p.name} {measured(p.value, p.stderr, unit_text(p.unit))}" for p in rest[:2]),
+                    tuple(f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}" for name, p in rest[:2]),
                 )
             )
     return facts[:4]
 
 
-def _moved_fact(found: Findings) -> list[KeyFact]:
-    moved = [m for step in found.steps for m in step.moved if math.isfinite(m.in_stderr)]
-    if not moved:
+def _moved_fact(found: Verdict) -> list[KeyFact]:
+    moved = _largest_move(found.steps)
+    if moved is None:
         return []
-    largest = max(moved, key=lambda m: abs(m.in_stderr))
+    name, largest = moved
     unit = unit_text(largest.unit)
     return [
         KeyFact(
-            f"largest move: {parameter_name(largest.name)}",
+            f"largest move: {parameter_name(name)}",
             f"{_signed(largest.median)} {unit}".strip(),
             (f"{_signed(largest.in_stderr, 2)} standard errors of a pixel",),
         )
     ]
 
 
+def _largest_move(steps: Sequence[Step]) -> tuple[str, Moved] | None:
+    moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
+    return max(moved, key=lambda pair: abs(pair[1].in_stderr), default=None)
+
+
 def _signed(value: float, digits: int = 3) -> str:
     return short(value, digits) if value < 0 or not math.isfinite(value) else f"+{short(value, digits)}"
 
 
-def _chance_fact(found: Findings) -> list[KeyFact]:
-    if not math.isfinite(found.p_before):
+def _chance_fact(found: Verdict) -> list[KeyFact]:
+    if not math.isfinite(found.p_global.before):
         return []
     more = [f"of a disagreement this large, from {found.replicates} replicates"] if found.replicates else []
-    before, after = probability_words(found.p_before), probability_words(found.p_after)
+    before, after = probability_words(found.p_global.before), probability_words(found.p_global.after)
     value = f"{before} → {after}" if after and found.effects else before
     return [KeyFact("probability by chance", value, tuple(more))]
 
@@ -238,7 +256,7 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     return sorted(flags, key=lambda flag: order.index(flag.level))
 
 
-def _closing(found: Findings, last: Step) -> list[Flag]:
+def _closing(found: Verdict, last: Step) -> list[Flag]:
     """Say whether the gap is at its floor, and whether a wrong effect closes it as well."""
     gap, flags = found.gap, []
     if math.isfinite(gap.after) and math.isfinite(gap.floor):
@@ -256,24 +274,24 @@ def _closing(found: Findings, last: Step) -> list[Flag]:
     if last.runner_up is not None and math.isfinite(share):
         closed = percent(max(share, 0.0), 1.0)
         text = f"The second-best effect ({last.runner_up.effect}) closes {closed} of the gap"
-        flags.append(Flag("note", f"{text}; {last.effect} leaves {gap_words(last.gap.after)}, it leaves "
+        flags.append(Flag("note", f"{text}; {last.effect} leaves {gap_words(last.gap_after)}, it leaves "
                                   f"{gap_words(last.runner_up.gap_after)}."))  # fmt: skip
     return flags
 
 
 def _closed(step: Step, rival: Rival | None) -> float:
     """Return the share of a step's gap that another effect closes."""
-    if rival is None or not step.gap.before > 0:
+    if rival is None or not step.gap_before > 0:
         return math.nan
-    return 1.0 - max(rival.gap_after, 0.0) / step.gap.before
+    return 1.0 - max(rival.gap_after, 0.0) / step.gap_before
 
 
 def _materiality(grown: list[Step]) -> list[Flag]:
-    moved = [m for step in grown for m in step.moved if math.isfinite(m.in_stderr)]
-    if not moved:
+    moved = _largest_move(grown)
+    if moved is None:
         return []
-    largest = max(moved, key=lambda m: abs(m.in_stderr))
-    name, far = parameter_name(largest.name), _signed(largest.in_stderr, 2)
+    name, largest = parameter_name(moved[0]), moved[1]
+    far = _signed(largest.in_stderr, 2)
     words = f"{name} moved by {far} standard errors of a pixel"
     if abs(largest.in_stderr) < _IMMATERIAL:
         return [Flag("note", f"Significant, but immaterial for the maps: at most, {words}.")]

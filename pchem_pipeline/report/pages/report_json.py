@@ -12,7 +12,6 @@ import numpy as np
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import status_counts
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.pages.findings import headline
 from pchem_pipeline.report.pages.verdict import flags, pixel_counts, sentence, summaries
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import stored_unit
@@ -143,7 +142,7 @@ def _discrepancy(data: ReportData) -> dict[str, Any] | None:
     if data.discrepancy is None:
         return None
     found = data.discrepancy.found
-    return {"verdict": found.verdict, "sentence": headline(found), "effects": found.effects}
+    return {"verdict": found.verdict, "sentence": found.sentence, "effects": found.effects}
 
 
 def _plain(value: Any) -> Any:

@@ -11,7 +11,6 @@ import numpy as np
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.map_figures import status_counts
-from pchem_pipeline.report.pages.findings import headline
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
 
@@ -256,7 +255,7 @@ def _discrepancy(data: ReportData) -> list[Flag]:
         return []
     found = data.discrepancy.found
     levels: dict[str, Level] = {"consistent": "good", "ambiguous": "caution", "unexplained": "serious"}
-    return [Flag(levels.get(found.verdict, "note"), _as_sentence(headline(found).replace(" -> ", " → ")))]
+    return [Flag(levels.get(found.verdict, "note"), _as_sentence(found.sentence.replace(" -> ", " → ")))]
 
 
 def _conditions(data: ReportData) -> list[Flag]:

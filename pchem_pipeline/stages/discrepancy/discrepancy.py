@@ -6,9 +6,8 @@ leaves its statistics in its marker, so that a stopped search goes on where it w
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from pchem_pipeline.discrepancy.by_likelihood.workflow import find_in_histograms
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
 from pchem_pipeline.discrepancy.by_simulation.workflow import find_discrepancies
 from pchem_pipeline.discrepancy.splits import block_length
-from pchem_pipeline.discrepancy.verdict import Discrepancy
+from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
@@ -32,7 +31,7 @@ from pchem_pipeline.store.files import write_atomic
 
 __all__ = ["Window", "choose_window", "run"]
 
-_STAGE, _RESULT = "discrepancy", "discrepancy.json"
+_STAGE = "discrepancy"
 # frames tell more than pixels about what happens in time; pixels more about what is rare
 _FRAMES_WANTED = 6000
 
@@ -121,12 +120,8 @@ def run(context: StageContext) -> None:
         model=before,
         mapper=_Mapper(context),
     )
-    result = found.to_json()
-    result["examined"] |= {"rows": list(window.rows), "columns": list(window.columns)}
-    for place in result["where"]:
-        # the search counts pixels from the corner of its window, people from that of the sensor
-        place["pixels"] = [[y + window.rows[0], x + window.columns[0]] for y, x in place["pixels"]]
-    _write(context, found, result, before)
+    found = replace(found, verdict=found.verdict.on_sensor(window.rows, window.columns))
+    _write(context, found, before)
     write_added_exposure(context.store, found.added, found.model, window.rows, window.columns)
     _grow(context, found, before)
 
@@ -144,7 +139,7 @@ def _run_histograms(context: StageContext) -> None:
         context.config.discrepancy,
         model=before,
     )
-    _write(context, found, found.to_json(), before)
+    _write(context, found, before)
     _grow(context, found, before)
     context.run_units([WHOLE], _nothing_left, by_tiles=False)
 
@@ -200,22 +195,20 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     return stack
 
 
-def _write(
-    context: StageContext, found: Discrepancy, result: dict[str, Any], before: Sequence[Effect]
-) -> None:
+def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
     names, z_before, z_after = found.statistics
     arrays = evidence_arrays(
         found.evidence,
         dict(zip(names, z_before.tolist(), strict=True)),
-        dict(zip(names, z_after.tolist(), strict=True)) if found.steps else None,
-        [s.effect for s in found.steps if s.effect is not None],
+        dict(zip(names, z_after.tolist(), strict=True)) if found.verdict.steps else None,
+        [e for e in found.model if e.tag in found.verdict.effects],
         context.integration_time or 1.0,
         context.config.input.bit_depth or context.sensor.bit_depth or 16,
         found.code_grown,
     )
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
-    context.store.write_file(_RESULT, json.dumps(result, indent=1, ensure_ascii=False).encode())
+    context.store.write_file(VERDICT_FILE, found.verdict.to_json().encode())
     context.store.set_attributes(
         _STAGE,
         {
@@ -224,14 +217,14 @@ def _write(
             "roi": list(context.options.roi or ()),
         },
     )
-    for tag, reason in found.left_out.items():
+    for tag, reason in found.verdict.left_out.items():
         context.note(f"effect {tag} left out: {reason}")
 
 
 def _grow(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
     """Put what was found into the model of the run, if wanted."""
     if context.config.discrepancy.add and found.model != tuple(before):
-        grow_model(context, found.model, found.set_aside)
+        grow_model(context, found.model, found.verdict.set_aside)
 
 
 def grow_model(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from pchem_pipeline.report.pages.findings import Findings, Place, Step, findings, headline
+from pchem_pipeline.discrepancy.verdict import Place, Step, Verdict
 
 __all__ = ["verdict_text"]
 
@@ -18,17 +17,13 @@ _LEAD = "where: "
 _PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
 
 
-def verdict_text(result: Mapping[str, Any]) -> str:
+def verdict_text(found: Verdict) -> str:
     """Return the verdict, where data and model disagree, the candidates, the gap, and what is not tested.
-
-    Args:
-        result: content of ``discrepancy.json``; keys may lack.
 
     Returns:
         Lines of at most 100 characters, without one at the end.
     """
-    found = findings(result)
-    lines = [*_wrapped(f"{found.verdict.upper()}: {headline(found)}", "  ")]
+    lines = [*_wrapped(f"{found.verdict.upper()}: {found.sentence}", "  ")]
     lines += _places("where: ", found.where, _MOST_PLACES)
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
@@ -81,7 +76,7 @@ def _sd(z: float) -> str:
     return f"{z:+.1f} sd" if math.isfinite(z) else "sd not known"
 
 
-def _step(step: Step, number: int, found: Findings) -> list[str]:
+def _step(step: Step, number: int, found: Verdict) -> list[str]:
     """Return the table of candidates of a step and the parameters of what was named."""
     lines = []
     if step.candidates:
@@ -94,7 +89,7 @@ def _step(step: Step, number: int, found: Findings) -> list[str]:
         more = len(step.candidates) - _MOST_CANDIDATES
         lines += [f"  and {more} more"] if more > 0 else []
     if step.effect and step.parameters:
-        values = [_value(p.name, p.value, p.stderr, p.unit) for p in step.parameters]
+        values = [_value(name, p.value, p.stderr, p.unit) for name, p in step.parameters.items()]
         lines += _listed(step.effect, values, 0)
     if not step.effect and found.verdict == "ambiguous":
         lines += [
@@ -114,7 +109,7 @@ def _value(name: str, value: float, stderr: float, unit: str) -> str:
     return f"{name} = {value:.4g}{error}{f' {unit}' if unit else ''}"
 
 
-def _gap(found: Findings) -> list[str]:
+def _gap(found: Verdict) -> list[str]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
