@@ -160,7 +160,7 @@ def test_the_command_line_passes_on(
         return "told"
 
     monkeypatch.setattr(hidden, "run_hidden_demo", run)
-    outcome = CliRunner().invoke(app.app, ["demo", "--hidden", "random", "-o", "out", "-q", *options])
+    outcome = CliRunner().invoke(app, ["demo", "--hidden", "random", "-o", "out", "-q", *options])
     assert outcome.stdout == "told\n"
     given = {"hidden": "random", "size": 64, "n_frames": 4000, "seed": seed, "quiet": True}
     assert seen == [(Path("out"), given)]
