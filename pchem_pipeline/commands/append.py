@@ -7,30 +7,25 @@ place: one that is stopped leaves the run without histograms, and ``pchem run`` 
 
 from __future__ import annotations
 
-import functools
 import math
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.frames.read_once import ReadOnce
 from pchem_pipeline.frames.resolve import input_paths
-from pchem_pipeline.model.histogram.count import counts_dtype
-from pchem_pipeline.model.histogram.summaries import block_starts
+from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.session import Command, working_run
-from pchem_pipeline.run.stage import StageContext, Swept, open_store
 from pchem_pipeline.stages.fit.start import keep_fit
-from pchem_pipeline.stages.histogram.counting import BandCounter
-from pchem_pipeline.stages.histogram.dry_run import allowed_bytes, sweep_bytes, sweep_rows
-from pchem_pipeline.stages.histogram.single_pass import block_tasks, do_all, whole_mebibytes
-from pchem_pipeline.stages.histogram.stream import Sweep, cut_rows
+from pchem_pipeline.stages.histogram.arrays import extend_arrays
+from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
+from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes
+from pchem_pipeline.stages.histogram.single_pass import PREPARED, prepared, stream_rows, whole_mebibytes
 from pchem_pipeline.stages.table import STAGES
 
 if TYPE_CHECKING:
@@ -38,11 +33,10 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.run.fingerprint import StageState
+    from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.run.target import Target
 
 __all__ = ["append_frames"]
-
-_STAGES = ("ingest", "histogram")
 
 
 def append_frames(target: Target, command: Command) -> list[StageState]:
@@ -73,14 +67,14 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         keep_fit(context)
         files = kept["files"] + _go_on(context, frames, added)["files"]
         keep_identity(context, quick, {"files": files, "digest": digest_of(files)})
-        context.swept = Swept(_STAGES, frames, clock)
-        return [execute(name, context) for name in _STAGES]
+        context.prepared = prepared(frames, clock)
+        return [execute(name, context) for name in PREPARED]
 
 
 def _check_run(context: StageContext) -> None:
     """Refuse a run that has no whole histograms, or that was made with other settings."""
     store = context.store
-    for name in _STAGES:
+    for name in PREPARED:
         record = store.records.read(name)
         finished = record is not None and record.finished
         if record is None or not finished or len(context.tiles_done(name)) < record.keys:
@@ -143,7 +137,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
             f"decide the bins; do all again: pchem run {quoted(place)}"
         )
     bins = context.store.array("histogram/counts").shape[2]
-    need = sweep_bytes(context.config, frames.shape, frames.dtype, bins)
+    need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
     if need > allowed_bytes(context.config, context.executor.workers):
         raise StoreError(
             f"{place}: appending needs {need >> 20} MiB; allow them (--max-memory), or do all again: "
@@ -154,47 +148,30 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
 def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> dict[str, Any]:
     """Count the new frames; return the identity of their files."""
     config, store, workers = context.config, context.store, context.executor.workers
-    done, shape = context.sensor.n_frames, frames.shape
     bins = store.array("histogram/counts").shape[2]
-    bands = cut_rows(shape[1], sweep_rows(config, shape, frames.dtype), workers)
-    counters = [BandCounter(store.path, rows, shape, bins, config.histogram) for rows in bands]
+    copies = config.input.mode == "copy"
+    job = CountJob(store.path, frames.shape, bins, config.histogram, copies)
     step = config.histogram.window_frames
-    if config.input.mode == "copy":
+    if copies:
         step = math.lcm(step, store.array("frames/dn").chunks[0])
+    done = context.sensor.n_frames
     total = sum(path.stat().st_size for path in added if path.is_file()) >> 20
     with (
         context.reporter.progress("ingest and histogram", total, "MiB") as advance,
-        ThreadPoolExecutor(workers, thread_name_prefix="count") as pool,
+        HashedFrameStream(
+            frames,
+            stream_rows(context, frames),
+            step,
+            files=added,
+            first=done,
+            threads=workers,
+            advance=whole_mebibytes(advance),
+        ) as stream,
     ):
-        do_all(pool, [functools.partial(counter.resume, done) for counter in counters])
-        for name in _STAGES:
+        counter = StackCounter(job, stream.bands, workers)
+        counter.resume(done)
+        for name in PREPARED:
             store.records.forget(name)
-        _make_room(context, shape, bins)
-        once = ReadOnce(frames, added, workers, whole_mebibytes(advance))
-        with Sweep(once.read, shape, frames.dtype, bands, step, done).blocks() as blocks:
-            for t0, parts in blocks:
-                context.stop.check()
-                do_all(pool, block_tasks(context, counters, bands, t0, parts))
-        do_all(pool, [counter.finish for counter in counters])
-    return once.identity()
-
-
-def _make_room(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
-    """Make the arrays along time longer, and the counts wide enough."""
-    store, n_frames = context.store, shape[0]
-    tile, length = context.config.run.tile, context.config.histogram.block_frames
-    open_store.cache_clear()
-    if store.array("histogram/counts").dtype != counts_dtype(n_frames):
-        counts = (*shape[1:], bins)
-        store.create_array(
-            "histogram/counts", counts, chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
-        )
-    if context.config.input.mode == "copy":
-        store.resize("frames/dn", n_frames)
-    if context.config.histogram.summaries:
-        starts = block_starts(n_frames, length)
-        for name in ("row_sum", "row_sum_square", "column_sum"):
-            store.resize(f"summary/{name}", n_frames)
-        for name in ("block_sum", "block_sum_square"):
-            store.resize(f"summary/{name}", starts.size)
-        store.write_array("summary/block_start", starts, {"frames": n_frames})
+        extend_arrays(context, frames.shape, bins)
+        counter.count(stream, context.stop.check)
+        return stream.identity()

@@ -22,6 +22,7 @@ __all__ = [
     "OnResult",
     "Outcome",
     "Stop",
+    "call_all",
     "guarded",
     "make_executor",
     "out_of_memory",
@@ -93,6 +94,18 @@ def out_of_memory(error: MemoryError) -> str:
         f"out of memory{f' ({error})' if str(error) else ''}; use fewer --workers, a smaller --max-memory "
         "or a smaller run.tile, or a machine with more, and run the same command to go on"
     )
+
+
+def call_all(tasks: Sequence[Callable[[], T]], threads: int) -> list[T]:
+    """Call tasks that share the memory, on some threads of this process; return their results in order.
+
+    The first error is raised when all have ended.
+    """
+    if threads <= 1 or len(tasks) <= 1:
+        return [task() for task in tasks]
+    with ThreadPoolExecutor(min(threads, len(tasks)), thread_name_prefix="share") as pool:
+        futures = [pool.submit(task) for task in tasks]
+    return [future.result() for future in futures]
 
 
 class SerialExecutor:

@@ -30,7 +30,7 @@ class SinglePass:
     Attributes:
         stages: their names, in order.
         run: ``"module:function"`` that takes the context of the run, does the work where that is possible,
-            and then sets ``context.swept``.
+            and then sets ``context.prepared``.
     """
 
     stages: tuple[str, ...]

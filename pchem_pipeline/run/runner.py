@@ -45,8 +45,9 @@ def execute(name: str, context: StageContext) -> StageState:
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
-    if context.swept is not None and name == context.swept.stages[-1]:
-        clock = context.swept.clock
+    prepared = context.prepared.get(name)
+    if prepared is not None and prepared.clock is not None:
+        clock = prepared.clock
     return _perform(stage, context, before, restart=not chosen, clock=clock)
 
 
@@ -71,7 +72,7 @@ def _perform(
         resumes = False
     context.stage, context.failed, context.notes, context.n_keys = stage.name, {}, [], 0
     context.fingerprint = old.fingerprint if resumes and old is not None else fingerprint_of(content)
-    context.fresh = not resumes and not context.is_swept
+    context.fresh = not resumes and not context.is_prepared
     if context.fresh:
         records.forget(stage.name)
         for path in stage.writes:

@@ -34,7 +34,7 @@ from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
-__all__ = ["WHOLE", "Options", "StageContext", "Swept", "Unit", "nothing_left", "open_store"]
+__all__ = ["WHOLE", "Options", "Prepared", "StageContext", "Unit", "nothing_left", "open_store"]
 
 
 class Unit(Protocol):
@@ -98,22 +98,20 @@ class MarkedTask:
 
 
 @dataclass(frozen=True)
-class Swept:
-    """What one pass over the input did for several stages at once; they have but to mark their units.
+class Prepared:
+    """What a single pass over the input did for a stage, which then has but to mark its units.
 
     Attributes:
-        stages: the stages whose arrays are written, in order; the last one's record takes the clock.
         frames: the opened camera files.
-        clock: wall and CPU time when the pass began.
+        clock: wall and CPU time when the pass began, for the stage to which its time belongs.
     """
 
-    stages: tuple[str, ...]
     frames: FrameSequence
-    clock: tuple[float, float]
+    clock: tuple[float, float] | None = None
 
 
 def nothing_left(unit: Any) -> dict[str, Any]:
-    """Be the task of units whose work is done."""
+    """Do nothing: the task of units whose work was done beforehand."""
     return {}
 
 
@@ -136,7 +134,7 @@ class StageContext:
         n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
         config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
-        swept: what the one pass over the input has done, where there was one.
+        prepared: the stages whose arrays a single pass over the input has made.
     """
 
     config: RunConfig
@@ -153,12 +151,12 @@ class StageContext:
     n_keys: int = 0
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
-    swept: Swept | None = None
+    prepared: Mapping[str, Prepared] = field(default_factory=dict)
 
     @property
-    def is_swept(self) -> bool:
-        """The arrays of the running stage were made beforehand, by the one pass over the input."""
-        return self.swept is not None and self.stage in self.swept.stages
+    def is_prepared(self) -> bool:
+        """The arrays of the running stage were made beforehand, by a single pass over the input."""
+        return self.stage in self.prepared
 
     @property
     def sensor(self) -> SensorInfo:

@@ -70,8 +70,8 @@ def run(context: StageContext) -> None:
         _record_histograms(context)
         return
     settings = context.config.input
-    swept = context.swept if context.is_swept else None
-    reader = open_frames(settings, context.base_dir) if swept is None else swept.frames
+    done = context.prepared.get(context.stage)
+    reader = open_frames(settings, context.base_dir) if done is None else done.frames
     if message := reader.report.message():
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
@@ -82,7 +82,7 @@ def run(context: StageContext) -> None:
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
     units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
     task: Callable[[CopyUnit], dict[str, Any]] = nothing_left
-    if swept is None:
+    if done is None:
         create_frames(context, reader)
         task = functools.partial(_copy, store=context.store.path, reader=reader)
     context.run_units(units, task, unit_name="block", by_tiles=False)

@@ -35,7 +35,7 @@ _INPUT_SETTINGS = (
     "on_bad_file",
 )
 
-_SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:sweep_input")
+_SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:count_in_one_pass")
 
 
 def _is_simulated(config: RunConfig) -> bool:

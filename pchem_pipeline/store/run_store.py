@@ -264,12 +264,12 @@ class RunStore:
         except OSError as error:
             raise storage_error(error, private) from error
         try:
-            self._sweep()
+            self._remove_partial_files()
             yield
         finally:
             lock.release()
 
-    def _sweep(self) -> None:
+    def _remove_partial_files(self) -> None:
         """Remove what a killed process left: partial files never become part of the run."""
         if isinstance(self.path, RemotePath):  # which has none
             return

@@ -108,8 +108,8 @@ def main() -> None:
     given = parser.parse_args()
 
     from pchem_pipeline.frames.open import open_frames
-    from pchem_pipeline.frames.read_once import ReadOnce
     from pchem_pipeline.frames.settings import InputSettings
+    from pchem_pipeline.frames.stream import HashedFrameStream
 
     with open_frames(InputSettings(files=(str(given.raw.resolve()),)), Path()) as reader:
         stack = reader.read(0, min(given.frames, reader.shape[0]))
@@ -128,10 +128,18 @@ def main() -> None:
             def ours(frames: object = frames, buffer: Stack = buffer) -> None:
                 frames.read_into(buffer, 0, len(stack))  # type: ignore[attr-defined]
 
-            def hashed(frames: object = frames, path: Path = path, buffer: Stack = buffer) -> None:
-                once = ReadOnce(frames, [path], given.threads)  # type: ignore[arg-type]
-                once.read([buffer], 0, len(stack))
-                once.identity()
+            def hashed(frames: object = frames, path: Path = path) -> None:
+                n, rows = stack.shape[:2]
+                with HashedFrameStream(
+                    frames,  # type: ignore[arg-type]
+                    [(0, rows)],
+                    n,
+                    files=[path],
+                    threads=given.threads,
+                ) as stream:
+                    for _ in stream:
+                        pass
+                    stream.identity()
 
             speeds = [stack.nbytes / 1e6 / seconds(call) for call in (bare, ours, hashed)]
             found[name] = speeds

@@ -36,7 +36,7 @@ class Row:
     took: Outcome
 
     @property
-    def sweep(self) -> float:
+    def single_pass(self) -> float:
         """Seconds of the one pass."""
         return self.took.seconds["histogram"]
 
@@ -69,7 +69,8 @@ def write_stack(path: Path, frames: int, side: int) -> None:
 def measure(folder: Path, frames: int, side: int, workers: int) -> Row:
     """Write a stack, run it as far as the histograms, or the fit if no frame is repeated, and remove it."""
     from pchem_pipeline.config.load import load_config
-    from pchem_pipeline.stages.histogram.dry_run import make_plan, sweep_bytes
+    from pchem_pipeline.stages.histogram.dry_run import make_plan
+    from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 
     raw, config = folder / "stack.raw", folder / "stack.yaml"
     write_stack(raw, frames, side)
@@ -78,7 +79,7 @@ def measure(folder: Path, frames: int, side: int, workers: int) -> Row:
     config.write_text(json.dumps(content))
     parsed = load_config(config)
     plan = make_plan(parsed, folder)
-    said = sweep_bytes(parsed, plan.shape, np.dtype(np.uint16), plan.bins) / 2**20
+    said = single_pass_bytes(parsed, plan.shape, np.dtype(np.uint16), plan.bins) / 2**20
     took = run_pchem(config, ("ingest", "histogram", "fit")[: 3 if frames <= _SIMULATED else 2])
     for path in sorted(folder.rglob("*"), reverse=True):
         path.rmdir() if path.is_dir() else path.unlink()
@@ -97,7 +98,7 @@ def show(rows: list[Row]) -> None:
     for row in rows:
         size = row.frames * row.side**2 * 2 / 1e9
         peak = row.took.peak["histogram"]
-        cells = (f"{row.frames}", f"{row.side}", f"{size:.2f}", f"{row.sweep:.2f}")
+        cells = (f"{row.frames}", f"{row.side}", f"{size:.2f}", f"{row.single_pass:.2f}")
         cells += (f"{row.took.cpu['histogram']:.1f}", f"{row.fit:.2f}", f"{peak:.0f}", f"{row.said:.0f}")
         print("".join(f"{cell:>9}" for cell in (*cells, f"{peak / row.said:.2f}")))
 
@@ -109,10 +110,10 @@ def draw(folder: Path, by_frames: list[Row], by_side: list[Row], powers: dict[st
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.4), layout="constrained")
     n = [row.frames for row in by_frames]
     first = f"pass, power {powers['pass/frames']:.2f}"
-    axes[0].loglog(n, [row.sweep for row in by_frames], "o-", label=first)
+    axes[0].loglog(n, [row.single_pass for row in by_frames], "o-", label=first)
     axes[0].set(xlabel=f"frames of {by_frames[0].side} x {by_frames[0].side} pixels", ylabel="seconds")
     pixels = [row.side**2 for row in by_side]
-    for name, label in (("sweep", "pass"), ("fit", "fit")):
+    for name, label in (("single_pass", "pass"), ("fit", "fit")):
         power = powers[f"{label}/pixels"]
         axes[1].loglog(
             pixels, [getattr(row, name) for row in by_side], "o-", label=f"{label}, power {power:.2f}"
@@ -155,9 +156,9 @@ def main() -> None:
     show(by_frames + by_side)
     frames, pixels = [row.frames for row in by_frames], [row.side**2 for row in by_side]
     powers = {
-        "pass/frames": exponent(frames, [row.sweep for row in by_frames]),
+        "pass/frames": exponent(frames, [row.single_pass for row in by_frames]),
         "memory/frames": exponent(frames, [row.took.peak["histogram"] for row in by_frames]),
-        "pass/pixels": exponent(pixels, [row.sweep for row in by_side]),
+        "pass/pixels": exponent(pixels, [row.single_pass for row in by_side]),
         "fit/pixels": exponent(pixels, [row.fit for row in by_side]),
         "memory/pixels": exponent(pixels, [row.took.peak["histogram"] for row in by_side]),
     }

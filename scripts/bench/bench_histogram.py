@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms, histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator, line_sums
-from pchem_pipeline.stages.histogram.frame_source import read_ahead
 from pchem_pipeline.stages.histogram.histogram import histogram_tile
 
 Frames = NDArray[np.uint16]
@@ -101,8 +101,9 @@ def ours(frames: Frames, repeat: int) -> RowHistograms:
                 reader.read_into(buffer[: end - t], t, end)
 
         def from_file(settings: HistogramSettings) -> None:
-            blocks = read_ahead(reader, (0, rows), 256)
-            histogram_tile(blocks, (rows, columns), bins, n_frames, settings)
+            with FrameStream(reader, [(0, rows)], 256) as stream:
+                blocks = (parts[0] for _, parts in stream)
+                histogram_tile(blocks, (rows, columns), bins, n_frames, settings)
 
         report("reading the file alone (warm)", read, frames.size, repeat)
         report("file to histograms", lambda: from_file(counts_only), frames.size, repeat)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
-from pchem_pipeline.stages.histogram.bands import bytes_per_row, plan_bands, row_frames
-from pchem_pipeline.stages.histogram.frame_source import read_ahead
+from pchem_pipeline.stages.bands import plan_bands
+from pchem_pipeline.stages.histogram.arrays import row_frames
+from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.store.tiles import TILE_SIZES, tile_grid
 
 
@@ -76,30 +75,3 @@ def test_row_sums_of_tall_sensors_are_read_in_smaller_pieces():
     assert row_frames(512) == 4096
     assert row_frames(10_000) * 10_000 * 16 < 2**28
     assert row_frames(200_000) > 0
-
-
-class _Source:
-    def __init__(self, frames, broken_at=None):
-        self._frames, self.shape, self.dtype = frames, frames.shape, frames.dtype
-        self.rows_per_read = 1
-        self._broken_at = broken_at
-
-    def read_into(self, buffer, t0, t1, y0=0, y1=None):
-        if self._broken_at is not None and t0 >= self._broken_at:
-            raise OSError("gone")
-        buffer[...] = self._frames[t0:t1, y0:y1]
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("step", [1, 4, 10, 99])
-def test_read_ahead_yields_every_frame_once(step, threads):
-    frames = np.arange(21 * 4 * 3, dtype=np.uint16).reshape(21, 4, 3)
-    blocks = [block.copy() for block in read_ahead(_Source(frames), (1, 3), step, threads)]
-    assert all(len(block) == step for block in blocks[:-1])
-    np.testing.assert_array_equal(np.concatenate(blocks), frames[:, 1:3])
-
-
-def test_read_ahead_passes_errors_on():
-    frames = np.zeros((20, 2, 2), np.uint8)
-    with pytest.raises(OSError, match="gone"):
-        list(read_ahead(_Source(frames, broken_at=10), (0, 2), 5))

@@ -20,7 +20,7 @@ from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store
-from pchem_pipeline.stages.histogram import histogram
+from pchem_pipeline.stages.histogram import arrays, histogram
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
@@ -86,8 +86,8 @@ def make_context(
 
 def contents(store: RunStore) -> dict[str, NDArray]:
     names = [
-        *(f"histogram/{name}" for name in ("counts", *histogram._MAPS)),
-        *(f"summary/{name}" for name in histogram._COVARIANCES),
+        *(f"histogram/{name}" for name in ("counts", *arrays.MAPS)),
+        *(f"summary/{name}" for name in arrays.COVARIANCES),
         *(f"summary/{name}" for name in ("block_start", "block_sum", "block_sum_square", "column_sum")),
         *(f"summary/{name}" for name in ("row_sum", "row_sum_square", "frame_mean", "frame_variance")),
     ]
@@ -173,14 +173,14 @@ def test_tiles_then_the_rest(tmp_path, frames, expected):
 
 def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected, monkeypatch):
     context = make_context(tmp_path, frames, band_memory=16)
-    real = histogram.read_ahead
+    real = histogram.FrameStream
 
     def breaks(source, rows, step, threads=1):
-        if rows[0] == 64:
+        if rows[0][0] == 64:
             raise ValueError("odd rows")
-        return real(source, rows, step, threads)
+        return real(source, rows, step, threads=threads)
 
-    monkeypatch.setattr(histogram, "read_ahead", breaks)
+    monkeypatch.setattr(histogram, "FrameStream", breaks)
     monkeypatch.setattr(histogram, "plan_bands", lambda *a: [*_single_bands(context)])
     state = execute("histogram", context)
     assert state.state == "failed"
@@ -193,7 +193,7 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
 
 
 def _single_bands(context: StageContext) -> list[histogram.Band]:
-    from pchem_pipeline.stages.histogram.bands import plan_bands
+    from pchem_pipeline.stages.bands import plan_bands
 
     return plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
 

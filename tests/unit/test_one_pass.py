@@ -22,8 +22,8 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.histogram import dry_run, single_pass
-from pchem_pipeline.stages.histogram.stream import Sweep, cut_rows
+from pchem_pipeline.stages.bands import cut_rows
+from pchem_pipeline.stages.histogram import memory, single_pass
 from pchem_pipeline.store.run_store import RunStore
 
 FRAMES, NY, NX = 300, 150, 40
@@ -107,8 +107,8 @@ def compare(folder: Path, **sections: dict[str, Any]) -> tuple[StageContext, Sta
     """Run both ways and compare everything that they leave."""
     apart = run_both(make_context(folder, "apart.zarr", **sections))
     once = make_context(folder, "once.zarr", **sections)
-    single_pass.sweep_input(once)
-    assert once.swept is not None
+    single_pass.count_in_one_pass(once)
+    assert set(once.prepared) == {"ingest", "histogram"}
     run_both(once)
     expected, found = contents(apart), contents(once)
     assert found.keys() == expected.keys()
@@ -159,8 +159,8 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
     context = make_context(tmp_path, "run.zarr")
     before = _bytes_read()
-    single_pass.sweep_input(context)
-    assert context.swept is not None
+    single_pass.count_in_one_pass(context)
+    assert set(context.prepared) == {"ingest", "histogram"}
     tags = 900 * 8192 if name == "tiff" else 0  # looking for the pages of frames as small as these
     assert size <= _bytes_read() - before < 1.1 * size + tags
     # the separate stages read all twice, so the count is a count
@@ -173,13 +173,13 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
 def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
     _npy(tmp_path, frames)
     context = make_context(tmp_path, "run.zarr", compute={"max_memory": 64})
-    single_pass.sweep_input(context)
-    assert context.swept is None
+    single_pass.count_in_one_pass(context)
+    assert not context.prepared
     # what the first block shows can be too much, too
-    room = dry_run.sweep_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
+    room = memory.single_pass_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
     monkeypatch.setattr(single_pass, "allowed_bytes", lambda config, workers: room)
-    single_pass.sweep_input(context)
-    assert context.swept is None
+    single_pass.count_in_one_pass(context)
+    assert not context.prepared
     run_both(context)
     np.testing.assert_array_equal(context.store.read("histogram/maximum"), frames.max(axis=0))
 
@@ -199,13 +199,13 @@ def test_a_stopped_or_killed_pass_leaves_nothing_half_done(tmp_path, frames, nam
 
     context.stop = Soon()
     with pytest.raises(InterruptedRunError):
-        single_pass.sweep_input(context)
-    assert context.swept is None
+        single_pass.count_in_one_pass(context)
+    assert not context.prepared
     assert context.store.has("histogram/counts")
     assert all(context.store.records.read(stage) is None for stage in ("ingest", "histogram"))
     again = make_context(tmp_path, "run.zarr")
-    single_pass.sweep_input(again)
-    assert again.swept is not None
+    single_pass.count_in_one_pass(again)
+    assert set(again.prepared) == {"ingest", "histogram"}
     run_both(again)
     np.testing.assert_array_equal(again.store.read("histogram/counts").sum(axis=2).max(), FRAMES)
 
@@ -222,8 +222,8 @@ def test_a_file_that_shrinks_meanwhile_is_said(tmp_path, frames, monkeypatch):
 
     monkeypatch.setattr(single_pass, "_create", shrink)
     with pytest.raises(InputError, match="became shorter"):
-        single_pass.sweep_input(context)
-    assert context.swept is None
+        single_pass.count_in_one_pass(context)
+    assert not context.prepared
 
 
 def test_a_known_input_is_left_to_the_stages(tmp_path, frames):
@@ -231,8 +231,8 @@ def test_a_known_input_is_left_to_the_stages(tmp_path, frames):
     context = make_context(tmp_path, "run.zarr")
     run_both(context)
     context.store.records.forget("histogram")
-    single_pass.sweep_input(context)
-    assert context.swept is None
+    single_pass.count_in_one_pass(context)
+    assert not context.prepared
 
 
 def test_rows_are_cut_at_whole_steps():
@@ -244,19 +244,6 @@ def test_rows_are_cut_at_whole_steps():
     assert all(a[1] == b[0] for a, b in pairwise(bands))
     assert all(y0 % 64 == 0 for y0, _ in bands)
     assert 8 <= len(bands) <= 12
-
-
-def test_a_broken_reader_is_heard():
-    def read(parts, t0, t1):
-        if t0 == 4:
-            raise OSError("gone")
-
-    sweep = Sweep(read, (10, 3, 3), np.dtype(np.uint8), [(0, 3)], 4)
-    assert sweep.n_blocks == 3
-    seen = []
-    with pytest.raises(OSError, match="gone"), sweep.blocks() as blocks:
-        seen.extend(t0 for t0, _ in blocks)
-    assert seen == [0]
 
 
 @pytest.fixture(autouse=True)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.stages.histogram.bands import bytes_per_row
-from pchem_pipeline.stages.histogram.dry_run import (
+from pchem_pipeline.stages.histogram.dry_run import make_plan
+from pchem_pipeline.stages.histogram.memory import (
     BASE_BYTES,
     allowed_bytes,
     band_bytes,
-    make_plan,
-    sweep_bytes,
+    bytes_per_row,
+    single_pass_bytes,
 )
 
 #: counts a run in a process of its own, and prints the memory that it took
@@ -72,8 +72,8 @@ def test_memory_is_what_was_said_whatever_the_number_of_frames(camera, limit):
         path = camera(n_frames, compute=compute)
         config = RunConfig.model_validate(json.loads(path.read_text()))
         plan = make_plan(config, path.parent)
-        assert plan.one_pass == (limit is None)
-        said = sweep_bytes(config, plan.shape, np.dtype(np.uint16), plan.bins)
+        assert plan.single_pass == (limit is None)
+        said = single_pass_bytes(config, plan.shape, np.dtype(np.uint16), plan.bins)
         peak, *states = _run(path)
         assert states == ["complete", "complete"]
         assert 0.5 * said < peak < 1.2 * (said if limit is None else limit << 20)
@@ -87,7 +87,7 @@ def test_the_plan_in_words(camera):
     path = camera(512, compute={"workers": 3, "max_memory": 2000})
     config = RunConfig.model_validate(json.loads(path.read_text()))
     plan = make_plan(config, path.parent)
-    assert (plan.shape, plan.tiles, plan.workers, plan.one_pass) == ((512, 256, 256), 16, 3, True)
+    assert (plan.shape, plan.tiles, plan.workers, plan.single_pass) == ((512, 256, 256), 16, 3, True)
     size = 512 * 256 * 256 * 2
     assert plan.input_bytes == pytest.approx(size, rel=1e-3)
     assert plan.read_bytes == pytest.approx(size * (1 + 250 / 512), rel=1e-3)

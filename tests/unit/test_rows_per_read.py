@@ -14,7 +14,7 @@ from astropy.io import fits
 
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.stages.electrons.tile_bands import tile_bands
+from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.store.tiles import tile_grid
 
 STACK = np.random.default_rng(8).integers(0, 4096, (6, 32, 48)).astype(np.uint16)

@@ -113,7 +113,7 @@ def test_second_process_finds_the_run_locked_and_a_killed_one_frees_it(store):
         pass
 
 
-def test_partial_files_of_a_killed_process_are_swept(store):
+def test_partial_files_of_a_killed_process_are_removed(store):
     orphan = store.path / "fit" / "c" / "x.partial"
     orphan.parent.mkdir(parents=True)
     orphan.write_bytes(b"half")

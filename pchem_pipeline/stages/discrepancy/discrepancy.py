@@ -23,10 +23,11 @@ from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.frames.stream import FrameSource
+from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.fit.added_exposure import write_added_exposure
-from pchem_pipeline.stages.histogram.frame_source import FrameSource, open_source
 from pchem_pipeline.store.files import write_atomic
 
 __all__ = ["Window", "choose_window", "run"]

@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
+from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.electrons.tile_bands import tile_bands
+from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
 from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_effects
-from pchem_pipeline.stages.histogram.frame_source import open_source, read_ahead
 
 if TYPE_CHECKING:
+    from pchem_pipeline.frames.stream import FrameSource
     from pchem_pipeline.model.maps.pixels import FloatArray
-    from pchem_pipeline.stages.histogram.bands import Band
-    from pchem_pipeline.stages.histogram.frame_source import FrameSource
+    from pchem_pipeline.stages.bands import Band
 
 __all__ = ["electrons_tile", "run"]
 
@@ -88,10 +89,8 @@ def _do_band(band: Band, *, store: Path, source: FrameSource, depth: int) -> dic
     effects = fitted_effects(opened)
     added = fitted_added_exposure(opened, effects, (rows, slice(None)))
     parameters = deciding_maps(maps, effects, added)
-    start = 0
-    for frames in read_ahead(source, (band.y0, band.y1), depth):
-        stop = start + frames.shape[0]
-        numbers = electrons_tile(frames, parameters)
-        opened.write("electrons/electron_number", (slice(start, stop), rows, slice(None)), numbers)
-        start = stop
+    with FrameStream(source, [(band.y0, band.y1)], depth) as stream:
+        for start, (frames,) in stream:
+            region = (slice(start, start + frames.shape[0]), rows, slice(None))
+            opened.write("electrons/electron_number", region, electrons_tile(frames, parameters))
     return {}

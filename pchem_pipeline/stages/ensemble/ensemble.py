@@ -23,18 +23,18 @@ from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_a
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.electrons.tile_bands import tile_bands
+from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.ensemble.result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble.tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
 from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
 from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_effects
-from pchem_pipeline.stages.histogram.frame_source import open_source
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.stages.histogram.bands import Band
-    from pchem_pipeline.stages.histogram.frame_source import FrameSource
+    from pchem_pipeline.frames.stream import FrameSource
+    from pchem_pipeline.stages.bands import Band
     from pchem_pipeline.store.tiles import Tile
 
 __all__ = ["ensemble_tile", "run"]

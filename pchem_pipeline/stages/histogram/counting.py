@@ -1,14 +1,21 @@
-"""Counting frames as they come: one object for some rows of the sensor, and its chunks in the store."""
+"""The counter of a stack: histograms and summaries of blocks of frames as they come, by bands of rows.
+
+One pass over the camera files, bands of rows that are read one after the other, and frames that are appended
+to a finished run differ in how they open the stream of blocks; they are counted by one `StackCounter`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -20,9 +27,10 @@ from pchem_pipeline.model.histogram.summaries import (
 from pchem_pipeline.run.stage import open_store
 
 if TYPE_CHECKING:
+    from pchem_pipeline.frames.stream import Block, Rows
     from pchem_pipeline.model.histogram.settings import HistogramSettings
 
-__all__ = ["AlongTime", "BandCounter", "Emit", "TileCounter"]
+__all__ = ["CountJob", "Emit", "StackCounter", "TileCounter"]
 
 _HISTOGRAMS = ("counts", "origin", "under", "over", "minimum", "maximum")
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
@@ -90,7 +98,7 @@ class TileCounter:
             self._emit(name, part)
 
 
-class AlongTime:
+class _AlongTime:
     """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
 
     def __init__(self, store: Path, name: str, rows: slice, done: int = 0) -> None:
@@ -132,33 +140,38 @@ class AlongTime:
             self._parts, self._held, self._written = [], 0, end
 
 
-class BandCounter:
-    """Histograms and summaries of some rows over the full width, written into a run."""
+@dataclass(frozen=True)
+class CountJob:
+    """What is counted, and into which run.
 
-    def __init__(
-        self,
-        store: Path,
-        rows: tuple[int, int],
-        shape: tuple[int, int, int],
-        bins: int,
-        settings: HistogramSettings,
-    ) -> None:
+    Attributes:
+        store: path of the run, which has the arrays.
+        shape: frames, rows and columns of the whole stack.
+        bins: bins of a pixel.
+        settings: the section ``histogram``.
+        copies: the frames go into ``frames/dn``, too.
+    """
+
+    store: Path
+    shape: tuple[int, int, int]
+    bins: int
+    settings: HistogramSettings
+    copies: bool = False
+
+
+class StackCounter:
+    """Counts the blocks of a stack, each band of rows apart, and copies the frames where that is asked."""
+
+    def __init__(self, job: CountJob, bands: Sequence[Rows], workers: int = 1) -> None:
         """Begin with no frames.
 
         Args:
-            store: path of the run, which has the arrays.
-            rows: first row and end of the rows, whole tiles and whole groups of rows.
-            shape: frames, rows and columns of the stack.
-            bins: bins of a pixel.
-            settings: the section ``histogram``.
+            job: what is counted.
+            bands: bands of rows as the blocks have them, whole tiles and whole groups of rows.
+            workers: threads that share the bands.
         """
-        y0, y1 = rows
-        self._store, self._rows = store, slice(y0, y1)
-        self._groups = slice(y0 // ROW_GROUP, -(-y1 // ROW_GROUP))
-        self._series: dict[str, AlongTime] = {}
-        self._done = dict.fromkeys(_ALONG_TIME, 0)
-        self._settings, self._shape = settings, shape
-        self._counter = TileCounter((y1 - y0, shape[2]), bins, shape[0], settings, self._emit)
+        self._job, self._bands, self._workers = job, bands, workers
+        self._counters = [_BandCounter(job, rows) for rows in bands]
 
     def resume(self, n_frames: int) -> None:
         """Go on behind the frames that the run has counted.
@@ -169,6 +182,55 @@ class BandCounter:
         Raises:
             StoreError: an array is missing or damaged.
         """
+        call_all([functools.partial(each.resume, n_frames) for each in self._counters], self._workers)
+
+    def count(self, blocks: Iterable[Block], check: Callable[[], None] = lambda: None) -> None:
+        """Count all blocks, and write what they give into the run.
+
+        Args:
+            blocks: in the order of time; the first of a stack decides the windows, so let it always have
+                the same number of frames.
+            check: called before each block; raises where the work shall end.
+
+        Raises:
+            InputError: DN of more than 24 bits, or the frames cannot be read.
+            StoreError: the store refuses.
+        """
+        for start, parts in blocks:
+            check()
+            tasks = [
+                functools.partial(counter.add, part)
+                for counter, part in zip(self._counters, parts, strict=True)
+            ]
+            if self._job.copies:
+                tasks += [
+                    functools.partial(self._copy, start, rows, part)
+                    for rows, part in zip(self._bands, parts, strict=True)
+                ]
+            call_all(tasks, self._workers)
+        call_all([counter.finish for counter in self._counters], self._workers)
+
+    def _copy(self, start: int, rows: Rows, part: NDArray[Any]) -> None:
+        """Write a band of a block of frames, whole chunks, into the store."""
+        region = (slice(start, start + part.shape[0]), slice(*rows), slice(None))
+        open_store(self._job.store).write("frames/dn", region, part)
+
+
+class _BandCounter:
+    """Histograms and summaries of some rows over the full width, written into a run."""
+
+    def __init__(self, job: CountJob, rows: Rows) -> None:
+        y0, y1 = rows
+        self._store, self._rows = job.store, slice(y0, y1)
+        self._groups = slice(y0 // ROW_GROUP, -(-y1 // ROW_GROUP))
+        self._series: dict[str, _AlongTime] = {}
+        self._done = dict.fromkeys(_ALONG_TIME, 0)
+        self._settings, self._shape = job.settings, job.shape
+        shape = (y1 - y0, job.shape[2])
+        self._counter = TileCounter(shape, job.bins, job.shape[0], job.settings, self._emit)
+
+    def resume(self, n_frames: int) -> None:
+        """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
         opened = open_store(self._store)
         held = RowHistograms(**{name: self._read(f"histogram/{name}") for name in _HISTOGRAMS})
         histograms = HistogramAccumulator.resumed(held, self._shape[0])
@@ -208,5 +270,5 @@ class BandCounter:
     def _emit(self, name: str, part: NDArray[Any]) -> None:
         if name not in self._series:
             rows = self._groups if name == "column_sum" else self._rows
-            self._series[name] = AlongTime(self._store, f"summary/{name}", rows, self._done[name])
+            self._series[name] = _AlongTime(self._store, f"summary/{name}", rows, self._done[name])
         self._series[name].add(part)

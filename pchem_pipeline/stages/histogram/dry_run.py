@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.compute.environment import available_memory, available_workers
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RangeAccumulator, choose_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
-from pchem_pipeline.stages.histogram.bands import bytes_per_row
-from pchem_pipeline.stages.ingest import chunk_shape
+from pchem_pipeline.stages.histogram.memory import (
+    BASE_BYTES,
+    allowed_bytes,
+    band_bytes,
+    single_pass_bytes,
+    worker_count,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,20 +28,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.frames.reader import FrameReader
 
-__all__ = [
-    "Plan",
-    "allowed_bytes",
-    "band_bytes",
-    "make_plan",
-    "plan_lines",
-    "sweep_bytes",
-    "sweep_rows",
-    "worker_count",
-]
+__all__ = ["Plan", "make_plan", "plan_lines"]
 
-#: the program with its libraries and compiled kernels
-BASE_BYTES = 240 << 20
-#: the same with what the later stages hold, and that for each pixel
+#: the program with what the later stages hold, and that for each pixel
 _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
 #: bytes in the store for each pixel: histograms, fit and maps; for each byte of the summaries along time
 _STORED_PIXEL, _STORED_SERIES = 420, 0.5
@@ -46,58 +39,6 @@ _COPY_RATIO = 1.77
 #: CPU seconds for each pixel of ensemble and report, and for what does not depend on them
 _REST_SECONDS, _REST_PIXEL_SECONDS = 6.0, 6e-5
 _FIT_SAMPLE = 256
-
-
-def worker_count(config: RunConfig) -> int:
-    """Return the workers on this machine that a configuration asks for."""
-    if config.compute.backend == "serial":
-        return 1
-    return available_workers() if config.compute.workers == "auto" else config.compute.workers
-
-
-def allowed_bytes(config: RunConfig, workers: int) -> int:
-    """Return the memory that the run may take, in all: the setting, else half of what is free."""
-    if config.compute.max_memory is not None:
-        return config.compute.max_memory << 20
-    bands = BASE_BYTES + workers * (config.histogram.band_memory << 20)
-    return max(bands, (available_memory() or 0) // 2)
-
-
-def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
-    """Return the memory of a worker that counts a band of rows.
-
-    Args:
-        config: of the run.
-        workers: number of workers.
-        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
-    """
-    bytes_each = config.histogram.band_memory << 20
-    if limit is not None:
-        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
-    if config.compute.max_memory is None:
-        return bytes_each
-    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
-
-
-def sweep_rows(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
-    """Return the rows that must stay together in a sweep: those of tiles, groups and chunks of the copy."""
-    step = max(config.run.tile, ROW_GROUP)
-    if config.input.mode == "copy":
-        step = math.lcm(step, chunk_shape(shape, dtype.itemsize)[1])
-    return step
-
-
-def sweep_bytes(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any], bins: int) -> int:
-    """Return the memory of the one pass over the input, the program included.
-
-    Args:
-        config: of the run.
-        shape: frames, rows, columns.
-        dtype: type of the samples.
-        bins: bins of a pixel.
-    """
-    n_frames, ny, nx = shape
-    return BASE_BYTES + ny * bytes_per_row(nx, n_frames, dtype.itemsize, bins, config.histogram)
 
 
 @dataclass(frozen=True)
@@ -110,7 +51,7 @@ class Plan:
         tiles: number of tiles.
         tile: rows and columns of one.
         workers: number of workers.
-        one_pass: the camera files are read once; else twice, by bands of rows.
+        single_pass: the camera files are read once; else twice, by bands of rows.
         input_bytes: of the camera files.
         read_bytes: of the camera files, in all.
         written_bytes: into the store, about.
@@ -124,7 +65,7 @@ class Plan:
     tiles: int
     tile: int
     workers: int
-    one_pass: bool
+    single_pass: bool
     input_bytes: int
     read_bytes: int
     written_bytes: int
@@ -135,7 +76,7 @@ class Plan:
     def words(self) -> list[str]:
         """Return the plan as ``--dry-run`` prints it."""
         n, ny, nx = self.shape
-        how = "once" if self.one_pass else "twice, by bands of rows (more compute.max_memory: once)"
+        how = "once" if self.single_pass else "twice, by bands of rows (more compute.max_memory: once)"
         return [
             f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tiles of {self.tile} x {self.tile}, "
             f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
@@ -175,14 +116,14 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     workers = worker_count(config)
     size = sum(file_size(path) for path in input_paths(config.input, base_dir))
     bins, reading, sample = _first_frames(config, frames)
-    whole = sweep_bytes(config, frames.shape, frames.dtype, bins)
+    whole = single_pass_bytes(config, frames.shape, frames.dtype, bins)
     allowed = allowed_bytes(config, workers)
-    one_pass = whole <= allowed and config.compute.backend != "distributed"
+    single_pass = whole <= allowed and config.compute.backend != "distributed"
     bands = BASE_BYTES + min(whole - BASE_BYTES, workers * band_bytes(config, workers))
     report = _REPORT_BYTES + _REPORT_PIXEL_BYTES * ny * nx
     first = min(config.histogram.window_frames, n) / n
     ensemble = n if config.ensemble.frames == "all" else min(config.ensemble.frames, n)
-    again = ensemble / n + (0 if one_pass else 1 + first)
+    again = ensemble / n + (0 if single_pass else 1 + first)
     copies = config.input.mode == "copy"
     counting, fitting = _speeds(config, sample, bins, n)
     samples = n * ny * nx
@@ -194,11 +135,11 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
         tiles=math.ceil(ny / config.run.tile) * math.ceil(nx / config.run.tile),
         tile=config.run.tile,
         workers=workers,
-        one_pass=one_pass,
+        single_pass=single_pass,
         input_bytes=size,
         read_bytes=round(size * (1 + (0 if copies else again))),
         written_bytes=_written(config, frames.shape, frames.dtype),
-        held_bytes=max(whole if one_pass else bands, report),
+        held_bytes=max(whole if single_pass else bands, report),
         allowed_bytes=allowed,
         seconds=seconds * (1.5 if copies else 1.0),
     )

@@ -2,6 +2,7 @@
 
 The unit of work is a band of rows over the full width: its frames are read once, by blocks, the next block
 being read while one is counted. How high the bands are depends on the memory allowed, the result does not.
+Where a single pass over the camera files has counted already, the tiles have but to be marked.
 """
 
 from __future__ import annotations
@@ -16,30 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import SerialExecutor
-from pchem_pipeline.model.histogram.count import (
-    RangeAccumulator,
-    RowHistograms,
-    choose_bins,
-    counts_dtype,
-)
-from pchem_pipeline.model.histogram.summaries import (
-    ROW_GROUP,
-    CovarianceMaps,
-    block_starts,
-    frame_statistics,
-)
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
+from pchem_pipeline.model.histogram.count import RangeAccumulator, RowHistograms, choose_bins
+from pchem_pipeline.model.histogram.summaries import CovarianceMaps, frame_statistics
+from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
-from pchem_pipeline.stages.histogram.bands import (
-    CHUNK_BLOCKS,
-    COLUMN_FRAMES,
-    Band,
-    bytes_per_row,
-    plan_bands,
-    row_frames,
-)
-from pchem_pipeline.stages.histogram.counting import BandCounter, Emit, TileCounter
-from pchem_pipeline.stages.histogram.dry_run import band_bytes
-from pchem_pipeline.stages.histogram.frame_source import FrameSource, open_source, read_ahead
+from pchem_pipeline.stages.bands import Band, plan_bands
+from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, row_frames
+from pchem_pipeline.stages.histogram.counting import CountJob, Emit, StackCounter, TileCounter
+from pchem_pipeline.stages.histogram.memory import band_bytes, bytes_per_row
 
 if TYPE_CHECKING:
     from pchem_pipeline.compute.executor import Outcome
@@ -49,8 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = ["histogram_tile", "run"]
 
-_MAPS = ("origin", "under", "over", "minimum", "maximum")
-_COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
 #: samples that one process looks through in a second or so
 _FEW_SAMPLES = 1 << 31
 
@@ -121,26 +105,20 @@ def run(context: StageContext) -> None:
     if context.sensor.kind == "histograms":
         _copy_histograms(context)
         return
-    if context.is_swept:
+    if context.is_prepared:
         context.run_units(context.tiles(), nothing_left)
         _end(context, context.tiles())
         return
     source = open_source(context)
-    settings = context.config.histogram
     if context.fresh or not context.store.has("histogram/counts"):
         bins = _decide_bins(context, source)
     else:
         bins = context.store.array("histogram/counts").shape[2]
     create_arrays(context, source.shape, bins)
     bands = _bands(context, source, bins)
-    task = functools.partial(
-        _do_band,
-        store=context.store.path,
-        source=source,
-        bins=bins,
-        settings=settings,
-        threads=max(1, context.executor.workers // max(1, len(context.pending(bands)))),
-    )
+    job = CountJob(context.store.path, source.shape, bins, context.config.histogram)
+    threads = max(1, context.executor.workers // max(1, len(context.pending(bands))))
+    task = functools.partial(_do_band, job=job, source=source, threads=threads)
     done = context.run_units(bands, task, unit_name="band")
     if len(done) == context.n_keys:
         _end(context, bands)
@@ -196,45 +174,11 @@ def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: i
     return ranges.finish(max_bins)
 
 
-def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
-    """Make the arrays of the stage for a stack of some shape (frames, rows, columns)."""
-    n_frames, ny, nx = shape
-    settings, tile = context.config.histogram, context.config.run.tile
-    context.create(
-        "histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
-    )
-    context.create_maps([f"histogram/{name}" for name in _MAPS])
-    if not settings.summaries:
-        context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
-        return
-    context.create_maps([f"summary/{name}" for name in _COVARIANCES])
-    for name, length in (("open_sums", 7), ("open_covariances", 3)):
-        context.create(f"summary/{name}", (length, ny, nx), chunks=(length, tile, tile))
-    starts = block_starts(n_frames, settings.block_frames)
-    rows = max(tile, ROW_GROUP)
-    for name in ("block_sum", "block_sum_square"):
-        context.create(f"summary/{name}", (starts.size, ny, nx), chunks=(CHUNK_BLOCKS, rows, nx))
-    for name in ("row_sum", "row_sum_square"):
-        context.create(f"summary/{name}", (n_frames, ny), chunks=(row_frames(ny), rows))
-    context.create(
-        "summary/column_sum",
-        (n_frames, -(-ny // ROW_GROUP), nx),
-        chunks=(COLUMN_FRAMES, rows // ROW_GROUP, nx),
-        rows=ROW_GROUP,
-    )
-    if context.fresh:
-        context.store.write_array("summary/block_start", starts, {"frames": n_frames})
-
-
-def _do_band(
-    band: Band, *, store: Path, source: FrameSource, bins: int, settings: HistogramSettings, threads: int
-) -> None:
+def _do_band(band: Band, *, job: CountJob, source: FrameSource, threads: int) -> None:
     """Count a band and write its chunks."""
-    rows = (band.y0, band.y1)
-    counter = BandCounter(store, rows, source.shape, bins, settings)
-    for frames in read_ahead(source, rows, settings.window_frames, threads):
-        counter.add(frames)
-    counter.finish()
+    rows = [(band.y0, band.y1)]
+    with FrameStream(source, rows, job.settings.window_frames, threads=threads) as stream:
+        StackCounter(job, rows).count(stream)
 
 
 def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
@@ -264,7 +208,7 @@ def _copy_histograms(context: StageContext) -> None:
     ny, nx, bins = given.counts.shape
     tile = context.config.run.tile
     context.create("histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=given.counts.dtype)
-    context.create_maps([f"histogram/{name}" for name in _MAPS])
+    context.create_maps([f"histogram/{name}" for name in MAPS])
     context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
     task = functools.partial(_copy_tile, store=context.store.path, given=given)
     context.run_units(context.tiles(), task)

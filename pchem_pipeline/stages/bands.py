@@ -1,4 +1,8 @@
-"""How the histogram stage cuts a sensor into bands of rows, and how it keeps arrays along time."""
+"""How stages that read frames cut the sensor into bands of rows.
+
+Camera files give whole rows cheaply and single tiles dearly: bands of a counted stack, bands of tiles to be
+done, and bands that the workers share while a stack streams by.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +10,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pchem_pipeline.model.histogram.count import counts_dtype
-from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.tiles import Tile
 
-__all__ = [
-    "CHUNK_BLOCKS",
-    "COLUMN_FRAMES",
-    "Band",
-    "bytes_per_row",
-    "plan_bands",
-    "row_frames",
-    "rows_together",
-]
+__all__ = ["Band", "cut_rows", "plan_bands", "rows_together", "tile_bands"]
 
-#: frames, or blocks, in a chunk of the arrays along time
-COLUMN_FRAMES = 1024
-_ROW_FRAMES = 4096
-CHUNK_BLOCKS = 8
-#: a chunk of row sums of all rows is read at once in the end: fewer frames on tall sensors
-_ROWS_AT_ONCE = 2048
+#: bands for each worker: enough to keep all busy to the end
+_BANDS_PER_WORKER = 4
 
 
 @dataclass(frozen=True)
@@ -47,19 +38,6 @@ class Band:
     def key(self) -> str:
         """What messages call it."""
         return f"rows {self.y0}-{self.y1 - 1}"
-
-
-def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:
-    """Return the memory that a worker needs for each row of its band."""
-    block = 2 * min(settings.window_frames, n_frames) * itemsize
-    pixel = block + bins * counts_dtype(n_frames).itemsize + 21 + 2 * itemsize
-    row = 0
-    if settings.summaries:
-        # sums, covariances and their temporaries; then what waits for its chunk along time to be whole
-        pixel += 170 + 2 * 2 * CHUNK_BLOCKS * 8
-        pixel += math.ceil(2 * min(COLUMN_FRAMES, n_frames) * 4 / ROW_GROUP)
-        row = 2 * 2 * min(_ROW_FRAMES, n_frames) * 8
-    return columns * pixel + row
 
 
 def plan_bands(
@@ -116,6 +94,54 @@ def rows_together(step: int, rows_per_read: int, ny: int, workers: int) -> int:
     return exact if exact * workers <= ny else step * math.ceil(rows / step)
 
 
-def row_frames(ny: int) -> int:
-    """Return the frames in a chunk of row sums."""
-    return max(_ROW_FRAMES // 16, _ROW_FRAMES // -(-ny // _ROWS_AT_ONCE))
+def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
+    """Cut ``ny`` rows into bands of multiples of ``step`` rows, a few for each worker.
+
+    Args:
+        ny: rows of the sensor.
+        step: rows that must stay together, from the top.
+        workers: number of workers.
+
+    Returns:
+        First row and end of each band, from top to bottom.
+    """
+    height = step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers))
+    return [(y, min(y + height, ny)) for y in range(0, ny, height)]
+
+
+def tile_bands(
+    context: StageContext, needs: str, most_rows: int, rows_per_read: int = 1
+) -> list[Band | Tile]:
+    """Return the units of a stage that reads frames again by bands.
+
+    A tile that is done, or that is not to be done, is in no band and stays a unit of its own.
+
+    Args:
+        context: of the stage.
+        needs: the stage whose tiles must be there; others are left as single tiles, which then fail.
+        most_rows: rows that a worker can hold; one row of tiles is the least.
+        rows_per_read: rows that come at no more cost than one.
+
+    Returns:
+        Bands of the tiles to be done, and all the other tiles.
+    """
+    tiles = context.tiles()
+    ready = context.tiles_done(needs)
+    todo = {tile.key for tile in context.pending(tiles)} & ready
+    step = tiles[0].y1
+    ny, workers = tiles[-1].y1, context.executor.workers
+    together = rows_together(step, rows_per_read, ny, workers)
+    # one worker that decodes once is faster than all of them that decode the same many times
+    if min(together, ny) <= most_rows and (together * workers <= ny or together > step * workers):
+        step = together
+    groups: dict[int, list[Tile]] = {}
+    for tile in tiles:
+        if tile.key in todo:
+            groups.setdefault(tile.y0 // step, []).append(tile)
+    bands: list[Band | Tile] = [_band(group) for group in groups.values()]
+    return bands + [tile for tile in tiles if tile.key not in todo]
+
+
+def _band(tiles: Sequence[Tile]) -> Band:
+    y0, y1 = min(tile.y0 for tile in tiles), max(tile.y1 for tile in tiles)
+    return Band(y0, y1, tuple(tile.key for tile in tiles))

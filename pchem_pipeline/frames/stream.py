@@ -1,0 +1,225 @@
+"""A stack of frames in the order of time, by blocks; the next one is read while one is used.
+
+A `HashedFrameStream` takes the hashes of the files from the same reading. Files in which whole frames lie
+plainly are read from their offsets into the buffers, and hashed there. Of files that have to be decoded, or
+of which only a region is wanted, the bytes are hashed a little ahead of the decoder, which then finds them in
+the memory of the operating system.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.compute.executor import call_all
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader
+from pchem_pipeline.frames.identity import FileHasher, file_size, identity_of_hashes
+from pchem_pipeline.frames.reader import FrameReader
+from pchem_pipeline.frames.sequence import FrameSequence
+
+__all__ = ["Block", "FrameSource", "FrameStream", "HashedFrameStream", "Rows"]
+
+#: bytes of decoded frames that a thread holds before they are cut into bands of rows
+_SCRATCH_BYTES = 8 << 20
+
+#: first row of a band, and its end
+Rows = tuple[int, int]
+
+#: first frame of a block, and the frames (frame, y, x) of each band
+Block = tuple[int, list[NDArray[Any]]]
+
+
+class FrameSource(Protocol):
+    """Frames that can be read by blocks of frames and bands of rows, from any thread or process."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the samples."""
+        ...
+
+    @property
+    def rows_per_read(self) -> int:
+        """Rows that are decoded together, and so come at no more cost than one."""
+        ...
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        """Fill ``buffer`` (frame, y, x) with frames t0..t1 and rows y0..y1, ends excluded."""
+        ...
+
+
+class FrameStream:
+    """The frames of a stack by blocks: to be opened with ``with``, and iterated once.
+
+    Attributes:
+        bands: first row and end of each band of a block.
+    """
+
+    def __init__(
+        self, source: FrameSource, bands: Sequence[Rows], step: int, *, first: int = 0, threads: int = 1
+    ) -> None:
+        """Take the memory, two blocks; nothing is read yet.
+
+        Args:
+            source: the frames.
+            bands: the rows that are wanted, by bands.
+            step: frames in a block; blocks end at multiples of it, the last one may be shorter.
+            first: frame to begin with.
+            threads: threads that share the reading of a block (coded files cost time to decode).
+        """
+        self.bands = bands
+        self._source, self._threads = source, threads
+        self._n_frames, _, columns = source.shape
+        self._step = min(step, self._n_frames)
+        self._first, self._skipped = first, first // self._step
+        self._buffers = [
+            [np.empty((self._step, y1 - y0, columns), source.dtype) for y0, y1 in bands] for _ in range(2)
+        ]
+        self._reader = ThreadPoolExecutor(1, thread_name_prefix="read")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._reader.shutdown()
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return -(-self._n_frames // self._step) - self._skipped
+
+    def __iter__(self) -> Iterator[Block]:
+        """Yield the blocks; each is overwritten after the next one was asked for."""
+        pending = self._request(0)
+        for number in range(self.n_blocks):
+            parts, reading = pending
+            reading.result()
+            if number + 1 < self.n_blocks:
+                pending = self._request(number + 1)
+            yield self._frames(number)[0], parts
+
+    def _request(self, number: int) -> tuple[list[NDArray[Any]], Future[None]]:
+        t0, t1 = self._frames(number)
+        parts = [band[: t1 - t0] for band in self._buffers[number % 2]]
+        return parts, self._reader.submit(self._fill, parts, t0, t1)
+
+    def _frames(self, number: int) -> tuple[int, int]:
+        """Return the first frame of a block, and its end."""
+        start = (number + self._skipped) * self._step
+        return max(start, self._first), min(start + self._step, self._n_frames)
+
+    def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
+        """Read frames t0..t1 into the parts, one for each band."""
+        cuts = np.linspace(0, t1 - t0, self._threads + 1).astype(int).tolist()
+        call_all(
+            [
+                functools.partial(self._source.read_into, part[a:b], t0 + a, t0 + b, *rows)
+                for a, b in itertools.pairwise(cuts)
+                if a < b
+                for rows, part in zip(self.bands, parts, strict=True)
+            ],
+            self._threads,
+        )
+
+
+class HashedFrameStream(FrameStream):
+    """The frames of camera files, all rows, from one reading of the bytes that also hashes them."""
+
+    def __init__(
+        self,
+        frames: FrameSequence,
+        bands: Sequence[Rows],
+        step: int,
+        *,
+        files: Sequence[Path],
+        first: int = 0,
+        threads: int = 1,
+        advance: Callable[[int], None] | None = None,
+    ) -> None:
+        """Take the memory; nothing is read yet.
+
+        Args:
+            frames: the stack.
+            bands: bands that cover all rows, from top to bottom.
+            step: see `FrameStream`.
+            files: all files that decide what is read, in reading order; among them those of the frames from
+                ``first`` on.
+            first: frame to begin with, the first one of a file.
+            threads: threads that decode, where there is something to decode.
+            advance: told of the number of bytes that were hashed.
+        """
+        super().__init__(frames, bands, step, first=first, threads=threads)
+        self._stack = frames
+        self._hashers = {path: FileHasher(path, advance) for path in files}
+        self._sizes: dict[Path, int] = {}
+
+    def identity(self) -> dict[str, Any]:
+        """Hash what is left of the files, and return their identity; see `content_identity`.
+
+        Raises:
+            InputError: a file vanished or cannot be read.
+        """
+        return identity_of_hashes({path: hasher.hexdigest() for path, hasher in self._hashers.items()})
+
+    def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
+        """Read the next frames, and hash the bytes of their files up to there.
+
+        Raises:
+            InputError: a file vanished, changed or cannot be read.
+        """
+        decode: list[tuple[int, int]] = []
+        for reader, first, end, offset in self._stack.pieces(t0, t1):
+            hasher = self._hashers[reader.paths[0]]
+            if self._is_plain(reader):
+                bands = [part[offset : offset + end - first] for part in parts]
+                assert isinstance(reader, ContiguousReader)
+                reader.scatter(bands, first, end, hasher)
+                for band in bands:
+                    self._stack.check_bits(reader, band)
+            else:
+                hasher.read_to(self._size(reader.paths[0]) * end // reader.shape[0])
+                decode.append((t0 + offset, t0 + offset + end - first))
+            if end == reader.shape[0]:
+                hasher.read_to()
+        self._decode(parts, t0, decode)
+
+    def _is_plain(self, reader: FrameReader) -> bool:
+        """Tell whether whole frames lie plainly in the file, one behind the other."""
+        if not (isinstance(reader, ContiguousReader) and self._stack.whole_frames):
+            return False
+        layout = reader.layout
+        return layout is not None and layout.in_order
+
+    def _size(self, path: Path) -> int:
+        if path not in self._sizes:
+            self._sizes[path] = file_size(path)
+        return self._sizes[path]
+
+    def _decode(self, parts: Sequence[NDArray[Any]], t0: int, ranges: Sequence[tuple[int, int]]) -> None:
+        """Decode ranges of frames, shared among the threads, each frame once."""
+        frame = int(np.prod(self._stack.shape[1:])) * self._stack.dtype.itemsize
+        step = max(1, _SCRATCH_BYTES // max(frame, 1))
+        cuts = [(a, min(a + step, end)) for start, end in ranges for a in range(start, end, step)]
+
+        def decode(a: int, b: int) -> None:
+            frames = self._stack.read(a, b)
+            row = 0
+            for part in parts:
+                part[a - t0 : b - t0] = frames[:, row : row + part.shape[1]]
+                row += part.shape[1]
+
+        call_all([functools.partial(decode, a, b) for a, b in cuts], self._threads)

@@ -1,0 +1,96 @@
+"""The memory that counting takes, and how much of it the run may have."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pchem_pipeline.compute.environment import available_memory, available_workers
+from pchem_pipeline.model.histogram.count import counts_dtype
+from pchem_pipeline.model.histogram.settings import HistogramSettings
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.stages.histogram.arrays import CHUNK_BLOCKS, COLUMN_FRAMES, ROW_FRAMES
+from pchem_pipeline.stages.ingest import chunk_shape
+
+if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
+
+__all__ = [
+    "BASE_BYTES",
+    "allowed_bytes",
+    "band_bytes",
+    "bytes_per_row",
+    "single_pass_bytes",
+    "single_pass_rows",
+    "worker_count",
+]
+
+#: the program with its libraries and compiled kernels
+BASE_BYTES = 240 << 20
+
+
+def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:
+    """Return the memory that a worker needs for each row of its band."""
+    block = 2 * min(settings.window_frames, n_frames) * itemsize
+    pixel = block + bins * counts_dtype(n_frames).itemsize + 21 + 2 * itemsize
+    row = 0
+    if settings.summaries:
+        # sums, covariances and their temporaries; then what waits for its chunk along time to be whole
+        pixel += 170 + 2 * 2 * CHUNK_BLOCKS * 8
+        pixel += math.ceil(2 * min(COLUMN_FRAMES, n_frames) * 4 / ROW_GROUP)
+        row = 2 * 2 * min(ROW_FRAMES, n_frames) * 8
+    return columns * pixel + row
+
+
+def worker_count(config: RunConfig) -> int:
+    """Return the workers on this machine that a configuration asks for."""
+    if config.compute.backend == "serial":
+        return 1
+    return available_workers() if config.compute.workers == "auto" else config.compute.workers
+
+
+def allowed_bytes(config: RunConfig, workers: int) -> int:
+    """Return the memory that the run may take, in all: the setting, else half of what is free."""
+    if config.compute.max_memory is not None:
+        return config.compute.max_memory << 20
+    bands = BASE_BYTES + workers * (config.histogram.band_memory << 20)
+    return max(bands, (available_memory() or 0) // 2)
+
+
+def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
+    """Return the memory of a worker that counts a band of rows.
+
+    Args:
+        config: of the run.
+        workers: number of workers.
+        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    """
+    bytes_each = config.histogram.band_memory << 20
+    if limit is not None:
+        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
+    if config.compute.max_memory is None:
+        return bytes_each
+    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+
+
+def single_pass_rows(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
+    """Return the rows that must stay together in a single pass: of tiles, groups, chunks of the copy."""
+    step = max(config.run.tile, ROW_GROUP)
+    if config.input.mode == "copy":
+        step = math.lcm(step, chunk_shape(shape, dtype.itemsize)[1])
+    return step
+
+
+def single_pass_bytes(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any], bins: int) -> int:
+    """Return the memory of a single pass over the input, the program included.
+
+    Args:
+        config: of the run.
+        shape: frames, rows, columns.
+        dtype: type of the samples.
+        bins: bins of a pixel.
+    """
+    n_frames, ny, nx = shape
+    return BASE_BYTES + ny * bytes_per_row(nx, n_frames, dtype.itemsize, bins, config.histogram)

@@ -1,0 +1,91 @@
+"""Blocks of frames as they stream by: every frame once, whatever the bands, the blocks and the threads."""
+
+from __future__ import annotations
+
+import threading
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pchem_pipeline.frames.stream import FrameStream
+
+
+class _Source:
+    def __init__(self, frames, broken_at=None):
+        self._frames, self.shape, self.dtype = frames, frames.shape, frames.dtype
+        self.rows_per_read = 1
+        self._broken_at = broken_at
+
+    def read_into(self, buffer, t0, t1, y0=0, y1=None):
+        if self._broken_at is not None and t0 >= self._broken_at:
+            raise OSError("gone")
+        buffer[...] = self._frames[t0:t1, y0:y1]
+
+
+FRAMES = np.arange(21 * 7 * 3, dtype=np.uint16).reshape(21, 7, 3)
+
+
+@given(
+    step=st.integers(1, 30),
+    first=st.integers(0, 20),
+    threads=st.integers(1, 4),
+    cuts=st.lists(st.integers(0, 7), min_size=2, unique=True).map(sorted),
+)
+def test_every_frame_of_every_band_comes_once(step, first, threads, cuts):
+    bands = list(pairwise(cuts))
+    with FrameStream(_Source(FRAMES), bands, step, first=first, threads=threads) as stream:
+        assert stream.bands == bands
+        blocks = [(t0, [part.copy() for part in parts]) for t0, parts in stream]
+        assert len(blocks) == stream.n_blocks
+    t = first
+    for t0, parts in blocks:
+        assert t0 == t
+        end = min(t0 - t0 % step + step, 21)  # blocks end at multiples of the step
+        for rows, part in zip(bands, parts, strict=True):
+            np.testing.assert_array_equal(part, FRAMES[t0:end, slice(*rows)])
+        t = end
+    assert t == 21
+
+
+def test_the_next_block_is_read_while_one_is_used():
+    reading = threading.Event()
+
+    class Told(_Source):
+        def read_into(self, buffer, t0, t1, y0=0, y1=None):
+            super().read_into(buffer, t0, t1, y0, y1)
+            if t0 == 4:
+                reading.set()
+
+    with FrameStream(Told(FRAMES), [(0, 7)], 4) as stream:
+        for t0, (part,) in stream:
+            if t0 == 0:
+                assert reading.wait(10)
+            np.testing.assert_array_equal(part, FRAMES[t0 : t0 + 4])  # not overwritten meanwhile
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_broken_reader_is_heard(threads):
+    seen = []
+    with (
+        pytest.raises(OSError, match="gone"),
+        FrameStream(_Source(FRAMES, broken_at=4), [(0, 3)], 4, threads=threads) as stream,
+    ):
+        seen.extend(t0 for t0, _ in stream)
+    assert seen == [0]
+
+
+def test_no_thread_outlives_the_stream():
+    class Slow(_Source):
+        def read_into(self, buffer, t0, t1, y0=0, y1=None):
+            time.sleep(0.02)
+            super().read_into(buffer, t0, t1, y0, y1)
+
+    before = threading.active_count()
+    with FrameStream(Slow(FRAMES), [(0, 7)], 2) as stream:
+        next(iter(stream))  # the block behind it is being read
+        assert threading.active_count() > before
+    assert threading.active_count() == before
