@@ -24,7 +24,7 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
-from pchem_pipeline.stages.ensemble.ensemble import ensemble as ensemble_stage
+from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 

@@ -7,13 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.model.histogram import count, count_numba
 from pchem_pipeline.model.histogram.count import (
     HistogramAccumulator,
     RangeAccumulator,
     RowHistograms,
     choose_bins,
-    count,
-    count_numba,
     counts_dtype,
     histogram_frames,
 )

@@ -19,9 +19,9 @@ from pchem_pipeline.report.pages import sections
 from pchem_pipeline.report.pages.answers import answers
 from pchem_pipeline.report.pages.sections import Section
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.report import inspector
 from pchem_pipeline.stages.report.inspected_pixels import choose_inspected
 from pchem_pipeline.stages.report.inspector import gather_inspector, listed_maps, map_entry
-from pchem_pipeline.stages.report.report import inspector
 from pchem_pipeline.store.run_store import RunStore
 
 SHAPE = (12, 16)

@@ -10,14 +10,11 @@ from scipy import special, stats
 from small_stacks import small_stack
 
 from pchem_pipeline.base.errors import InputError, PchEmError
+from pchem_pipeline.discrepancy.observe import law_numba, scores_numba, sums_numba, tables_numba
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import (
-    law_numba,
     observe,
     observe_histograms,
-    scores_numba,
-    sums_numba,
-    tables_numba,
 )
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence

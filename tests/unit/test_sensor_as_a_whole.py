@@ -14,7 +14,7 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
-from pchem_pipeline.stages.fit.fit import together
+from pchem_pipeline.stages.fit import together
 from pchem_pipeline.store.run_store import RunStore
 
 WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.histogram.count import summaries, summaries_numba
+from pchem_pipeline.model.histogram import summaries, summaries_numba
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
     BlockSums,
