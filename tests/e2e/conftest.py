@@ -4,7 +4,7 @@ import os
 import shutil
 
 import pytest
-from commands import RUN, Shell
+from helpers.commands import RUN, Shell
 
 CAMERA = """
 run: {store: truth.zarr, tile: 8}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
-from commands import RUN
+from helpers.commands import RUN
 
 from pchem_pipeline.store.run_store import RunStore
 

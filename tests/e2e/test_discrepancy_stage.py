@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import Shell
+from helpers.commands import Shell
 
 CAMERA = """
 # the camera of the north bench

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from inspector_material import make_run
+from helpers.inspector_material import make_run
 
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.commands.view import make_server

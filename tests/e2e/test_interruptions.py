@@ -6,8 +6,8 @@ import subprocess
 import time
 
 import pytest
-from commands import RUN, assert_same_results
 from filelock import FileLock
+from helpers.commands import RUN, assert_same_results
 
 UNTIL = ("--until", "ensemble")  # a report is drawn once, in a test of its own
 

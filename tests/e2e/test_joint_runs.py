@@ -4,11 +4,11 @@ import json
 import os
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Shell
+from helpers.commands import Shell
+from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.commands.joint import find_joint, run_joint
@@ -48,7 +48,7 @@ def joint(tmp_path_factory, kernels):
         camera(folder, f"dark_{time:g}s", 10 + seed, time)
     camera(folder, "bias", 20, 0.001, dead=1.0)
     shell = Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
-    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
     [command] = re.findall(r"```shell\n(pchem joint .*)\n```", readme)
     result = shell.ok(*command.split()[1:])
     assert result.stdout.strip() == str(folder.resolve() / "dark.zarr" / "report.html")

@@ -2,16 +2,16 @@
 
 import json
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Shell
+from helpers.commands import Shell
+from helpers.places import SIPM
 
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.store.run_store import RunStore
 
-SPECTRA = sorted((Path(__file__).parents[1] / "data" / "sipm").glob("*.csv"))
+SPECTRA = sorted(SIPM.glob("*.csv"))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 import pytest
-from commands import Shell
+from helpers.commands import Shell
 
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.store.run_store import RunStore

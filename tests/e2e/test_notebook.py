@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.places import ROOT
 
 import pchem_pipeline
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
 from pchem_pipeline.report.style.style import figure_bytes
 from pchem_pipeline.store.run_store import RunStore
 
-TUTORIAL = Path(__file__).parents[2] / "notebooks" / "tutorial.ipynb"
+TUTORIAL = ROOT / "notebooks" / "tutorial.ipynb"
 
 
 @pytest.fixture(scope="module")

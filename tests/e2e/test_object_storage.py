@@ -12,8 +12,8 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-from commands import RUN, arrays_of
 from filelock import FileLock
+from helpers.commands import RUN, arrays_of
 
 from pchem_pipeline.store.remote_path import lock_folder, place_of
 

@@ -6,12 +6,11 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
-from commands import Shell
+from helpers.commands import Shell
+from helpers.places import TESTS
 
-TESTS = Path(__file__).resolve().parents[1]
 RUN = """
 run: {store: run.zarr}
 input: {files: [stack/frames.npy], integration_time: 1.0}

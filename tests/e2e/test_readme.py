@@ -6,9 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from helpers.places import ROOT
+
 from pchem_pipeline.stages.table import pipeline
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from commands import RUN, arrays_of, assert_same_results
+from helpers.commands import RUN, arrays_of, assert_same_results
 
 from pchem_pipeline.store.run_store import RunStore
 

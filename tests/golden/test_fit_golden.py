@@ -5,9 +5,9 @@ from __future__ import annotations
 import mpmath
 import numpy as np
 import pytest
-from drawn_pixels import draw, samples
+from helpers.drawn_pixels import draw, samples
+from helpers.reference_pchem import Theta, log_likelihood
 from iminuit import Minuit
-from reference_pchem import Theta, log_likelihood
 from scipy.special import gammaln
 
 from pchem_pipeline.model.fit.pchem import fit_histograms

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from drawn_pixels import draw
+from helpers.drawn_pixels import draw
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from charge_material import a_sensor, evidence_of
+from helpers.charge_material import a_sensor, evidence_of
 
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
 from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sensor_of_modes import drawn_truth, every_third_block, seen, taken
+from helpers.sensor_of_modes import drawn_truth, every_third_block, seen, taken
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
 from pchem_pipeline.effects.adc.adc_inl import AdcInl

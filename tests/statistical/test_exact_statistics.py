@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn_pixels import draw
+from helpers.drawn_pixels import draw
 
 from pchem_pipeline.model.fit.exact import refine, rounding_bias
 from pchem_pipeline.model.fit.pchem import fit_histograms

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from joint_material import draw_series
+from helpers.joint_material import draw_series
 
 from pchem_pipeline.model.errors.fisher import cramer_rao
 from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao

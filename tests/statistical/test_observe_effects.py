@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_stacks import small_stack
+from helpers.small_stacks import small_stack
 
 from pchem_pipeline.discrepancy.observe.observe import observe
 

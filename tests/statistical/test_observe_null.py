@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_stacks import small_stack
+from helpers.small_stacks import small_stack
 
 from pchem_pipeline.discrepancy.observe import laws, observe
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS

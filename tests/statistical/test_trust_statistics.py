@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drawn_pixels import Drawn, draw
+from helpers.drawn_pixels import Drawn, draw
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 from scipy.stats import binom, kstest

@@ -1,0 +1,83 @@
+"""A small run with a report, written array by array: no stage is run and no kernel compiled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from helpers.report_material import draw_dn, report_data
+
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.report import render_report
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Picture
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.report.inspector import gather_inspector
+from pchem_pipeline.store.run_store import RunStore
+
+
+def write_run(folder: Path, data: ReportData, *, n_frames: int = 400) -> RunStore:
+    """Write what the inspector reads of a run whose fit is that of ``data``."""
+    store = RunStore.create(folder / "run.zarr")
+    store.write_config(dump_config(RunConfig.model_validate({"input": {"files": ["frames/*.tif"]}})))
+    ny, nx = data.shape
+    identity = {"files": [], "digest": ""}
+    SensorInfo("frames", n_frames, ny, nx, "uint16", 14, None, "copy", identity).write(store)
+    for name, values in data.maps.items():
+        store.write_array(f"maps/{name}", values)
+    store.write_array("fit/fit_status", data.fit["fit_status"])
+    store.write_array("fit/goodness_p", data.fit["goodness_p"])
+    dn, _ = draw_dn(dict(data.truth), n_frames, seed=5)
+    origin = dn.min(axis=0)
+    counts = np.zeros((ny, nx, int((dn - origin).max()) + 1), np.uint16)
+    y, x = np.mgrid[:ny, :nx]
+    for frame in dn - origin:
+        counts[y, x, frame] += 1
+    store.create_array("histogram/counts", counts.shape, chunks=(32, 32, counts.shape[2]), dtype=np.uint16)
+    store.write("histogram/counts", (slice(None),) * 3, counts)
+    store.write_array("histogram/origin", origin.astype(np.int32))
+    return store
+
+
+def inspected(store: RunStore, data: ReportData) -> ReportData:
+    """Return the same report with its inspector."""
+    shown = [(0, 0)]
+    return replace(
+        data,
+        inspector=gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, shown),
+        pixels=data.pixels[:1],
+    )
+
+
+def page_without_pictures(data: ReportData) -> str:
+    """Return the page with a dot for every figure: fast."""
+
+    def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> Picture:
+        return Picture(exhibit, "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", "", 10, 10)
+
+    before = report_module.draw_picture
+    report_module.draw_picture = dot  # type: ignore[assignment]
+    try:
+        return render_report(data, ReportSettings(figure_formats=())).html
+    finally:
+        report_module.draw_picture = before
+
+
+def make_run(
+    folder: Path,
+    shape: tuple[int, int] = (70, 90),
+    *,
+    failed: float = 0.02,
+    n_frames: int = 400,
+    **changes: object,
+) -> RunStore:
+    """Write a run of a simulated sensor with its report."""
+    data = replace(report_data(shape, failed=failed), **changes)  # type: ignore[arg-type]
+    store = write_run(folder, data, n_frames=n_frames)
+    store.write_file("report.html", page_without_pictures(inspected(store, data)).encode())
+    return store

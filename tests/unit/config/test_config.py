@@ -1,0 +1,80 @@
+import pytest
+import yaml
+from helpers.places import ROOT
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.config.load import dump_config, load_config, parse_config, setting_of
+from pchem_pipeline.config.template import commented_config
+
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_template_is_the_defaults_and_explains_every_setting(simulated):
+    text = commented_config("c.yaml", files=["a.tif"], simulated=simulated)
+    short = "run: {store: c.zarr}\ninput: {files: [a.tif]}\n"
+    short += "simulate: {output: c-frames}\n" if simulated else ""
+    assert parse_config(text) == parse_config(short)
+    keys = [line for line in text.splitlines() if ":" in line and not line.lstrip().startswith("#")]
+    comments = [line for line in text.splitlines() if line.lstrip().startswith("#")]
+    assert len(comments) >= len(keys) > 30
+
+
+def test_the_resolved_yaml_reads_back_the_same():
+    config = parse_config("input: {files: [a.tif], roi: [0, 8, 0, 8]}\nsimulate: {seed: 7}\n")
+    assert parse_config(dump_config(config)) == config
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
+def test_shipped_configs_are_valid(path):
+    load_config(path)
+
+
+def test_there_are_shipped_configs():
+    assert {path.name for path in CONFIGS} >= {"demo.yaml", "paper_dark.yaml"}
+
+
+def test_simulated_input_is_what_is_simulated():
+    config = parse_config("simulate: {output: cam, format: fits, bit_depth: 12, integration_time: 2.5}")
+    assert config.input.files == ("cam",)
+    assert (config.input.format, config.input.bit_depth, config.input.integration_time) == ("fits", 12, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("input: {files: [a]}\nfit: {algoritm: em}", "fit.algoritm: unknown key; did you mean algorithm?"),
+        ("input: {files: [a], integration_time: .nan}", "input.integration_time"),
+        ("input: {files: [a], integration_time: 0}", "input.integration_time: .*greater than 0"),
+        ("input: {files: [a], integration_time: -1}", "input.integration_time"),
+        ("input: {files: [a]}\nrun: {tile: 50}", "run.tile"),
+        ("input: {files: [a]}\ninput: {files: [b]}", "'input' is given twice"),
+        ("input: {files: [a]", "not valid YAML"),
+        ("- a", "holds no settings"),
+        ("", "holds no settings"),
+        ("run: {tile: 64}", "nothing to read"),
+        ("input: {files: [a]}\nrun: !!python/object/apply:os.system [ls]", "not valid YAML"),
+        ("simulate: {shape: [0, 4]}", "simulate"),
+        ("simulate: {n_frames: many}", "simulate.n_frames"),
+    ],
+)
+def test_wrong_settings_say_what_and_where(text, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse_config(text, "c.yaml")
+    assert str(caught.value).startswith("c.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_undecodable_files(tmp_path):
+    with pytest.raises(ConfigError, match="pchem init"):
+        load_config(tmp_path / "none.yaml")
+    (tmp_path / "bad.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path / "bad.yaml")
+
+
+def test_settings_are_read_by_dotted_name():
+    config = parse_config("input: {files: [a], roi: [0, 8, 0, 9]}")
+    assert setting_of(config, "input.roi") == [0, 8, 0, 9]
+    assert setting_of(config, "run.tile") == 64
+    assert yaml.safe_dump(setting_of(config, "fit"))

@@ -1,0 +1,120 @@
+"""The study of the discrepancy workflow counts what it should, and its beginnings are balanced."""
+
+import sys
+from collections import Counter
+
+import pytest
+from helpers.places import ROOT
+
+sys.path.append(str(ROOT / "scripts" / "bench"))
+
+from bench_discrepancy import read_results
+from discrepancy_cases import EFFECTS, OUTSIDE, UNTESTABLE, Plan, remaining
+from discrepancy_figures import Answer, print_figures, wilson
+from hidden import chain
+
+SHAPE = (64, 64, 4000)
+
+
+def record(hidden, verdict, *steps, kind="single", level=4.0, **more):
+    """A record: each step is a name, or a set of names that could not be told apart."""
+    gap = {"after": 1e-7, "before": 1e-4, "floor": 1e-6, "closed_fraction": 0.999}
+    told = [
+        {
+            "effect": step if isinstance(step, str) else None,
+            "candidates": [{"effect": tag} for tag in ([step, "other"] if isinstance(step, str) else step)],
+            "placebo": {"effect": "frame_noise", "gap_after": 9e-5},
+            "runner_up": None,
+            "gap_before": 1e-4,
+            "gap_after": 1e-7,
+            "gap_floor": 1e-6,
+        }
+        for step in steps
+    ]
+    names = [step for step in steps if isinstance(step, str)]
+    return {
+        "case": {"kind": kind, "level": level, "hidden": list(hidden), "key": f"{kind}{hidden}{steps}"},
+        "verdict": {"verdict": verdict, "effects": names, "steps": told, "gap": gap, "replicates": 90},
+        "error": None,
+        "cpu_seconds": 40.0,
+    } | more
+
+
+@pytest.mark.parametrize(
+    ("hidden", "verdict", "steps", "word"),
+    [
+        (["row_noise"], "named", ["row_noise"], "alone"),
+        (["row_noise"], "named", ["row_noise", "adc_inl"], "wrong"),
+        (["row_noise"], "named", ["adc_inl"], "wrong"),
+        (["row_noise"], "ambiguous", [["adc_inl", "row_noise"]], "in set"),
+        (["row_noise"], "ambiguous", ["row_noise", ["adc_inl", "clipping"]], "in set"),
+        (["row_noise"], "ambiguous", [["adc_inl", "clipping"]], "other set"),
+        (["row_noise"], "ambiguous", [["a", "b", "c", "row_noise"]], "other set"),
+        # the steps of an unexplained stack are nobody's names
+        (["row_noise"], "unexplained", [["row_noise", "adc_inl"]], "unexplained"),
+        (["row_noise"], "consistent", [], "consistent"),
+        (["row_noise", "clipping"], "named", ["row_noise"], "part"),
+        (["row_noise", "clipping"], "named", ["clipping", "row_noise"], "alone"),
+        (["row_noise", "clipping"], "ambiguous", ["row_noise", ["clipping", "adc_dnl"]], "in set"),
+        ([], "consistent", [], "consistent"),
+        ([], "named", ["row_noise"], "wrong"),
+    ],
+)
+def test_an_answer_lands_in_its_column(hidden, verdict, steps, word):
+    assert Answer(record(hidden, verdict, *steps)).word == word
+
+
+def test_figures_count_and_compare_with_their_targets(capsys):
+    good = [record(["row_noise"], "named", "row_noise") for _ in range(9)]
+    bias = {"before": -3.0, "after": 0.2, "chance": 0.05, "pixels": 4096}
+    good[0]["bias"] = dict.fromkeys(("quanta_exposure", "conversion_gain", "bias", "read_noise_e"), bias)
+    wrong = record(["row_noise"], "named", "adc_inl")
+    failed = record(["row_noise"], "error", error="ValueError: broken")
+    null = record([], "consistent", kind="null", level=0.0)
+    print_figures([*good, wrong, failed, null])
+    lines = capsys.readouterr().out.splitlines()
+
+    def line(text):
+        return next(line for line in lines if text in line)
+
+    assert "9/11 " in line("4 s95: named alone")
+    assert "MISSED" in line("4 s95: named alone")
+    assert "1/11 " in line("4 s95: a wrong name")
+    assert "0/1 " in line("nothing hidden: any name  ")
+    assert "1/1 " in line("all, bias: beyond one s.e.")
+    assert "reached" in line("a placebo closes a quarter")
+    assert any("failed x1: ValueError: broken" in text for text in lines)
+
+
+def test_the_interval_of_a_fraction():
+    # Wilson 1927: 0 of 10 and 5 of 10
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-3)
+    assert wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-3)
+
+
+def test_every_beginning_of_the_study_is_balanced():
+    cases = Plan(EFFECTS, (4.0, 1.5), 10, 0, 200, 40, 10, 2, 4, SHAPE).cases()
+    assert len({case.key for case in cases}) == len({case.seed for case in cases}) == len(cases)
+    whole = Counter((case.kind, case.level) for case in cases)
+    for share in (0.1, 0.3, 0.7):
+        some = Counter((case.kind, case.level) for case in cases[: round(share * len(cases))])
+        for group, n in whole.items():
+            assert abs(some[group] - share * n) <= 1.5
+    single = [c.hidden for c in cases if c.kind == "single" and c.level == 4.0]
+    assert len(set(single[: len(EFFECTS)])) == len(EFFECTS)
+    assert {case.exclude for case in cases if case.kind == "left_out"} == {(tag,) for tag in EFFECTS}
+    assert len(remaining(cases, [case.key for case in cases[:50]])) == len(cases) - 50
+
+
+def test_the_study_knows_the_effects_of_the_hidden_chain():
+    assert set(EFFECTS) == set(chain.LIBRARY)
+    assert set(UNTESTABLE) == set(chain.UNTESTABLE)
+    assert set(OUTSIDE) == set(chain.OUTSIDE)
+
+
+def test_a_result_cut_off_by_an_interruption_is_done_again(tmp_path, capsys):
+    path = tmp_path / "results.jsonl"
+    assert read_results(path) == []
+    path.write_text('{"case": {"key": "a"}}\n{"case": {"ke')
+    assert read_results(path) == [{"case": {"key": "a"}}]
+    assert "incomplete" in capsys.readouterr().err

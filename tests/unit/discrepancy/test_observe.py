@@ -1,0 +1,352 @@
+"""From a stack to its evidence: the kernels against plain numpy, and input that is hard to digest."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.small_stacks import small_stack
+from scipy import special, stats
+
+from pchem_pipeline.base.errors import InputError, PchEmError
+from pchem_pipeline.discrepancy.observe import law_numba, scores_numba, sums_numba, tables_numba
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.observe import (
+    observe,
+    observe_histograms,
+)
+from pchem_pipeline.discrepancy.observe.sums import blocks_of
+from pchem_pipeline.effects.framework.evidence import SCORES, Evidence
+from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.pcd import pcd_mass
+
+H, STEP, BIAS, WIDTH = 1.7, 9.0, 40.3, 2.4
+
+
+def _law(width: float = WIDTH) -> np.ndarray:
+    first, last = law_numba.electron_range(H, np.log(1e-12))
+    law = np.empty((int(BIAS + last * STEP + 8 * width) + 1, law_numba.N_COLUMNS))
+    law_numba.fill_law(H, STEP, BIAS, width, first, last, law)
+    return law
+
+
+def _numbers(n: int, block: int) -> np.ndarray:
+    """Every other block of frames."""
+    return np.concatenate([np.arange(start, start + block) for start in range(0, 2 * n, 2 * block)])
+
+
+@pytest.mark.parametrize("width", [2.4, 0.9], ids=["series", "error function"])
+def test_law_holds_the_polynomials_integrated_over_cells(width: float) -> None:
+    law = _law(width)
+    k = np.arange(30)
+    weight = stats.poisson.pmf(k, H)
+    d = k - H
+    charlier = [
+        np.ones_like(d),
+        d / np.sqrt(H),
+        (d**2 - k) / (np.sqrt(2) * H),
+        (d**3 - 3 * k * d + 2 * k) / (6**0.5 * H**1.5),
+    ]
+    node, size = np.polynomial.legendre.leggauss(20)
+    for code in (35, 40, 45, 53, 60, 75):
+        z = (code + 0.5 * node[:, None] - BIAS - k * STEP) / width
+        density = stats.norm.pdf(z) * 0.5 * size[:, None] / width
+        for column, (a, b) in enumerate(law_numba.COLUMNS):
+            expected = np.sum(weight * charlier[b] * density * special.eval_hermitenorm(a, z))
+            assert law[code, column] == pytest.approx(expected, rel=1e-6, abs=1e-6 * law[code, 0])
+    np.testing.assert_allclose(
+        law[20:120, 0], pcd_mass(np.arange(20, 120), H, 1 / STEP, BIAS, width / STEP), atol=1e-11
+    )
+    assert law[:, 0].sum() == pytest.approx(1.0, abs=1e-10)
+
+
+def test_scores_are_orthogonal_to_the_parameters_and_know_their_variance() -> None:
+    law = _law()[26:120].copy()
+    mass = law[:, 0].copy()
+    raw = law.copy()
+    gram = np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
+    assert scores_numba.whiten(law, 1 / mass, gram)
+    products = law.T @ (law / mass[:, None])
+    n = law_numba.N_NUISANCE
+    np.testing.assert_allclose(products[:n, :n], np.eye(n), atol=1e-9)
+    np.testing.assert_allclose(products[:n, n:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(raw[:, :n], law[:, :n] @ gram[:, :n], atol=1e-12)
+    # samples in exact proportion to the mass score nothing but the bias of a fit; doubling He3 shows
+    out = np.empty((3, law_numba.N_TESTS))
+    seen = 1e4 * mass
+    scores_numba.pixel_scores(law, 1 / mass, seen, gram, H, out)
+    still = out[0].copy()
+    assert np.abs(still).max() < 0.2
+    tilt = 1 + 0.05 * law[:, n + 2] / mass
+    scores_numba.pixel_scores(law, 1 / mass, seen * tilt, gram, H, out)
+    variance = products[n + 2, n + 2]
+    assert out[0, 2] - still[2] == pytest.approx(0.05 * np.sqrt(1e4 * variance), rel=1e-3)
+
+
+def test_bias_of_the_scores_is_that_of_fitted_samples() -> None:
+    # the second-order expectation against its definition by finite differences of the law
+    gram = np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
+    law = _law()[:150].copy()
+    mass = law[:, 0].copy()
+    keep = mass > 1e-12
+    law, mass = law[keep], mass[keep]
+    codes = np.arange(150)[keep]
+    assert scores_numba.whiten(law, 1 / mass, gram)
+    n = law_numba.N_NUISANCE
+    theta = np.array([H, STEP, BIAS, WIDTH])
+
+    def mass_at(shift: np.ndarray) -> np.ndarray:
+        h, step, bias, width = theta + shift
+        return pcd_mass(codes, h, 1 / step, bias, width / step)
+
+    e = np.diag([1e-3, 1e-2, 1e-2, 1e-2])
+    slope = np.array([(mass_at(d) - mass_at(-d)) / (2 * d.sum()) for d in e])
+    covariance = np.linalg.inv(slope @ (slope / mass).T)
+    expected = np.zeros(law_numba.N_TESTS)
+    for i in range(4):
+        for j in range(4):
+            step2 = mass_at(e[i] + e[j]) - mass_at(e[i] - e[j]) - mass_at(e[j] - e[i]) + mass_at(-e[i] - e[j])
+            curvature = step2 / (4 * e[i].sum() * e[j].sum())
+            expected -= 0.5 * covariance[i, j] * (law[:, n:] / mass[:, None]).T @ curvature
+    out = np.empty((3, law_numba.N_TESTS))
+    samples = 1e4
+    scores_numba.pixel_scores(law, 1 / mass, samples * mass, gram, H, out)
+    variance = np.sum(law[:, n:] ** 2 / mass[:, None], axis=0)
+    bias = -out[0] * np.sqrt(samples * variance)
+    np.testing.assert_allclose(bias, expected, rtol=0.02, atol=0.02 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0.5
+
+
+def _tables(frames: np.ndarray, evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return k and r of every sample by brute force, centred, and the support of the pixels."""
+    n = frames.shape[0]
+    k_of, r_of = np.zeros(frames.shape), np.zeros(frames.shape)
+    maps = evidence.maps
+    electrons = np.arange(60)
+    for y, x in np.argwhere(maps.usable):
+        h, g, mu = maps.quanta_exposure[y, x], maps.conversion_gain[y, x], maps.bias[y, x]
+        s = np.sqrt(maps.read_noise_dn[y, x] ** 2 - 1 / 12)
+        codes = np.arange(400)[:, None]
+        mean = mu + electrons / g
+        joint = stats.poisson.pmf(electrons, h) * (
+            stats.norm.cdf(codes + 0.5, mean, s) - stats.norm.cdf(codes - 0.5, mean, s)
+        )
+        total = joint.sum(axis=1)
+        below, above = np.cumsum(total), np.cumsum(total[::-1])[::-1]
+        low, high = np.argmax(n * below >= 0.01), 399 - np.argmax((n * above >= 0.01)[::-1])
+        at = np.clip(frames[:, y, x].astype(int), low, high)
+        k = (joint @ electrons)[at] / total[at]
+        r = at - mu - k / g
+        k_of[:, y, x], r_of[:, y, x] = k - k.mean(), r - r.mean()
+        model = total / total.sum()
+        kt = (joint @ electrons) / np.maximum(total, 1e-300)
+        variance = np.sum(model * kt**2) - np.sum(model * kt) ** 2
+        # the support ends where a hundredth of a sample is left
+        assert evidence.charge_std[y, x] == pytest.approx(np.sqrt(variance), rel=1e-2)
+    return k_of, r_of, maps.usable, np.where(maps.usable, maps.quanta_exposure, 0.0)
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A stack of 5 x 6 pixels and 60 frames; one pixel is stuck, one excluded, one frame repeated."""
+    frames = small_stack((5, 6), 60, 5, analog_read_noise_e={"kind": "constant", "value": 0.2})
+    frames[:, 1, 2] = 77
+    frames[31] = frames[30]
+    frames[50, 3] = frames[49, 3]
+    exclude = np.zeros((5, 6), np.bool_)
+    exclude[4, 5] = True
+    return frames, _numbers(60, 12), exclude
+
+
+def test_sums_are_those_of_plain_numpy(small: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    frames, numbers, exclude = small
+    evidence = observe(frames, numbers, n_run=120, block_frames=12, exclude=exclude)
+    k, r, usable, h = _tables(frames, evidence)
+    assert usable.sum() >= 20
+    assert not usable[1, 2]
+    assert not usable[4, 5]
+    time = evidence.time
+    assert time is not None
+    tight = {"rtol": 1e-3, "atol": 2e-5}
+    np.testing.assert_allclose(time.frame_charge, k.sum(axis=(1, 2)) / h.sum(), **tight)
+    np.testing.assert_allclose(time.frame_readout, r.sum(axis=(1, 2)) / usable.sum(), **tight)
+    np.testing.assert_allclose(time.row_charge, k.sum(axis=2) / usable.sum(axis=1), **tight)
+    np.testing.assert_allclose(time.column_readout, r.sum(axis=1) / usable.sum(axis=0), **tight)
+    np.testing.assert_allclose(
+        time.quadrant_readout[:, 1], r[:, :2, 3:].sum(axis=(1, 2)) / usable[:2, 3:].sum(), **tight
+    )
+    np.testing.assert_allclose(
+        time.quadrant_charge[:, 2], k[:, 2:, :3].sum(axis=(1, 2)) / h[2:, :3].sum(), **tight
+    )
+    edges = blocks_of(numbers, 12)
+    assert edges.tolist() == [0, 12, 24, 36, 48, 60]
+    assert time.block_start.tolist() == [0, 24, 48, 72, 96]
+    np.testing.assert_allclose(time.block_readout[2][usable], r[24:36].mean(axis=0)[usable], **tight)
+    assert np.isnan(time.block_readout[:, ~usable]).all()
+    # products are of what the common mode leaves
+    k1 = k - time.frame_charge[:, None, None] * h
+    r1 = r - time.frame_readout[:, None, None] * usable
+    t = np.concatenate([np.arange(a + 1, b) for a, b in pairwise(edges)])
+    assert time.n_pairs == t.size
+    n_pairs = t.size
+    vk, vr = k.var(axis=0), r.var(axis=0)
+    share_k, share_r = h / h.sum(), usable / usable.sum()
+    vk1 = vk * (1 - 2 * share_k) + share_k**2 * vk.sum()
+    vr1 = vr * (1 - 2 * share_r) + share_r**2 * vr.sum()
+    lag = (k1[t] * k1[t - 1]).sum(axis=0) / n_pairs
+    np.testing.assert_allclose(time.lag_charge[0][usable], (lag[usable] / vk1[usable]) + 1 / 59, **tight)
+    both = np.sqrt(vk1 * vr1)
+    cross = (r1[t] * k1[t - 1]).sum(axis=0) / n_pairs + (k * r).mean(axis=0) / 59
+    np.testing.assert_allclose(time.lag_readout_charge[usable], cross[usable] / both[usable], **tight)
+    t3 = np.concatenate([np.arange(a + 3, b) for a, b in pairwise(edges)])
+    lag3 = (r1[t3] * r1[t3 - 3]).sum(axis=0) / t3.size
+    np.testing.assert_allclose(time.lag_readout[2][usable], (lag3[usable] / vr1[usable]) + 1 / 59, **tight)
+    # neighbours along y: what the removal of the mean does to pairs is taken out
+    pairs = usable[:-1] & usable[1:]
+    product = (r1[:, :-1] * r1[:, 1:]).mean(axis=0)
+    removed = share_r[0, 0] ** 2 * vr.sum() - share_r[0, 0] * (vr[:-1] + vr[1:])
+    expected = ((product - removed) / np.sqrt(vr1[:-1] * vr1[1:], where=pairs, out=np.ones(pairs.shape)))[
+        pairs
+    ]
+    assert time.neighbours["y.rr"] == pytest.approx(expected.mean(), abs=2e-5)
+    assert time.neighbour_pairs["y.rr"] == 60 * pairs.sum()
+    assert evidence.z["space.y.rr"] == pytest.approx(expected.sum() * np.sqrt(60 / pairs.sum()), abs=1e-2)
+    mixed = (r1[:, :, :-1] * k1[:, :, 1:] + k1[:, :, :-1] * r1[:, :, 1:]).mean(axis=0)
+    near = usable[:, :-1] & usable[:, 1:]
+    root = np.sqrt(vr1[:, :-1] * vk1[:, 1:]) + np.sqrt(vk1[:, :-1] * vr1[:, 1:])
+    # the frames are few: the correction is small beside what is summed
+    assert time.neighbours["x.rk"] == pytest.approx((mixed[near] / root[near]).mean(), abs=0.01)
+    assert time.repeated.tolist() == [numbers[31]]
+    assert time.repeated_rows == 1
+    assert evidence.z["frame.repeated"] == 10.0
+
+
+def test_gain_of_a_frame_is_the_slope_of_the_residual() -> None:
+    frames = small_stack((12, 12), 400, 8)
+    numbers = np.arange(400)
+    plain = observe(frames, numbers, n_run=400, block_frames=20)
+    assert plain.time is not None
+    k, r, usable, h = _tables(frames, plain)
+    k, r, h, g = k[:, usable], r[:, usable], h[usable], plain.maps.conversion_gain[usable]
+    weight = 1 / r.var(axis=0)
+    pattern = h / g - (h / g * weight).sum() / weight.sum()
+    top = (r * weight * (k / g + pattern)).sum(axis=1) - (weight * (k * r).mean(axis=0) / g).sum()
+    bottom = (weight * (k.var(axis=0) / g**2 + pattern**2)).sum()
+    np.testing.assert_allclose(plain.time.frame_gain, top / bottom, atol=2e-4)
+
+
+def test_loops_are_the_same_uncompiled() -> None:
+    frames = small_stack((2, 3), 40, 3)
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(6, -1)
+    parameters = np.tile([1.5, 11.0, 100.0, 3.0], (6, 1))
+    n_bins, n_codes, first = 20, 320, 60
+    results = []
+    for summarise in (tables_numba.summarise_pixels, tables_numba.summarise_pixels.py_func):
+        arrays = [
+            np.zeros((6, tables_numba.N_MOMENTS)), np.zeros((6, 3, 8)), np.array([True] * 5 + [False]),
+            np.zeros((6, 3), np.int64), np.zeros((1500, 2), np.float32), np.zeros((4, n_codes)), np.zeros(16),
+            np.zeros((16, 16)), np.zeros((3, n_bins)), np.zeros((n_bins, n_bins)),
+        ]  # fmt: skip
+        summarise(
+            counts, histograms.origin.ravel().astype(np.int64), np.zeros((6, 2)), parameters,
+            np.tile([0, 9], (6, 1)), np.tile([75, 230], (6, 1)), first, 16,
+            1e-2, 1e-3, *arrays,
+        )  # fmt: skip
+        results.append(arrays)
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
+    assert results[0][0][:5, tables_numba.CHI2_MEAN].min() > 0
+
+    support = np.array([[[90, 90, 90], [130, 130, 130], [0, 41, 82]]] * 2, np.int32)
+    tables = np.random.default_rng(1).normal(size=(123, 2)).astype(np.float32)
+    modes, weights = (
+        np.array([[[one] * 3] * 2, [[two] * 3] * 2], np.float32) for one, two in ((1.5, 1.0), (0.3, 0.1))
+    )
+    results = []
+    for sum_block in (sums_numba.sum_block, sums_numba.sum_block.py_func):
+        arrays = [
+            np.zeros((7, 2, 3), np.float32), np.zeros((7, 2, 3), np.float32), np.zeros((4, 10, 2)),
+            np.zeros((10, 2, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)), np.zeros((8, 2, 3)),
+            np.zeros((3, 2, 3)), np.zeros((3, 2, 3)),
+        ]  # fmt: skip
+        sum_block(frames[:10], support, tables, modes, weights, np.array([9.0, 6.0]), *arrays)
+        results.append(arrays)
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_names_come_in_the_order_of_the_catalogue_and_all_are_there() -> None:
+    frames = small_stack((12, 12), 300, 1)
+    evidence = observe(frames, np.arange(300), n_run=300, block_frames=20)
+    assert list(evidence.z) == list(STATISTICS)
+    assert np.isfinite(list(evidence.z.values())).all()
+    assert tuple(evidence.scores) == SCORES
+    again = observe(frames, np.arange(300), n_run=300, block_frames=20)
+    assert dict(again.z) == dict(evidence.z)
+
+
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1)], ids=["one row", "one column"])
+def test_a_line_of_pixels_has_no_neighbours_across(shape: tuple[int, int]) -> None:
+    frames = small_stack(shape, 200, 4)
+    z = observe(frames, np.arange(200), n_run=200, block_frames=20).z
+    across, along = ("row", "x") if shape[0] == 1 else ("column", "y")
+    assert not [name for name in z if name.startswith(f"space.{across}.")]
+    assert {name.split(".")[1] for name in z if len(name.split(".")) == 3 and name.startswith("space.")} == {
+        along
+    }
+    assert np.isfinite(list(z.values())).all()
+
+
+def test_a_third_of_the_pixels_unfit_breaks_nothing() -> None:
+    frames = small_stack((12, 12), 240, 2)
+    frames[:, ::3] = 0
+    frames[:, 1::6, ::2] = np.random.default_rng(1).integers(0, 2, frames[:, 1::6, ::2].shape) * 9000
+    evidence = observe(frames, np.arange(240), n_run=240, block_frames=20)
+    share = evidence.maps.usable.mean()
+    assert 0.3 < share < 0.7
+    assert np.isfinite(list(evidence.z.values())).all()
+    assert max(abs(z) for z in evidence.z.values()) < 6
+    unfit = ~evidence.maps.usable
+    assert np.isnan(evidence.maps.bias[unfit]).all()
+    assert np.isnan(evidence.scores["He4"][unfit]).all()
+    assert np.isfinite(evidence.scores["He4"][~unfit]).all()
+
+
+def test_samples_far_above_are_listed() -> None:
+    frames = small_stack((8, 8), 200, 6)
+    frames[17, 3, 4:6] = 2000
+    frames[90, 0, 0] = 1500
+    numbers = np.arange(1000, 1200)
+    evidence = observe(frames, numbers, n_run=1200, block_frames=20)
+    assert evidence.time is not None
+    hits = evidence.time.hits[evidence.time.hits[:, 3] >= 1500]
+    assert hits.tolist() == [[1017, 3, 4, 2000], [1017, 3, 5, 2000], [1090, 0, 0, 1500]]
+    assert evidence.z["tail.high.clusters"] > 3
+    assert evidence.z["tail.high.count"] > 3
+
+
+def test_histograms_alone_give_the_same_marginal_statistics() -> None:
+    frames = small_stack((10, 10), 300, 1)
+    histograms = histogram_frames(frames)
+    full = observe(frames, np.arange(300), n_run=300, block_frames=20)
+    alone = observe_histograms(histograms.counts.reshape(100, -1), histograms.origin.ravel())
+    assert alone.time is None
+    assert alone.maps.bias.shape == (1, 100)
+    for name, value in alone.z.items():
+        assert full.z[name] == value
+    assert {name.split(".")[0] for name in alone.z} == {"shape", "code", "tail"}
+    assert set(full.z) - set(alone.z) >= {"tail.high.clusters", "time.lag1.charge.mean"}
+
+
+def test_what_cannot_be_observed_says_why() -> None:
+    frames = small_stack((4, 4), 100, 1)
+    with pytest.raises(InputError, match="fewer than 4 blocks of 30"):
+        observe(frames, np.arange(100), n_run=100, block_frames=30)
+    with pytest.raises(InputError, match="one number for each"):
+        observe(frames, np.arange(99), n_run=100, block_frames=10)
+    with pytest.raises(InputError, match="unsigned"):
+        observe(frames.astype(np.int32), np.arange(100), n_run=100, block_frames=10)  # type: ignore[arg-type]
+    with pytest.raises(PchEmError, match="none of the 16 pixels"):
+        observe(np.full_like(frames, 90), np.arange(100), n_run=100, block_frames=10)

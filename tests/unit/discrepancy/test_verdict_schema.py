@@ -1,0 +1,102 @@
+"""``discrepancy.json``: written and read back the same, older ones read, damaged and later ones refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.discrepancy_material import UNTESTABLE, VERDICTS, result, verdict_of
+
+from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.discrepancy.verdict import SCHEMA_VERSION, Place, Verdict, parameters_of, read_verdict
+from pchem_pipeline.effects.framework.registry import effect_class
+
+OPTIONAL = {"schema_version", "set_aside"}
+OPTIONAL_OF_STEP = {"gap_interval_after", "families", "runner_up", "placebo", "moved", "separate", "pulls"}
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_what_is_written_is_read_back(verdict: str) -> None:
+    found = verdict_of(verdict)
+    text = found.to_json()
+    assert json.loads(text)["schema_version"] == SCHEMA_VERSION == found.schema_version
+    assert "NaN" not in text
+    assert Verdict.from_json(text).to_json() == text
+    again = json.loads(text)
+    for key, value in result(verdict).items():
+        if key not in ("steps", "gap", "where", "unexplained", "p_global"):
+            assert again[key] == value, key
+
+
+def test_numbers_that_are_not_known_are_null_in_the_file() -> None:
+    gap = {**result("named")["gap"], "floor": math.nan, "after": math.inf}
+    content = json.loads(verdict_of("named", gap=gap).to_json())
+    assert content["gap"]["floor"] is None
+    assert content["gap"]["after"] is None
+    assert math.isnan(Verdict.from_json(json.dumps(content)).gap.floor)
+
+
+def test_a_verdict_of_the_first_schema_is_read() -> None:
+    old = result("unexplained")
+    del old["schema_version"]
+    old |= {"schema": 1, "untestable": list(UNTESTABLE), "untestable_reasons": UNTESTABLE}
+    for place in old["where"]:
+        place["dn"] = place["dn"] or []
+    assert Verdict.from_json(json.dumps(old)).to_json() == verdict_of("unexplained").to_json()
+
+
+def test_a_verdict_of_a_later_schema_is_refused_with_the_cure() -> None:
+    later = json.dumps({**result("named"), "schema_version": SCHEMA_VERSION + 1, "new": 1})
+    with pytest.raises(StoreError, match=r"run.zarr holds a verdict of schema \d, .*--force"):
+        Verdict.from_json(later, "run.zarr")
+
+
+@pytest.mark.parametrize("text", ["[1, 2", "[]", "3", "{}", '{"verdict": null}', '{"schema": "x"}'])
+def test_what_is_no_verdict_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(StoreError, match="run pchem discrepancy with --force") as caught:
+        Verdict.from_json(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_key_is_optional_or_missed_by_name() -> None:
+    whole = result("named")
+    spoiled: list[tuple[str, bool, dict[str, Any]]] = [
+        (key, key in OPTIONAL, {k: v for k, v in whole.items() if k != key}) for key in whole
+    ]
+    for key in whole["steps"][0]:
+        steps = [{k: v for k, v in step.items() if k != key} for step in whole["steps"]]
+        spoiled.append((f"steps.0.{key}", key in OPTIONAL_OF_STEP, {**whole, "steps": steps}))
+    spoiled.append(("verdict", False, {**whole, "verdict": "unheard of"}))
+    spoiled.append(("odd", False, {**whole, "odd": 1}))
+    spoiled.append(("gap.before", False, {**whole, "gap": {**whole["gap"], "before": "x"}}))
+    for key, optional, content in spoiled:
+        if optional:
+            assert Verdict.from_json(json.dumps(content)).effects == ("row_noise", "bias_drift")
+        else:
+            with pytest.raises(StoreError, match=rf"damaged \({key}: "):
+                Verdict.from_json(json.dumps(content))
+
+
+def test_a_run_without_a_verdict_has_none(tmp_path: Path) -> None:
+    assert read_verdict(tmp_path) is None
+    (tmp_path / "discrepancy.json").write_bytes(b"\xff\xfe")
+    with pytest.raises(StoreError, match=r"discrepancy.json is damaged"):
+        read_verdict(tmp_path)
+
+
+def test_a_place_takes_its_words_from_the_catalogue() -> None:
+    place = Place.of("code.alternating", z=-3.0, dn=(148, 152))
+    assert (place.direction, place.channel, place.dn) == ("-", "digital", (148, 152))
+    assert "opposite signs" in place.sentence
+    assert Place.of("code.smooth", z=1.0, sentence="other").sentence == "other"
+
+
+def test_only_the_strength_has_a_standard_error() -> None:
+    effect = effect_class("row_noise").model_validate({"row_noise_dn": 0.35})
+    found = parameters_of(effect, 0.004)
+    assert found["row_noise_dn"].model_dump() == {"value": 0.35, "stderr": 0.004, "unit": "DN"}
+    others = [measured for name, measured in found.items() if name != "row_noise_dn"]
+    assert all(math.isnan(measured.stderr) for measured in others)

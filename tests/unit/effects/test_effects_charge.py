@@ -1,0 +1,376 @@
+"""Effects of the light and the charge: forward models against theory, at every tiling, and neutral at zero.
+
+Limits are five standard errors from theory; each test also shows that what it guards against is many more.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.charge_material import a_sensor, electrons, exposures, simulated
+from pydantic import ValidationError
+from scipy import stats
+
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
+from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
+from pchem_pipeline.effects.charge.charge_lag import ChargeLag
+from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
+from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
+from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
+from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
+from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
+from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform
+from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
+from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
+from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
+from pchem_pipeline.effects.exposure.persistence import Persistence
+from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+CLASSES = (
+    ExposureDrift,
+    Persistence,
+    DarkCurrentRts,
+    ExposureFlicker,
+    OverdispersedCounts,
+    BranchingCounts,
+    OpticalCrosstalk,
+    CosmicRays,
+    ChargeLag,
+    ChargeDiffusion,
+    SpuriousCharge,
+)
+KINDS = [
+    *(effect for cls in CLASSES for effect in cls.typical()),
+    ExposureDrift(drift=0.5, path=(0.0, 3.0, 1.0)),
+    Persistence(peak_e=1.0, decay_frames=9.0, slow_decay_frames=50.0, image=((1.0, 0.0), (0.5, 0.2))),
+    DarkCurrentRts(fraction=0.4, steps="exponential", dwell_low_frames=3.0, dwell_high_frames=2.0),
+    CosmicRays(tracks_per_frame=0.7),
+    OverdispersedCounts(relative_variance=0.3),
+    BranchingCounts(branching=0.3),
+]
+
+
+@pytest.mark.parametrize("effect", KINDS, ids=repr)
+def test_no_strength_is_no_effect_to_the_bit(effect):
+    truth = a_sensor((7, 9))
+    with_it, plain = (simulated(truth, *e, n_frames=30) for e in ((effect.scaled(0.0),), ()))
+    assert np.array_equal(with_it[0], plain[0])
+    assert np.array_equal(with_it[1], plain[1])
+
+
+@pytest.mark.parametrize("effect", KINDS, ids=repr)
+def test_every_tiling_gives_the_same_frames(effect):
+    truth = a_sensor((8, 7))
+    effects = (effect, OpticalCrosstalk(probability=0.2), ChargeLag(fraction=0.2))
+    whole = simulated(truth, *effects, n_frames=40)
+    for frames, rows in (((0, 17), (0, 8)), ((17, 40), (0, 3)), ((5, 6), (2, 8)), ((39, 40), (7, 8))):
+        part = simulated(truth, *effects, n_frames=40, frames=frames, rows=rows)
+        for a, b in zip(part, whole, strict=True):
+            assert np.array_equal(a, b[slice(*frames), slice(*rows)])
+
+
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
+def test_each_says_what_is_known_of_it(cls):
+    tags = effect_classes().keys()
+    assert cls.title
+    assert cls.source
+    assert cls.strength in cls.model_fields
+    assert all(name in STATISTICS for name in cls.signature)
+    assert bool(cls.untestable) == (cls in (ChargeLag, ChargeDiffusion, SpuriousCharge))
+    assert bool(cls.signature) != bool(cls.untestable)
+    assert set(cls.separate) <= tags - {cls.model_fields["tag"].default}
+    assert bool(cls.separate) != bool(cls.untestable)
+    assert all(getattr(effect, cls.strength) != 0 for effect in cls.typical())
+
+
+# -- laws of the electron number ---------------------------------------------------------------------
+
+
+def goodness(k, mass):
+    """Return chi-square against a mass as a standard normal number, classes below 20 samples joined."""
+    seen = np.bincount(k.ravel(), minlength=mass.size)[: mass.size].astype(float)
+    wanted = mass * k.size
+    enough = wanted > 20
+    seen = np.append(seen[enough], k.size - seen[enough].sum())
+    wanted = np.append(wanted[enough], k.size - wanted[enough].sum())
+    chi2 = np.sum((seen - wanted) ** 2 / np.maximum(wanted, 20.0))
+    return (chi2 - enough.sum()) / np.sqrt(2.0 * enough.sum())
+
+
+def borel_mass(h, branching, n=60):
+    k = np.arange(n)
+    q = h * (1 - branching)
+    return np.exp(
+        np.log(q)
+        + (k - 1) * np.log(q + branching * k)
+        - q
+        - branching * k
+        - [np.sum(np.log(np.arange(1, i + 1))) for i in k]
+    )
+
+
+@pytest.mark.parametrize("h", [0.4, 3.0])
+@pytest.mark.parametrize("strength", [0.02, 0.4])
+def test_overdispersed_counts_are_negative_binomial(h, strength):
+    k = electrons(h, (40, 40), 500, OverdispersedCounts(relative_variance=strength))
+    mass = stats.nbinom.pmf(np.arange(60), 1 / strength, 1 / (1 + strength * h))
+    assert abs(goodness(k, mass)) < 5
+    if strength * h > 0.05:
+        assert goodness(electrons(h, (40, 40), 500), mass) > 20
+    if strength * h > 1:
+        # nor is it the other law of the same variance
+        assert goodness(k, borel_mass(h, 1 - (1 + strength * h) ** -0.5)) > 20
+
+
+@pytest.mark.parametrize("h", [0.4, 3.0])
+@pytest.mark.parametrize("strength", [0.02, 0.4])
+def test_branching_counts_are_generalised_poisson_of_the_same_mean(h, strength):
+    k = electrons(h, (40, 40), 500, BranchingCounts(branching=strength))
+    assert abs(goodness(k, borel_mass(h, strength))) < 5
+    assert abs(k.mean() - h) < 5 * np.sqrt(h / (1 - strength) ** 2 / k.size)
+    if strength > 0.1:
+        assert goodness(electrons(h, (40, 40), 500), borel_mass(h, strength)) > 20
+
+
+def test_overdispersed_counts_follow_an_exposure_that_changes():
+    drift = ExposureDrift(drift=1.6)
+    truth = a_sensor((30, 30), exposure=(2.0, 2.0))
+    k = simulated(truth, drift, OverdispersedCounts(relative_variance=0.3), n_frames=400)[1].astype(float)
+    h = exposures(drift, truth.quanta_exposure, 400)[:, 0, 0]
+    wanted = h + 0.3 * h**2
+    # the fourth cumulant of these laws stays below ten variances
+    error = wanted * np.sqrt((2 + 10 / wanted) / 900)
+    assert np.all(abs(k.var(axis=(1, 2)) - wanted) < 5 * error)
+    assert abs(k.var(axis=(1, 2)) - h - 0.3 * 4.0).max() > 20 * error.min()
+
+
+@pytest.mark.parametrize("cls", [OverdispersedCounts, BranchingCounts, OpticalCrosstalk])
+def test_small_strengths_change_few_samples_and_larger_ones_change_these_too(cls):
+    truth = a_sensor((20, 20))
+    plain, small, large = (
+        simulated(truth, *(() if s == 0 else (cls(**{cls.strength: s}),)), n_frames=300)[1].astype(int)
+        for s in (0, 0.002, 0.004)
+    )
+    mean = truth.quanta_exposure.mean()
+    changed = small != plain
+    bound = 0.002 * max(np.mean(truth.quanta_exposure**2), 2 * mean)
+    assert 0 < changed.mean() < bound + 5 * np.sqrt(bound / changed.size)
+    assert (large != plain)[changed].mean() > 0.99
+
+
+def test_crosstalk_correlates_neighbours_and_adds_its_electrons():
+    p, h = 0.1, 2.0
+    k = electrons(h, (60, 60), 600, OpticalCrosstalk(probability=p))[:, 1:-1, 1:-1].astype(float)
+    mean = h * (1 + p)
+    assert abs(k.mean() - mean) < 5 * np.sqrt(mean * (1 + 2 * p) / k.size)
+    # a Poisson count it stays
+    assert abs(goodness(k.astype(int), stats.poisson.pmf(np.arange(40), mean))) < 5
+    d = k - mean
+    pairs = {
+        "x": ((d[:, :, 1:] * d[:, :, :-1]), p / 2 * h),
+        "y": ((d[:, 1:] * d[:, :-1]), p / 2 * h),
+        "two apart": ((d[:, 2:] * d[:, :-2]), 0.0),
+    }
+    for products, wanted in pairs.values():
+        error = mean * (1 + 2 * p) / np.sqrt(products.size)
+        assert abs(products.mean() - wanted) < 5 * error
+    assert p / 2 * h > 20 * error
+
+
+@pytest.mark.parametrize(
+    ("effect", "mean"),
+    [(ChargeLag(fraction=0.3), 2.0), (ChargeDiffusion(fraction=0.3), 2.0), (SpuriousCharge(mean_e=0.3), 2.3)],
+)
+def test_what_cannot_be_seen_leaves_independent_poisson_electrons(effect, mean):
+    k = electrons(2.0, (50, 50), 400, effect)[1:]
+    assert abs(goodness(k, stats.poisson.pmf(np.arange(40), mean))) < 5
+    d = k - mean
+    error = mean / np.sqrt(d.size)
+    for a, b in (
+        (d[1:], d[:-1]),
+        (d[:, 1:], d[:, :-1]),
+        (d[:, :, 1:], d[:, :, :-1]),
+        (d[1:, 1:], d[:-1, :-1]),
+    ):
+        assert abs((a * b).mean()) < 5 * error
+    # it did something, and its opposite number, electrons made rather than moved, would be found
+    assert (k != electrons(2.0, (50, 50), 400)[1:]).mean() > 0.2
+    crosstalk = electrons(2.0, (50, 50), 400, OpticalCrosstalk(probability=0.3)) - 2.6
+    assert (crosstalk[:, 1:] * crosstalk[:, :-1]).mean() > 20 * error
+
+
+def test_lag_takes_electrons_from_one_frame_to_the_next():
+    truth = a_sensor((6, 6))
+    truth = dataclasses.replace(truth, quanta_exposure=np.full((6, 6), 30.0))
+    step = ExposureDrift(drift=2.0, path=(0.0, 0.0, 2.0, 2.0))
+    k = simulated(truth, step, ChargeLag(fraction=0.5), n_frames=4)[1].mean(axis=(1, 2))
+    plain = simulated(truth, step, n_frames=4)[1].mean(axis=(1, 2))
+    wanted = np.append([0.5 * plain[0]], 0.5 * (plain[1:] + plain[:-1]))
+    assert np.all(abs(k - wanted)[1:] < 5 * np.sqrt(30 / 36))
+    assert abs(k - plain)[2] > 10
+
+
+def test_diffusion_moves_electrons_and_loses_none():
+    truth = a_sensor((9, 9), exposure=(0.0, 0.0))
+    h = np.zeros((9, 9))
+    h[4, 4], h[0, 0] = 1000.0, 1000.0
+    truth = dataclasses.replace(truth, quanta_exposure=h)
+    plain, moved = (
+        simulated(truth, *e, n_frames=50)[1].astype(float) for e in ((), (ChargeDiffusion(fraction=0.2),))
+    )
+    assert np.array_equal(plain.sum(axis=(1, 2)), moved.sum(axis=(1, 2)))
+    mean = moved.mean(axis=0)
+    for place, wanted in (
+        ((4, 4), 800),
+        ((3, 4), 50),
+        ((4, 5), 50),
+        ((0, 0), 900),
+        ((0, 1), 50),
+        ((3, 3), 0),
+    ):
+        assert abs(mean[place] - wanted) <= 5 * np.sqrt(wanted / 50)
+
+
+def test_tracks_come_at_their_rate_and_leave_their_electrons():
+    effect = CosmicRays(tracks_per_frame=0.4, length_um=6.0, electrons_per_um=50.0, pixel_pitch_um=3.0)
+    n = 2000
+    total = _electrons(effect, (50, 50), 0, n).sum(axis=(1, 2))
+    hit = total > 0
+    rate = 1 - np.exp(-0.4)
+    assert abs(hit.mean() - rate) < 5 * np.sqrt(rate * (1 - rate) / n) + 0.01
+    # an exponential length has E[l^2] = 2 E[l]^2; a track that crosses the edge loses half at the most
+    mean, edge = 0.4 * 6.0 * 50.0, 4 * 2.0 / 50 / np.pi
+    error = np.sqrt(0.4 * (2 * 300.0**2 + 300.0) / n)
+    assert abs(total.mean() - mean * (1 - edge)) < 5 * error + mean * edge
+    # the pixels of the first track touch each other
+    k = _electrons(CosmicRays(tracks_per_frame=0.01, length_um=60.0), (60, 60), 0, 400)
+    y, x = np.nonzero(k[np.flatnonzero(k.sum(axis=(1, 2)))[0]])
+    assert y.size > 3
+    steps = abs(y[:, None] - y) + abs(x[:, None] - x) + 99 * np.eye(y.size)
+    assert steps.min(axis=1).max() <= 2
+
+
+def _electrons(effect, shape, first, last):
+    truth = dataclasses.replace(a_sensor(shape), quanta_exposure=np.zeros(shape))
+    return simulated(truth, effect, n_frames=last, frames=(first, last))[1]
+
+
+# -- place in the fit --------------------------------------------------------------------------------
+
+
+def test_exposures_of_a_run_are_a_mixture_with_its_moments():
+    factors = 1.0 + 0.8 * np.random.default_rng(3).beta(0.5, 2.0, 1000)
+    factors /= factors.mean()
+    weights, nodes = exposure_nodes(factors)
+    for power in range(6):
+        assert weights @ nodes**power == pytest.approx(np.mean(factors**power), rel=1e-9)
+    assert exposure_nodes(np.ones(5))[1].tolist() == [1.0]
+    two = exposure_nodes(np.array([0.9, 1.1]))
+    assert np.allclose(two[1], [0.9, 1.1])
+    assert np.allclose(two[0], 0.5)
+
+
+@pytest.mark.parametrize(
+    ("effect", "variance"),
+    [
+        (ExposureDrift(drift=0.6), 0.03),
+        (ExposureFlicker(rms=0.1), 0.01),
+        (ExposureFlicker(rms=0.1, period_frames=5.0), 0.01),
+    ],
+)
+def test_the_law_is_mixed_over_the_exposures_of_the_run(effect, variance):
+    model = effect.marginal(MarginalModel(), None)
+    w, f = model.exposure_weights, model.exposure_factors
+    assert w.sum() == pytest.approx(1.0)
+    assert w @ f == pytest.approx(1.0)
+    assert w @ (f - 1) ** 2 == pytest.approx(variance, rel=0.01)
+
+
+def test_the_law_of_the_electron_number_and_what_leaves_it_alone():
+    plain = MarginalModel()
+    law = OverdispersedCounts(relative_variance=0.1).marginal(plain, None)
+    assert (law.law, law.dispersion) == ("negative_binomial", 0.1)
+    law = BranchingCounts(branching=0.2).marginal(plain, None)
+    assert (law.law, law.dispersion) == ("borel", 0.2)
+    law = OpticalCrosstalk(probability=0.2).marginal(plain, None)
+    assert law.exposure_factors.tolist() == [1.2]
+    assert 0 < CosmicRays(tracks_per_frame=0.1).marginal(plain, None).outlier_share < 1e-5
+    for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion, SpuriousCharge):
+        assert cls.typical()[0].marginal(plain, None) is plain
+
+
+# -- tools -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "p"), [(1, 0.3), (7, 0.02), (40, 0.6), (20_000, 0.3)])
+def test_binomial_numbers_come_from_the_upper_end(n, p):
+    u = (np.arange(1000) + 0.5) / 1000
+    seen = binomial_upper(u, np.full(1000, n), p)
+    assert np.array_equal(seen, stats.binom.isf(u, n, p))
+    assert np.all(np.diff(seen) <= 0)
+
+
+def test_further_numbers_are_uniform_and_unrelated():
+    n = 200_000
+    u = np.random.default_rng(1).random(n) * 1e-3
+    more = [further_uniform(u, draw) for draw in (0, 1, 2)]
+    for a in more:
+        assert a.min() > 0
+        assert a.max() < 1
+        assert stats.kstest(a, "uniform").pvalue > 5.7e-7
+    for a, b in ((more[0], more[1]), (more[1], more[2]), (more[0], u)):
+        assert abs(np.corrcoef(a, b)[0, 1]) < 5 / np.sqrt(n)
+    assert np.array_equal(further_uniform(u, np.arange(n) % 3)[1::3], more[1][1::3])
+
+
+# -- bad input ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cls", "fields", "words"),
+    [
+        (ExposureDrift, {"drift": 3.0}, "less than or equal to 2"),
+        (ExposureDrift, {"drift": 0.1, "path": (1.0, 1.0)}, "two different values"),
+        (ExposureDrift, {"drift": 0.1, "path": (1.0, 2.0), "settling_fraction": 0.1}, "give one of them"),
+        (ExposureDrift, {"drift": 0.1, "path": (1.0, np.nan)}, "finite"),
+        (ExposureFlicker, {"rms": -0.1}, "greater than or equal"),
+        (ExposureFlicker, {"rms": 0.1, "period_frames": 1.0}, "greater than 1"),
+        (ExposureFlicker, {"rms": 0.1, "period_frames": 5.0, "correlation_frames": 2.0}, "leave one"),
+        (Persistence, {"peak_e": 1.0}, "decay_frames"),
+        (Persistence, {"peak_e": 1.0, "decay_frames": 0.0}, "greater than 0"),
+        (
+            Persistence,
+            {"peak_e": 1.0, "decay_frames": 1.0, "image": ((1.0,), (1.0, 2.0))},
+            "different lengths",
+        ),
+        (Persistence, {"peak_e": 1.0, "decay_frames": 1.0, "image": ((-1.0, 1.0),)}, "numbers >= 0"),
+        (DarkCurrentRts, {"fraction": 1.5}, "less than or equal"),
+        (DarkCurrentRts, {"fraction": 0.1, "dwell_low_frames": 0.0}, "greater than or equal"),
+        (OverdispersedCounts, {"relative_variance": -1e-9}, "greater than or equal"),
+        (BranchingCounts, {"branching": 0.9}, "less than or equal"),
+        (OpticalCrosstalk, {"probability": 0.6}, "less than or equal"),
+        (CosmicRays, {"tracks_per_frame": 1e9}, "less than or equal"),
+        (CosmicRays, {"tracks_per_frame": 1.0, "length_um": 0.0}, "greater than 0"),
+        (ChargeLag, {"fraction": 1.0}, "less than or equal"),
+        (ChargeDiffusion, {"fraction": -0.1}, "greater than or equal"),
+        (SpuriousCharge, {"mean_e": np.inf}, "finite"),
+    ],
+)
+def test_impossible_parameters_are_refused(cls, fields, words):
+    with pytest.raises(ValidationError, match=words):
+        cls(**fields)
+
+
+@pytest.mark.parametrize("effect", KINDS, ids=repr)
+def test_the_largest_strengths_work(effect):
+    truth = a_sensor((4, 4), exposure=(20.0, 50.0))
+    _, k = simulated(truth, effect.scaled(1e9), n_frames=5)
+    assert k.max() < 2**31
+
+
+def test_a_run_of_one_frame_and_a_sensor_of_one_pixel():
+    truth = a_sensor((1, 1))
+    for effect in KINDS:
+        assert simulated(truth, effect, n_frames=1)[0].shape == (1, 1, 1)

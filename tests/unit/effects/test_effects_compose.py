@@ -1,0 +1,121 @@
+"""From effects to the law of the pixels, and what the fit of a tile makes of it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import pytest
+from helpers.drawn_pixels import draw
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_of
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.rts_noise import RtsNoise
+from pchem_pipeline.effects.framework.compose import marginal_model, model_words, pixel_maps
+from pchem_pipeline.effects.framework.effect import Effect, Plane
+from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.fitted_model import deciding_maps
+
+
+class Broken(Effect):
+    """An effect of somebody else that cannot say what it does."""
+
+    tag: Literal["broken"] = "broken"
+    plane: ClassVar[Plane] = Plane.ANALOG
+
+    def apply(self, values: Any, context: Any) -> Any:
+        return values
+
+    def marginal(self, model: MarginalModel, maps: Any) -> MarginalModel:
+        raise IndexError("list index out of range")
+
+
+class Wide(Broken):
+    """Variance in e-^2 that grows with the pixel's own exposure."""
+
+    tag: Literal["wide"] = "wide"  # type: ignore[assignment]
+
+    def marginal(self, model: MarginalModel, maps: Any) -> MarginalModel:
+        return model.with_variance(e2=0.01 * np.nan_to_num(maps.quanta_exposure))
+
+
+def maps_of(*exposures: float):
+    h = np.array(exposures)
+    return pixel_maps([h, h * 0 + 0.1, h * 0 + 100, h * 0 + 2.5], np.ones(h.size, bool))
+
+
+def test_effects_add_up_in_their_order() -> None:
+    maps = maps_of(1.0, np.nan, 3.0)
+    assert maps.usable.tolist() == [True, False, True]
+    assert np.isnan(maps.bias).tolist() == [False, True, False]
+    model = marginal_model([Wide(), RowNoise(row_noise_dn=0.5), RowNoise(row_noise_dn=1.0)], maps)
+    np.testing.assert_allclose(model.extra_variance_e2, [0.01, 0.0, 0.03])
+    np.testing.assert_allclose(model.extra_variance_dn2, [1.25])
+    assert marginal_model([], maps).neutral
+    assert model_words([RowNoise(row_noise_dn=0.5), Wide()]) == "PCD + row_noise + wide"
+    assert model_words([]) == "PCD"
+
+
+def test_an_effect_that_raises_is_named() -> None:
+    with pytest.raises(
+        ConfigError, match=r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
+    ):
+        marginal_model([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
+
+
+def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
+    pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0], 11.0, 0.3)
+    histogram = {
+        "counts": pixels.counts.reshape(2, 2, -1),
+        "origin": pixels.origin.reshape(2, 2).astype(np.int32),
+        "under": np.zeros((2, 2), np.uint32),
+        "over": np.zeros((2, 2), np.uint32),
+    }
+    plain = fit_tile(histogram, FitSettings(), None)
+    again = fit_tile(histogram, FitSettings(), None, ())
+    for name, values in plain.items():
+        np.testing.assert_array_equal(again[name], values)
+    trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
+    grown = fit_tile(histogram, FitSettings(), None, [RowNoise(row_noise_dn=1.0), trap])
+    ends = {path for name in INTERVALS for path in interval_names(name)}  # only where they are asked for
+    stored = [variable for variable in variables_of("fit") if variable.name not in ends]
+    assert set(grown) == {variable.name for variable in stored}
+    for variable in stored:
+        assert grown[variable.name].dtype == np.dtype(variable.dtype), variable.name
+        assert grown[variable.name].shape[:2] == (2, 2), variable.name
+    # the pixel's own noise is what the rows leave of it
+    expected = plain["read_noise_dn"] ** 2 - 1.0
+    np.testing.assert_allclose(grown["read_noise_dn"] ** 2, expected, rtol=2e-3)
+    np.testing.assert_allclose(grown["bias"], plain["bias"], atol=0.01)
+    assert not grown["lobe_weight"].any()
+    assert np.isnan(grown["lobe_amplitude_e"]).all()
+
+
+def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> None:
+    columns = [
+        np.array([2.0, np.nan]),
+        np.array([0.1, np.nan]),
+        np.array([100.0, np.nan]),
+        np.array([2.5, np.nan]),
+    ]
+    model = MarginalModel().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
+    model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02).with_noise(
+        [0.5, 0.5], shift_dn=[-1.0, 2.0]
+    )
+    exposure, gain, bias, sigma = nearest_pcd(columns, model)
+    # near k = H: levels 100 + 10 (0.98 k (1 + 0.01 (k - 1)) + 0.1) + 0.5
+    levels = [100 + 10 * (0.98 * k * (1 + 0.01 * (k - 1)) + 0.1) + 0.5 for k in (1.9, 2.0, 2.1)]
+    assert exposure[0] == 2.0
+    assert 1 / gain[0] == pytest.approx((levels[2] - levels[0]) / 0.2)
+    assert bias[0] + 2.0 / gain[0] == pytest.approx(levels[1])
+    # lobes at -1 and 2 DN have the variance 2.25; the electrons' in e-^2 counts a hundredfold in DN^2
+    assert sigma[0] ** 2 == pytest.approx(2.5**2 + 1.0 + 2.25 + 100 * (0.01 + 0.01 + 0.004))
+    assert np.isnan([gain[1], bias[1], sigma[1]]).all()
+    maps = [np.array([[2.0]]), np.array([[0.1]]), np.array([[100.0]]), np.array([[2.5]])]
+    assert deciding_maps(maps, ()) == tuple(maps)
+    wider = deciding_maps(maps, [RowNoise(row_noise_dn=1.0)])
+    np.testing.assert_allclose([w.item() for w in wider], [2.0, 0.1, 100.0, np.hypot(2.5, 1.0)])

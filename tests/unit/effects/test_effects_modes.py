@@ -1,0 +1,389 @@
+"""Common modes, ADC and data path: what their forward models do to frames, and what they refuse."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import context_of, drawn_truth, offsets
+from pydantic import ValidationError
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
+from pchem_pipeline.effects.adc.adc_inl import AdcInl
+from pchem_pipeline.effects.adc.clipping import Clipping
+from pchem_pipeline.effects.analog.bias_drift import BiasDrift
+from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
+from pchem_pipeline.effects.analog.column_noise import ColumnNoise
+from pchem_pipeline.effects.analog.frame_noise import FrameNoise
+from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
+from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.plane import Plane
+from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.simulate import chain
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+CLASSES: tuple[type[Effect], ...] = (
+    AdcDnl,
+    AdcInl,
+    BiasDrift,
+    BiasJumps,
+    Clipping,
+    ColumnNoise,
+    FrameNoise,
+    PeriodicPickup,
+    ReadoutAlternation,
+    RepeatedFrames,
+    RowNoise,
+)
+JUMPS = (((0, 1.0), (5, -2.0), (9, 0.0)), ((3, 1.0),), (), ((2, 0.5), (11, 4.0)))
+NOTHING = [
+    BiasDrift(drift_dn=0),
+    BiasDrift(drift_dn=0, shape="path", path=(1.0, 5.0, -3.0)),
+    BiasDrift(drift_dn=0, shape="walk"),
+    BiasJumps(amplitude_dn=0, rate=0.1),
+    BiasJumps(amplitude_dn=0, path=JUMPS),
+    FrameNoise(frame_noise_dn=0),
+    RowNoise(row_noise_dn=0),
+    ColumnNoise(column_noise_dn=0),
+    PeriodicPickup(amplitude_dn=0, cycles_per_row=0.1, cycles_per_column=0.2, random_phase=True),
+    ReadoutAlternation(alternation_dn=0),
+    AdcDnl(dnl_lsb=0),
+    AdcDnl(dnl_lsb=0, per_column=True),
+    AdcDnl(dnl_lsb=0, pattern="bit", bit=2),
+    AdcDnl(dnl_lsb=0, pattern="edges", first_code=90, edges=(1.0, -1.0)),
+    AdcInl(inl_lsb=0),
+    RepeatedFrames(),
+]
+STRONG = [
+    BiasDrift(drift_dn=9),
+    BiasDrift(drift_dn=9, shape="path", path=(1.0, 5.0, -3.0)),
+    BiasDrift(drift_dn=9, shape="walk"),
+    BiasDrift(drift_dn=9, shape="settling"),
+    BiasJumps(amplitude_dn=9, rate=0.2, levels=4),
+    BiasJumps(amplitude_dn=9, path=JUMPS),
+    BiasJumps(amplitude_dn=9, rate=0.2, parts="left_right"),
+    FrameNoise(frame_noise_dn=9),
+    RowNoise(row_noise_dn=9),
+    ColumnNoise(column_noise_dn=9),
+    PeriodicPickup(amplitude_dn=9, cycles_per_row=0.1, cycles_per_frame=-0.3, cycles_per_column=0.2),
+    PeriodicPickup(amplitude_dn=9, cycles_per_row=0.1, random_phase=True),
+    ReadoutAlternation(alternation_dn=-9),
+    AdcDnl(dnl_lsb=0.9),
+    AdcDnl(dnl_lsb=0.9, per_column=True),
+    AdcDnl(dnl_lsb=-0.9, pattern="bit", bit=2),
+    AdcInl(inl_lsb=3, period_dn=50),
+    Clipping(low=98, high=140),
+    RepeatedFrames(probability=0.4),
+    RepeatedFrames(frames=(1, 2, 3, 7, 13), rows=(1, 4)),
+]
+N_FRAMES, SHAPE = 14, (6, 5)
+
+
+def frames_of(*effects: Effect) -> Any:
+    sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=effects)
+    return simulate_block(drawn_truth(SHAPE), sensor, (0, N_FRAMES))[0]
+
+
+def short(effect: Effect) -> str:
+    return f"{effect.tag} {effect.model_dump(exclude_defaults=True, exclude={'tag'})}"[:60]
+
+
+@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
+def test_each_effect_says_what_it_is(effect):
+    assert effect.title
+    assert effect.source
+    assert effect.signature
+    assert set(effect.signature) <= set(STATISTICS)
+    assert effect.separate
+    assert effect.separate.keys() <= effect_classes().keys() - {effect.model_fields["tag"].default}
+    assert not effect.strength or effect.strength in effect.model_fields
+    for one in effect.typical():
+        assert getattr(one.scaled(2.0), effect.strength) == pytest.approx(2 * getattr(one, effect.strength))
+
+
+@pytest.mark.parametrize("effect", NOTHING, ids=short)
+def test_no_strength_changes_nothing_not_even_the_last_bit(effect):
+    np.testing.assert_array_equal(frames_of(effect), frames_of())
+
+
+@pytest.mark.parametrize("effect", STRONG, ids=short)
+def test_the_same_frames_at_every_division(effect, monkeypatch):
+    sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=(effect,))
+    truth = drawn_truth(SHAPE)
+    whole = frames_of(effect)
+    assert (whole != frames_of()).any()
+    for frames, rows in [([0, 1, 4, 9, 14], [0, 2, 3, 6]), (range(15), range(7))]:
+        for t, y in itertools.product(itertools.pairwise(frames), itertools.pairwise(rows)):
+            part = simulate_block(truth, sensor, t, y)[0]
+            np.testing.assert_array_equal(part, whole[slice(*t), slice(*y)])
+    monkeypatch.setattr(chain, "_SAMPLES_AT_ONCE", 1)
+    np.testing.assert_array_equal(frames_of(effect), whole)
+
+
+def test_a_repeat_that_forgets_history_would_be_noticed():
+    class Forgetful(RepeatedFrames):
+        def history(self):
+            return 1
+
+    effect = Forgetful(frames=(4, 5, 6))
+    sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=(effect,))
+    part = simulate_block(drawn_truth(SHAPE), sensor, (5, 9))[0]
+    assert (part != frames_of(RepeatedFrames(frames=(4, 5, 6)))[5:9]).any()
+
+
+# -- moments and shapes ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect", "axes"),
+    [
+        (FrameNoise(frame_noise_dn=0.7), (0,)),
+        (RowNoise(row_noise_dn=0.7), (0, 1)),
+        (ColumnNoise(column_noise_dn=0.7), (0, 2)),
+    ],
+    ids=lambda v: getattr(v, "tag", ""),
+)
+def test_random_offsets_have_their_variance_and_their_place(effect, axes):
+    added = offsets(effect, context_of((40, 50), 500))
+    others = tuple(axis for axis in range(3) if axis not in axes)
+    # along the other axes there is one and the same number
+    np.testing.assert_allclose(np.ptp(added, axis=others), 0.0, atol=1e-12)
+    numbers = added.mean(axis=others).ravel()
+    assert abs(numbers.mean()) < 5 * 0.7 / np.sqrt(numbers.size)
+    assert abs((numbers**2).mean() / 0.49 - 1) < 5 * np.sqrt(2 / numbers.size)
+    # half the variance would be found out
+    assert abs(0.5 - 1) > 5 * np.sqrt(2 / numbers.size)
+
+
+def test_linear_drift_ends_where_it_says_and_keeps_the_mean():
+    added = offsets(BiasDrift(drift_dn=-0.3), context_of(n_frames=101))
+    np.testing.assert_allclose(added[-1] - added[0], -0.3)
+    np.testing.assert_allclose(added.mean(axis=0), 0.0, atol=1e-12)
+    before = offsets(BiasDrift(drift_dn=-0.3), context_of(n_frames=101, frames=[-5, 0]))
+    np.testing.assert_array_equal(before[0], before[1])
+
+
+def test_a_bias_settles_by_an_exponential_and_keeps_the_mean():
+    effect = BiasDrift(drift_dn=2.0, shape="settling", settling_fraction=0.25)
+    added = offsets(effect, context_of(n_frames=401))[:, 0, 0]
+    assert added[-1] - added[0] == pytest.approx(2.0)
+    rest = (added[-1] - added) + 2.0 * np.exp(-4.0) / -np.expm1(-4.0)
+    np.testing.assert_allclose(rest[100] / rest[0], np.exp(-1.0))
+    assert abs(added.mean()) < 2.0 * 3 / 401
+
+
+def test_a_path_goes_through_its_nodes():
+    path = BiasDrift(drift_dn=2.0, shape="path", path=(0.0, 1.0, -1.0))
+    added = offsets(path, context_of(n_frames=201))[:, 0, 0]
+    np.testing.assert_allclose(added[[0, 100, 200]] - added[0], [0.0, 2.0, -2.0])
+    np.testing.assert_allclose(added[50] - added[0], 1.0)
+    assert abs(added.mean()) < 2.0 * 3 / 201
+
+
+def test_a_walk_has_the_variance_of_its_end():
+    ends = []
+    for seed in range(400):
+        walk = offsets(BiasDrift(drift_dn=0.5, shape="walk"), context_of((1, 1), 60, seed=seed))[:, 0, 0]
+        assert abs(walk.mean()) < 1e-12
+        ends.append(walk[-1] - walk[0])
+    # from the first frame to the last there are 59 of the 60 steps
+    assert abs(np.mean(np.square(ends)) / (0.25 * 59 / 60) - 1) < 5 * np.sqrt(2 / 400)
+
+
+def test_jumps_have_their_rate_and_their_levels():
+    n_frames, rate = 20_000, 0.01
+    added = offsets(BiasJumps(amplitude_dn=0.5, rate=rate, levels=3), context_of((2, 2), n_frames))
+    for y, x in itertools.product((0, 1), (0, 1)):
+        series = np.round(added[:, y, x], 9)
+        assert set(series) <= {-0.5, 0.0, 0.5}
+        number = int((np.diff(series) != 0).sum())
+        assert abs(number - rate * n_frames) < 5 * np.sqrt(rate * n_frames)
+    together = np.corrcoef(added.reshape(n_frames, 4).T)
+    assert np.abs(together - np.eye(4)).max() < 5 * np.sqrt(1 / (rate * n_frames))
+
+
+def test_a_path_of_jumps_holds_each_level_from_its_frame_on():
+    effect = BiasJumps(amplitude_dn=2.0, path=JUMPS)
+    added = offsets(effect, context_of((5, 5)))
+    top_left = added[:, 0, 0]
+    np.testing.assert_allclose(top_left[:5] - top_left[5], 6.0)
+    np.testing.assert_allclose(top_left[9:] - top_left[8], 4.0)
+    np.testing.assert_allclose(added.mean(axis=0), 0.0, atol=1e-12)
+    # an odd middle row and column belong to the bottom and the right; their path has one level only
+    np.testing.assert_array_equal(added[:, 0, 2:], 0.0)
+    np.testing.assert_array_equal(added[:, 2:, 0], 0.0)
+    np.testing.assert_array_equal(added[:, 2, 2], added[:, 4, 4])
+    assert np.ptp(added[:, 2, 2]) == pytest.approx(7.0)
+
+
+def test_halves_jump_together():
+    tops = offsets(BiasJumps(amplitude_dn=2.0, rate=0.3, parts="top_bottom"), context_of((4, 6), 50))
+    sides = offsets(BiasJumps(amplitude_dn=2.0, parts="left_right", path=JUMPS[:2]), context_of((4, 6)))
+    assert np.ptp(tops, axis=2).max() == 0
+    assert (tops[:, 0] != tops[:, 3]).any()
+    np.testing.assert_array_equal(tops[:, 0], tops[:, 1])
+    assert np.ptp(sides, axis=1).max() == 0
+    np.testing.assert_allclose(sides[9, 0] - sides[8, 0], [4.0] * 3 + [0.0] * 3)
+
+
+def test_pickup_is_the_sine_that_it_says():
+    effect = PeriodicPickup(
+        amplitude_dn=0.4, cycles_per_row=0.11, cycles_per_frame=-0.27, cycles_per_column=0.07, phase=0.6
+    )
+    context = context_of((6, 7), 30, frames=np.arange(10, 30))
+    t, y, x = np.ogrid[10:30, :6, :7]
+    expected = 0.4 * np.sin(2 * np.pi * (0.11 * y - 0.27 * t + 0.07 * x) + 0.6)
+    np.testing.assert_allclose(offsets(effect, context), expected, atol=1e-12)
+
+
+def test_a_random_phase_is_new_in_every_frame():
+    effect = PeriodicPickup(amplitude_dn=0.4, cycles_per_row=0.25, random_phase=True)
+    added = offsets(effect, context_of((4, 1), 2000))[:, :, 0]
+    np.testing.assert_allclose((added**2).sum(axis=1), 2 * 0.16, atol=1e-9)
+    assert abs(added.mean()) < 5 * 0.4 / np.sqrt(2 * added.size)
+    lag = (added[1:, 0] * added[:-1, 0]).mean() / 0.08
+    assert abs(lag) < 5 / np.sqrt(2000)
+
+
+def test_alternation_is_positive_in_even_frames():
+    added = offsets(ReadoutAlternation(alternation_dn=0.3), context_of(frames=[-1, 0, 1, 7, 8]))
+    np.testing.assert_allclose(added[:, 0, 0], [-0.3, 0.3, -0.3, -0.3, 0.3])
+
+
+def coded(effect: AdcDnl | AdcInl, values: Any, **kwargs: Any) -> Any:
+    values = np.asarray(values, float).reshape(-1, 1, 1)
+    context = context_of((1, 1), len(values), **kwargs)
+    return np.rint(effect.apply(values, context)).astype(int).ravel()
+
+
+def edges_of(effect: AdcDnl | AdcInl, first: int, last: int, **kwargs: Any) -> Any:
+    """Return where codes first + 1 .. last begin."""
+    fine = np.arange(first - 0.5, last + 0.5, 1e-3) + 5e-4
+    codes = coded(effect, fine, **kwargs)
+    assert (np.diff(codes) >= 0).all()
+    return np.array([fine[np.searchsorted(codes, code)] for code in range(first + 1, last + 1)]) - 5e-4
+
+
+def test_listed_edges_move_and_no_others():
+    effect = AdcDnl(dnl_lsb=0.5, pattern="edges", first_code=101, edges=(0.6, -0.4))
+    moved = edges_of(effect, 98, 104) - (np.arange(99, 105) - 0.5)
+    np.testing.assert_allclose(moved, [0, 0, 0.3, -0.2, 0, 0], atol=2e-3)
+
+
+@pytest.mark.parametrize("bit", [0, 1, 3])
+def test_a_wrong_bit_has_its_period(bit):
+    moved = edges_of(AdcDnl(dnl_lsb=0.4, pattern="bit", bit=bit), 63, 96) - (np.arange(64, 97) - 0.5)
+    expected = 0.4 * ((np.arange(64, 97) >> bit & 1) - 0.5)
+    np.testing.assert_allclose(moved, expected, atol=2e-3)
+
+
+def test_random_edges_have_their_width_and_are_the_same_everywhere():
+    effect = AdcDnl(dnl_lsb=0.1)
+    edges = edges_of(effect, 1000, 1500)
+    # across the chunks (of 1024 codes) in which they are drawn
+    np.testing.assert_allclose(edges_of(effect, 1020, 1030), edges[20:30], atol=1e-9)
+    moved = edges - (np.arange(1001, 1501) - 0.5)
+    assert abs((moved**2).mean() / 0.005 - 1) < 5 * np.sqrt(2 / 500)
+    assert abs((np.diff(edges, prepend=np.nan)[1:] - 1).std() / 0.1 - 1) < 5 * np.sqrt(1.5 / 500)
+    assert (edges_of(effect, 1000, 1010, seed=4) != edges[:10]).any()
+
+
+def test_every_column_has_an_adc_of_its_own():
+    values = np.random.default_rng(0).uniform(100, 130, (400, 1, 1)) * np.ones((1, 3, 2))
+    out = AdcDnl(dnl_lsb=0.5, per_column=True).apply(values, context_of((3, 2), 400))
+    np.testing.assert_array_equal(out[:, 0], out[:, 2])
+    assert (out[:, 0, 0] != out[:, 0, 1]).any()
+    one = AdcDnl(dnl_lsb=0.5).apply(values, context_of((3, 2), 400))
+    np.testing.assert_array_equal(one[:, 0, 0], one[:, 0, 1])
+
+
+def test_the_bent_curve_moves_edges_against_the_deviation():
+    effect = AdcInl(inl_lsb=1.2, period_dn=40.0, phase=0.3)
+    values = np.linspace(90.0, 180.0, 500)
+    bent = effect.apply(values.reshape(-1, 1, 1), context_of((1, 1), 500)).ravel()
+    np.testing.assert_allclose(bent - values, 1.2 * np.sin(2 * np.pi * values / 40 + 0.3), atol=1e-9)
+    assert (np.diff(bent) > 0).all()
+
+
+def test_repeats_are_exact_copies_of_what_was_delivered():
+    plain, listed = frames_of(), (1, 2, 5, 9, 10, 11)
+    delivered = plain.copy()
+    for t in listed:
+        delivered[t] = delivered[t - 1]
+    np.testing.assert_array_equal(frames_of(RepeatedFrames(frames=listed)), delivered)
+    some = frames_of(RepeatedFrames(frames=listed, rows=(2, 4)))
+    np.testing.assert_array_equal(some[:, 2:4], delivered[:, 2:4])
+    np.testing.assert_array_equal(np.delete(some, [2, 3], axis=1), np.delete(plain, [2, 3], axis=1))
+
+
+def test_random_repeats_come_as_often_as_they_should():
+    n_frames, p = 20_000, 0.1
+    values = np.arange(n_frames, dtype=np.uint16).reshape(-1, 1, 1)
+    out = RepeatedFrames(probability=p).apply(values, context_of((1, 1), n_frames)).ravel().astype(int)
+    number = int((np.diff(out) == 0).sum())
+    assert abs(number - p * n_frames) < 5 * np.sqrt(p * (1 - p) * n_frames)
+    # a repeat of a repeat shows the frame that was last taken
+    assert (np.arange(n_frames) - out).max() > 1
+    assert out[0] == 0
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect", "fields", "words"),
+    [
+        (BiasDrift, {"drift_dn": 1, "shape": "path"}, "needs `path` with 2 values"),
+        (BiasDrift, {"drift_dn": 1, "path": [1, 2]}, "leave one of them out"),
+        (BiasDrift, {"drift_dn": float("nan")}, "finite"),
+        (BiasJumps, {"amplitude_dn": -1}, "greater than or equal to 0"),
+        (BiasJumps, {"amplitude_dn": 1, "rate": 0.9}, "less than or equal to 0.5"),
+        (BiasJumps, {"amplitude_dn": 1, "path": [[[0, 1]]]}, "each of 4 quadrants, got 1"),
+        (BiasJumps, {"amplitude_dn": 1, "path": [[[5, 1], [2, 0]], [], [], []]}, "must increase"),
+        (BiasJumps, {"amplitude_dn": 1, "parts": "top_bottom", "path": [[]] * 4}, "of 2 top_bottom, got 4"),
+        (FrameNoise, {}, "frame_noise_dn"),
+        (RowNoise, {"row_noise_dn": -0.1}, "greater than or equal to 0"),
+        (ColumnNoise, {"column_noise_dn": "much"}, "valid number"),
+        (PeriodicPickup, {"amplitude_dn": 1, "cycles_per_row": 0.7}, "less than or equal to 0.5"),
+        (ReadoutAlternation, {"alternation_dn": float("inf")}, "finite"),
+        (AdcDnl, {"dnl_lsb": 1.5}, "less than or equal to 1"),
+        (AdcDnl, {"dnl_lsb": 0.1, "pattern": "edges"}, "belong together"),
+        (AdcDnl, {"dnl_lsb": 0.1, "edges": [0.1]}, "belong together"),
+        (AdcDnl, {"dnl_lsb": 0.1, "pattern": "bit", "per_column": True}, "per_column is for pattern random"),
+        (AdcInl, {"inl_lsb": 20, "period_dn": 50}, "turns the curve back"),
+        (RepeatedFrames, {"frames": [0]}, "frame 0 is the first"),
+        (RepeatedFrames, {"rows": [3, 3]}, "hold none"),
+        (RepeatedFrames, {"probability": 0.9}, "less than or equal to 0.5"),
+    ],
+)
+def test_impossible_parameters_are_refused(effect, fields, words):
+    with pytest.raises(ValidationError, match=words):
+        effect(**fields)
+
+
+def test_scaling_stops_where_the_parameters_end():
+    assert AdcDnl(dnl_lsb=0.4).scaled(10).dnl_lsb == 1.0
+    bent = AdcInl(inl_lsb=1, period_dn=50).scaled(100)
+    assert 2 * np.pi * bent.inl_lsb < 50
+    assert RepeatedFrames(probability=0.3).scaled(4).probability == 0.5
+    with pytest.raises(ConfigError, match="no strength"):
+        Clipping(low=3).scaled(2)
+
+
+def test_planes():
+    at = {effect.model_fields["tag"].default: effect.plane for effect in CLASSES}
+    assert at["repeated_frames"] is Plane.READOUT
+    assert {at[tag] for tag in ("adc_dnl", "adc_inl", "clipping")} == {Plane.ADC}
+    assert list(at.values()).count(Plane.ANALOG) == 7
+
+
+def test_clipping_guesses_nothing_without_evidence():
+    assert Clipping.typical() == ()

@@ -1,0 +1,125 @@
+"""The law of a pixel's samples under common modes and a real ADC, against what the forward models do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import context_of, offsets, taken
+from scipy.special import ndtri
+
+from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
+from pchem_pipeline.effects.adc.adc_inl import AdcInl
+from pchem_pipeline.effects.adc.clipping import Clipping
+from pchem_pipeline.effects.analog.bias_drift import BiasDrift
+from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
+from pchem_pipeline.effects.analog.column_noise import ColumnNoise
+from pchem_pipeline.effects.analog.frame_noise import FrameNoise
+from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
+from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.simulate.truth import TruthMaps
+
+H, STEP, MU, NOISE_E = 1.4, 12.0, 100.3, 0.25
+SIGMA = float(np.sqrt((NOISE_E * STEP) ** 2 + 1 / 12))
+CODES = np.arange(60, 260)
+NORMAL = ndtri((np.arange(2000) + 0.5) / 2000)
+
+
+def maps_of(bias) -> PixelMaps:
+    bias = np.atleast_1d(np.asarray(bias, float))
+    constant = [np.full(bias.shape, v) for v in (H, 1 / STEP, SIGMA)]
+    return PixelMaps(constant[0], constant[1], bias, constant[2], np.ones(bias.shape, np.bool_))
+
+
+def law_of(effect) -> np.ndarray:
+    maps = maps_of(MU)
+    return marginal_mass(effect.marginal(MarginalModel(), maps), maps, CODES)[0]
+
+
+def smeared(added: np.ndarray) -> np.ndarray:
+    """Return the mean of the plain law over these offsets, DN."""
+    return marginal_mass(MarginalModel(), maps_of(MU + added.ravel()), CODES).mean(axis=0)
+
+
+@pytest.mark.parametrize("scale", [0.2, 3.0])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        BiasDrift(drift_dn=2.0),
+        BiasDrift(drift_dn=-2.0, shape="path", path=(0.0, 0.2, 1.0, -0.1)),
+        BiasDrift(drift_dn=2.0, shape="settling", settling_fraction=0.3),
+        PeriodicPickup(amplitude_dn=1.0, cycles_per_frame=0.2137),
+        ReadoutAlternation(alternation_dn=-0.8),
+        BiasJumps(amplitude_dn=1.0, rate=0.4, levels=5),
+        BiasJumps(amplitude_dn=1.0, path=(((0, 1.0), (700, -0.5), (1400, 0.8)),) * 4),
+    ],
+    ids=lambda e: getattr(e, "tag", ""),
+)
+def test_offsets_smear_the_law_as_they_smear_the_samples(effect, scale):
+    effect = effect.scaled(scale)
+    exact = smeared(offsets(effect, context_of((1, 1), 2100))[:, 0, 0])
+    change = np.abs(exact - smeared(np.zeros(1))).max()
+    assert np.abs(law_of(effect) - exact).max() < 0.06 * change
+
+
+@pytest.mark.parametrize("size", [0.2, 2.0])
+@pytest.mark.parametrize(
+    "effect",
+    [FrameNoise(frame_noise_dn=1), RowNoise(row_noise_dn=1), ColumnNoise(column_noise_dn=1)],
+    ids=lambda e: getattr(e, "tag", ""),
+)
+def test_gaussian_offsets_widen_the_law(effect, size):
+    quantiles = NORMAL / NORMAL.std() * size
+    change = np.abs(smeared(quantiles) - smeared(np.zeros(1))).max()
+    assert np.abs(law_of(effect.scaled(size)) - smeared(quantiles)).max() < 0.06 * change
+
+
+def chi2(observed: np.ndarray, mass: np.ndarray) -> tuple[float, int]:
+    expected = mass * observed.sum()
+    good = expected > 5
+    return float(((observed - expected)[good] ** 2 / expected[good]).sum()), int(good.sum()) - 1
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        AdcDnl(dnl_lsb=0.2, pattern="bit", bit=1),
+        AdcDnl(dnl_lsb=0.3, pattern="edges", first_code=100, edges=(0.5, -1.0, 0.8, 0.3)),
+        AdcInl(inl_lsb=1.0, period_dn=37.0, phase=1.0),
+        Clipping(low=98, high=141),
+    ],
+    ids=lambda e: e.tag,
+)
+def test_the_law_of_the_adc_is_that_of_simulated_samples(effect):
+    truth = TruthMaps(
+        *(np.full((20, 20), v) for v in (H, 1 / STEP, MU, NOISE_E)), np.zeros((20, 20), np.uint8)
+    )
+    frames = taken(truth, effect, n_frames=1500)
+    observed = np.bincount(frames.ravel(), minlength=CODES[-1] + 1)[CODES]
+    value, degrees = chi2(observed, law_of(effect))
+    assert value < degrees + 5 * np.sqrt(2 * degrees)
+    plain, degrees = chi2(observed, law_of(RepeatedFrames(probability=0.1)))
+    assert plain > degrees + 50 * np.sqrt(2 * degrees)
+
+
+def test_random_widths_and_repeats_leave_the_law_as_it_is():
+    model = MarginalModel()
+    for effect in (AdcDnl(dnl_lsb=0.3), RepeatedFrames(probability=0.1)):
+        assert effect.marginal(model, maps_of(MU)) is model
+
+
+def test_edges_of_several_effects_add_up():
+    maps = maps_of(MU)
+    first = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=100, edges=(1.0, 2.0))
+    second = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=99, edges=(1.0, 1.0))
+    both = second.marginal(first.marginal(MarginalModel(), maps), maps)
+    assert both.edge_first == 99
+    np.testing.assert_allclose(both.edge_shift, [0.1, 0.2, 0.2])
+    limits = Clipping(low=90, high=200).marginal(
+        Clipping(low=95, high=300).marginal(MarginalModel(), maps), maps
+    )
+    assert (limits.clip_low, limits.clip_high) == (95, 200)

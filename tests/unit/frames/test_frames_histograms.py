@@ -1,0 +1,192 @@
+"""Ready-made histograms: layouts, refusals, and the measured SiPM spectra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.places import SIPM
+
+from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.frames.histogram_files import HistogramInput, is_histogram_input, read_histograms
+from pchem_pipeline.frames.settings import InputSettings
+
+DN = np.array([100, 101, 102, 104])
+COUNTS = np.array([3, 0, 7, 2])
+WANTED = [3, 0, 7, 0, 2]
+
+
+def read(folder: Path, *files: str, **settings: Any) -> HistogramInput:
+    return read_histograms(InputSettings(files=files, format="histogram", **settings), folder)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "DN,count\n100,3\n101,0\n102,7\n104,2\n",
+        "Energy,Count\n100,3\n101,0\n102,7\n104,2",
+        "100,3\n101,0\n102,7\n104,2\n",
+        "# a remark\n\n100.0, 3.0\r\n101.0, 0\r\n102, 7\r\n104, 2\r\n",
+        "DN;count\n100;3\n101;0\n102;7\n104;2\n",
+        "100\t3\n101\t0\n102\t7\n104\t2\n",
+        "dn count\n100 3\n101 0\n102 7\n104 2\n",
+        "\ufeffDN,count\n98,0\n100,3\n102,7\n104,2\n250,0\n",
+        "DN,count,\n100,3,\n102,7,\n104,2,\n",
+    ],
+)
+def test_csv(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    found = read(tmp_path, "a.csv")
+    assert found.counts.shape == (1, 1, 5)
+    assert found.counts.dtype == np.uint32
+    assert found.counts[0, 0].tolist() == WANTED
+    assert found.origin.tolist() == [[100]]
+    assert found.names == ("a",)
+    assert found.shape == (1, 1)
+    assert any("count 0" in note for note in found.notes)
+
+
+def test_several_columns_are_several_channels(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("DN,left,right\n10,1,0\n11,2,0\n12,0,5\n")
+    found = read(tmp_path, "a.csv")
+    assert found.names == ("a:left", "a:right")
+    assert found.origin.tolist() == [[10, 12]]
+    assert found.counts[0].tolist() == [[1, 2], [5, 0]]
+    assert found.notes == ()
+
+
+def test_numpy_files(tmp_path: Path) -> None:
+    np.save(tmp_path / "columns.npy", np.stack([DN, COUNTS], axis=1))
+    np.save(tmp_path / "line.npy", np.array(WANTED, np.uint64))
+    np.save(tmp_path / "channels.npy", np.array([WANTED, [0, 0, 0, 0, 9]]))
+    np.savez(tmp_path / "one.npz", dn=DN, counts=COUNTS)
+    np.savez(tmp_path / "two.npz", dn=DN, counts=np.stack([COUNTS, COUNTS[::-1]]))
+    for name, origin in [("columns.npy", 100), ("line.npy", 0), ("one.npz", 100)]:
+        found = read(tmp_path, name)
+        assert found.counts[0].tolist() == [WANTED]
+        assert found.origin.tolist() == [[origin]]
+    assert read(tmp_path, "channels.npy").counts[0].tolist() == [WANTED, [9, 0, 0, 0, 0]]
+    assert read(tmp_path, "channels.npy").origin.tolist() == [[0, 4]]
+    two = read(tmp_path, "two.npz")
+    assert two.counts[0].tolist() == [WANTED, [2, 7, 0, 0, 3]]
+    assert two.names == ("two:0", "two:1")
+
+
+def test_several_files_and_large_counts(tmp_path: Path) -> None:
+    (tmp_path / "c2.csv").write_text("0,1\n1,2\n")
+    (tmp_path / "c10.csv").write_text(f"-5,{2**40}\n-4,1\n-3,1\n")
+    found = read(tmp_path, "c*.csv")
+    assert found.names == ("c2", "c10")
+    assert found.counts.dtype == np.uint64
+    assert found.counts[0].tolist() == [[1, 2, 0], [2**40, 1, 1]]
+    assert found.origin.tolist() == [[0, -5]]
+    assert [file["name"] for file in found.identity()["files"]] == ["c2.csv", "c10.csv"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1,2\n2,-3\n", r"negative counts \(first at DN 2\)"),
+        ("1,2\n2,2.5\n", "count 2.5 is not a whole number"),
+        ("1.5,2\n", "DN 1.5 is not a whole number"),
+        ("1,2\n2,nan\n", "count column holds NaN"),
+        ("inf,2\n", "DN column holds NaN or infinity"),
+        ("1,2\n1,3\n", "DN 1 occurs twice"),
+        ("2,2\n1,3\n", r"not in rising order \(at DN 1\); sort"),
+        ("1,0\n2,0\n", "all counts are zero"),
+        ("DN,count\n", "holds no bins"),
+        ("", "holds no histogram"),
+        ("1\n2\n", "needs two columns"),
+        ("1,2\n2,x\n", r"row 2 \(2,x\) is not 2 numbers"),
+        ("1,2\n2,3,4\n", "row 2"),
+        ("0,1\n999999999,1\n", "span more than any ADC"),
+        ("1,1e300\n2,1\n", "too large to be exact"),
+    ],
+)
+def test_refusals(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read(tmp_path, "a.csv")
+    assert str(caught.value).startswith(str(tmp_path / "a.csv"))
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 4
+
+
+def test_refusals_of_numpy_files(tmp_path: Path) -> None:
+    def refused(words: str, name: str) -> None:
+        with pytest.raises(InputError, match=words):
+            read(tmp_path, name)
+
+    np.save(tmp_path / "o.npy", np.array([{1: 2}], dtype=object), allow_pickle=True)
+    refused("pickles are never opened", "o.npy")
+    np.save(tmp_path / "d.npy", np.zeros((2, 3, 4)))
+    refused(r"an array of shape \(2, 3, 4\)", "d.npy")
+    np.save(tmp_path / "t.npy", np.array(["a", "b"]))
+    refused("numbers are needed", "t.npy")
+    np.savez(tmp_path / "n.npz", dn=DN, count=COUNTS)
+    refused("needs the arrays dn and counts, holds count, dn", "n.npz")
+    np.savez(tmp_path / "s.npz", dn=DN, counts=COUNTS[:2])
+    refused("do not fit", "s.npz")
+    np.savez(tmp_path / "b.npz", dn=DN, counts=COUNTS)
+    data = (tmp_path / "b.npz").read_bytes()
+    (tmp_path / "b.npz").write_bytes(data[: len(data) // 2])
+    refused(r"b\.npz: ", "b.npz")
+    (tmp_path / "e.npy").write_bytes(b"")
+    refused(r"e\.npy: ", "e.npy")
+    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00\x01")
+    refused("not a text file", "x.csv")
+    (tmp_path / "x.dat").write_text("1,2")
+    refused("histograms are read from", "x.dat")
+
+
+def test_all_bad_files_in_one_message(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,2\n2,3\n")
+    (tmp_path / "b.csv").write_text("1,-2\n")
+    (tmp_path / "c.csv").write_text("")
+    with pytest.raises(InputError, match=r"b\.csv: negative.*c\.csv: holds no.*input\.on_bad_file: skip"):
+        read(tmp_path, "*.csv")
+    found = read(tmp_path, "*.csv", on_bad_file="skip")
+    assert found.names == ("a",)
+    assert len(found.notes) == 2
+    with pytest.raises(InputError, match="named twice"):
+        read(tmp_path, "a.csv", "a.csv")
+    with pytest.raises(ConfigError, match="empty"):
+        read(tmp_path)
+
+
+def test_what_is_a_histogram_input(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,2\n2,3\n")
+    np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
+
+    def kind(*files: str, format: str = "auto") -> bool:
+        return is_histogram_input(InputSettings(files=files, format=format), tmp_path)
+
+    assert kind("a.csv")
+    assert kind("*.csv")
+    assert not kind("a.npy")
+    assert kind("a.npy", format="histogram")
+    assert not kind("a.csv", format="raw")
+    assert not kind(".")
+    with pytest.raises(InputError, match="mixed"):
+        kind("a.csv", "a.npy")
+
+
+def test_measured_spectra() -> None:
+    found = read(SIPM, "*.csv")
+    assert found.names == (
+        "M11_LED_1muA",
+        "M11_LED_10muA",
+        "M11_LED_25muA",
+        "M11_LED_50muA",
+        "M11_LED_100nA",
+        "M11_LED_dark",
+    )
+    for i, name in enumerate(found.names):
+        table = np.loadtxt(SIPM / f"{name}.csv", delimiter=",", skiprows=1, dtype=np.int64)
+        total = int(found.counts[0, i].sum())
+        assert total == table[:, 1].sum()
+        assert 9e6 < total < 2e7
+        dn = found.origin[0, i] + np.arange(found.counts.shape[2])
+        assert int((dn * found.counts[0, i].astype(np.int64)).sum()) == (table[:, 0] * table[:, 1]).sum()

@@ -1,0 +1,218 @@
+"""The methods of the literature, each against plain numpy on raw samples, and with nothing to see."""
+
+import numpy as np
+import pytest
+from helpers import reference_pchem
+from helpers.drawn_pixels import draw, samples
+from scipy.stats import kstat
+
+from pchem_pipeline.methods import base, peak_valley_numba, plain_em_numba
+from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings
+from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
+from pchem_pipeline.methods.moments import sample_moments
+from pchem_pipeline.methods.peak_valley import LARGEST_READ_NOISE, read_noise_of_valley
+from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.pcd import pcd_moments
+
+
+def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):
+    drawn = draw_histograms(
+        np.random.default_rng([seed, int(100 * exposure)]),
+        np.full(n_pixels, exposure),
+        gain,
+        100.3,
+        noise,
+        n_frames,
+    )
+    return Sample(drawn.counts, drawn.origin)
+
+
+def test_every_method_says_what_it_is():
+    found = methods()
+    assert {"pchem_em", "plain_em", "photon_transfer", "peak_valley", "cumulants", "emva1288"} <= set(found)
+    assert list(found) == sorted(found, key=lambda name: (found[name].order, name))
+    for name, method in found.items():
+        assert method.name == name
+        assert method.title
+        assert method.source
+        assert method.remark
+
+
+def test_a_method_is_added_by_registering_it(monkeypatch):
+    monkeypatch.setattr(base, "_REGISTERED", {})
+
+    class Guess(Method):
+        name, title, source, needs, remark, order = "guess", "guess", "nobody", "one sample", "wrong", 99
+
+        def estimate(self, pixels, settings):
+            return base.Estimates(base.no_estimates(pixels.n_pixels))
+
+    base.register_method(Guess)
+    assert base.registered() == {"guess": Guess}
+    other = type("Other", (Guess,), {"__module__": "elsewhere"})
+    with pytest.raises(ValueError, match="registered twice"):
+        base.register_method(other)
+
+
+def test_drawn_histograms_have_the_moments_of_the_pcd():
+    n = 400_000
+    drawn = draw_histograms(np.random.default_rng(2), [0.0, 2.0], 0.1, 50.4, 0.31, n)
+    found = sample_moments(drawn.counts, drawn.origin)
+    expected = pcd_moments(*drawn.truth.T)
+    assert (found.n_frames == n).all()
+    error = np.sqrt(expected.variance / n)
+    assert (np.abs(found.mean - expected.mean) < 5 * error).all()
+    spread = np.sqrt((expected.fourth + 2 * expected.variance**2) / n)
+    assert (np.abs(found.variance - expected.variance) < 5 * spread).all()
+    with pytest.raises(ValueError, match="rounding"):
+        draw_histograms(np.random.default_rng(2), 1.0, 1.0, 0.0, 0.2, 10)
+
+
+def test_moments_are_k_statistics():
+    drawn = draw(np.random.default_rng(3), [0.4, 3.0], 10.0, 0.4, n_frames=500)
+    found = sample_moments(drawn.counts, drawn.origin)
+    for pixel in range(2):
+        raw = samples(drawn.counts[pixel], drawn.origin[pixel])
+        for order, name in enumerate(("mean", "variance", "third", "fourth"), 1):
+            assert getattr(found, name)[pixel] == pytest.approx(kstat(raw, order), rel=1e-9)
+
+
+def test_photon_transfer_is_that_of_raw_samples():
+    bright, dark = sample(2.0), sample(0.0)
+    found = methods()["photon_transfer"].estimate(PixelSamples((bright, dark)), Settings()).parameters
+    for pixel in range(3):
+        b, d = (samples(s.counts[pixel], s.origin[pixel]) for s in (bright, dark))
+        gain = (b.mean() - d.mean()) / (b.var(ddof=1) - d.var(ddof=1))
+        expected = (gain * (b.mean() - d.mean()), gain, d.mean(), d.std(ddof=1))
+        np.testing.assert_allclose(found[pixel], expected, rtol=1e-9)
+
+
+def test_the_series_of_two_samples_is_the_two_sample_method():
+    pixels = PixelSamples((sample(2.0), sample(0.0)))
+    pair = methods()["photon_transfer"].estimate(pixels, Settings()).parameters
+    line = methods()["photon_transfer_series"].estimate(pixels, Settings()).parameters
+    np.testing.assert_allclose(line, pair, rtol=1e-9)
+
+
+def test_emva_leaves_out_what_nears_saturation():
+    dark, half, bright = sample(0.0), sample(1.0), sample(8.0, noise=0.9)
+    method = methods()["emva1288"]
+    top = int(bright.moments().mean.mean())
+    whole = method.estimate(PixelSamples((half, dark, bright)), Settings()).parameters
+    inside = method.estimate(PixelSamples((half, dark, bright), (0, top)), Settings()).parameters
+    two = method.estimate(PixelSamples((half, dark)), Settings()).parameters
+    np.testing.assert_allclose(inside, two)
+    assert abs(whole[0, 1] / two[0, 1] - 1) > 1e-6
+    assert np.unique(inside[:, 1]).size == 1
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.6])
+def test_one_em_step_is_that_of_the_paper(noise):
+    drawn = draw(np.random.default_rng(4), 1.7, 9.0, noise, n_frames=400)
+    raw, origin = samples(drawn.counts[0], 0), int(drawn.origin[0])
+    start = reference_pchem.Theta(1.2, 0.1, 100.0 - origin, 4.0)
+    expected = reference_pchem.em_step(raw, start)
+    theta = np.array([start.exposure, 1 / start.gain, start.bias, start.sigma])
+    compiled = theta.copy()
+    assert plain_em_numba.em_pixel.py_func(drawn.counts[0], theta, False, 1, 1e-12) == 1
+    assert plain_em_numba.em_pixel(drawn.counts[0], compiled, False, 1, 1e-12) == 1
+    np.testing.assert_allclose(theta, compiled, rtol=1e-12)
+    found = (theta[0], 1 / theta[1], theta[2], theta[3])
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_em_with_known_bias_and_noise_is_a_maximum():
+    """At the end of the steps no small change of H or g makes the bright sample likelier."""
+    bright, dark = sample(1.5, noise=0.4), sample(0.0, noise=0.4)
+    pixels = PixelSamples((bright, dark))
+    found = methods()["dark_and_bright_mle"].estimate(pixels, Settings(em_tolerance=1e-10)).parameters
+    raw = samples(bright.counts[0], bright.origin[0])
+    exposure, gain, bias, sigma = found[0]
+
+    def height(h, g):
+        return reference_pchem.log_likelihood(raw, reference_pchem.Theta(h, g, bias, sigma))
+
+    # the exposure told is that of the mean; the likelihood has its own, near it
+    best = max((height(h, gain), h) for h in exposure * np.linspace(0.97, 1.03, 121))[1]
+    assert height(best, gain) > max(height(best, gain * 1.003), height(best, gain / 1.003))
+    moments = dark.moments()
+    np.testing.assert_allclose(found[:, 2], moments.mean)
+    np.testing.assert_allclose(found[:, 3], np.sqrt(moments.variance))
+
+
+def test_peaks_compiled_equal_plain():
+    one = sample(2.0, noise=0.22, n_pixels=2, n_frames=800)
+    spacing, width = np.full(2, 11.0), np.full(2, 1.3)
+    plain, compiled = np.full((2, 5), np.nan), np.full((2, 5), np.nan)
+    peak_valley_numba.peaks_tile.py_func(one.counts, spacing, width, plain)
+    peak_valley_numba.peaks_tile(one.counts, spacing, width, compiled)
+    np.testing.assert_allclose(plain, compiled, rtol=1e-12)
+    assert (plain[:, 0] >= 4).all()
+
+
+def test_valley_and_read_noise_belong_together():
+    noise = np.array([0.15, 0.25, 0.35, 0.42])
+    np.testing.assert_allclose(read_noise_of_valley(2 * np.exp(-1 / (8 * noise**2))), noise)
+    assert np.isnan(read_noise_of_valley(np.array([1.0, 1.5, 0.0, -1.0]))).all()
+    assert pytest.approx(0.4247, abs=1e-4) == LARGEST_READ_NOISE
+
+
+EMPTY = np.zeros((1, 40), np.uint32)
+
+
+def spikes(*bins):
+    counts = EMPTY.copy()
+    counts[0, list(bins)] = 50
+    return counts
+
+
+@pytest.mark.parametrize("counts", [EMPTY, spikes(7), spikes(7, 8), spikes(0, 39), spikes(7, 18, 29)])
+def test_no_pixel_stops_a_method(counts):
+    one = Sample(counts, np.array([100]))
+    for other in (one, sample(2.0, n_pixels=1)):
+        for result in compare(PixelSamples((one, other, one)), None, Settings()):
+            assert result.missing == ""
+            assert result.estimates.shape == (1, 4)
+
+
+def test_methods_say_which_samples_they_lack():
+    results = {r.name: r for r in compare(PixelSamples((sample(1.0),)), None, Settings())}
+    assert results["photon_transfer"].missing == "needs a dark and a bright sample; this comparison has 1"
+    assert results["photon_transfer_series"].missing.startswith("needs a series")
+    assert results["pchem_em"].missing == ""
+    assert results["photon_transfer"].estimates is None
+    told = results["pchem_em"].as_json()["medians"]
+    assert told["conversion_gain"] == pytest.approx(1 / 11, rel=0.05)
+    assert told["read_noise_e"] == pytest.approx(0.3, rel=0.1)
+
+
+def test_bounds_are_those_of_the_samples_given():
+    bright, dark = sample(2.0), sample(0.0)
+    truth = np.tile([2.0, 1 / 11, 100.3, 0.3 * 11], (3, 1))
+    one = pixel_bounds([bright], truth)[0]
+    covariance = inverse_information(3000 * expected_information(2.0, 0.3))
+    assert one[0] == pytest.approx(np.sqrt(covariance[0, 0]) / 2)
+    assert one[1] == pytest.approx(np.sqrt(covariance[1, 1]))
+    assert one[2] == pytest.approx(np.sqrt(covariance[2, 2]))
+    gradient = np.array([0, 1, 0, 1])
+    assert one[3] == pytest.approx(np.sqrt(gradient @ covariance @ gradient))
+    both = pixel_bounds([bright, dark], truth)[0]
+    assert (both < one).all()
+    truth[1] = np.nan
+    assert np.isnan(pixel_bounds([bright], truth)[1]).all()
+
+
+def test_errors_are_relative_and_summed_up_over_answers():
+    truth = np.array([[2.0, 0.1, 100.0, 3.0]] * 3)
+    found = truth * np.array([[1.1, 1.0, 1.0, 1.0], [1.0, 0.9, 1.0, 1.0], [np.nan] * 4])
+    found[0, 2] += 2.0
+    errors = errors_of(found, truth)
+    np.testing.assert_allclose(errors["quanta_exposure"][:2], [0.1, 0.0], atol=1e-12)
+    np.testing.assert_allclose(errors["bias"][:2], [0.2, 0.0], atol=1e-12)
+    np.testing.assert_allclose(errors["read_noise_e"][:2], [0.0, -0.1], atol=1e-12)
+    summary = summarise_errors(errors["conversion_gain"], np.full(3, 0.05))
+    assert (summary.n, summary.bound) == (2, pytest.approx(0.05))
+    assert summary.rmse == pytest.approx(0.1 / np.sqrt(2))
+    assert summarise_errors(np.full(2, np.nan), np.ones(2)).rmse is None

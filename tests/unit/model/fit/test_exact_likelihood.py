@@ -1,0 +1,152 @@
+"""The exact quantised likelihood of one sample: where it is used, and what rounding does without it."""
+
+import numpy as np
+import pytest
+from helpers.drawn_pixels import draw
+from scipy.optimize import minimize
+
+from pchem_pipeline.model.errors.fisher import cramer_rao
+from pchem_pipeline.model.fit import rounding_numba
+from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import find_run
+from pchem_pipeline.store.run_store import RunStore
+
+EXACT, AUTO = FitSettings(likelihood="exact"), FitSettings(likelihood="auto")
+
+
+def stack(results):
+    return np.stack(
+        [results.quanta_exposure, results.conversion_gain, results.bias, results.read_noise_dn], 1
+    )
+
+
+def test_the_predicted_bias_is_where_the_density_goes_on_the_exact_masses():
+    h, a, mu, sigma, n = 1.3, 3.2, 100.4, 1.0, 1e6
+    x = np.arange(90, 150)
+    weights = pcd_mass(x, h, 1 / a, mu, np.sqrt(sigma**2 - 1 / 12) / a)
+
+    def cost(theta):
+        return -n * float(
+            weights @ log_pcd(x, np.exp(theta[0]), 1 / theta[1], theta[2], np.exp(theta[3] / 2))
+        )
+
+    truth = np.array([np.log(h), a, mu, 2 * np.log(sigma)])
+    found = minimize(
+        cost, truth, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-9, "maxiter": 4000}
+    )
+    shift = found.x - truth
+    bound = cramer_rao(h, 1 / a, sigma, n)
+    scale = np.array([1 / h, a**2, 1.0, 2 / sigma])
+    errors = np.sqrt(np.diagonal(bound)) * scale
+    predicted = rounding_bias([np.array([v]) for v in (h, 1 / a, mu, sigma)], np.array([n]))[0]
+    assert np.abs(predicted).max() > 0.3
+    np.testing.assert_allclose(predicted, shift / errors, rtol=0.05, atol=0.005)
+
+
+def test_the_compiled_bias_equals_the_plain_one():
+    one, other = np.empty(4), np.empty(4)
+    arguments = (0.4, 3.0, 7.3, 1.0, 1000.0)
+    assert rounding_numba.rounding_bias(*arguments, one)
+    assert rounding_numba.rounding_bias.py_func(*arguments, other)
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+    assert not rounding_numba.rounding_bias(0.4, 3.0, 7.3, 0.28, 1000.0, one)
+
+
+def test_pixels_are_named_where_rounding_matters_and_what_is_skipped_is_safe():
+    n = np.full(6, 17_750.0)
+    gains = 1 / np.array([1.5, 2.5, 4.0, 5.0, 10.0, np.nan])
+    parameters = [np.full(6, 2.0), gains, np.full(6, 100.3), 0.3 / gains]
+    named = biased_by_rounding(parameters, n)
+    assert named.tolist() == [True, True, True, False, False, False]
+    for h in (0.2, 2.0, 12.0):
+        for noise in (0.12, 0.2, 0.35, 0.6):
+            sigma = (17_750**0.5 / 20.0) ** 0.25 * np.ones(16)
+            if noise / sigma[0] < 0.7:
+                bias = rounding_bias(
+                    [np.full(16, h), noise / sigma, np.arange(16) / 16, sigma], np.full(16, 17_750.0)
+                )
+                assert np.abs(bias).max() < LARGEST_BIAS
+
+
+def test_density_is_left_alone_and_auto_refits_only_what_rounding_biases():
+    fine, coarse = (draw(np.random.default_rng(2), [1.0, 2.0], step, 0.3) for step in (10.0, 2.5))
+    for drawn, changes in ((fine, False), (coarse, True)):
+        plain = fit_histograms(drawn.counts, drawn.origin)
+        assert refine(drawn.counts, drawn.origin, plain, FitSettings()) is plain
+        auto = refine(drawn.counts, drawn.origin, plain, AUTO)
+        assert ((auto.conversion_gain != plain.conversion_gain) == changes).all()
+    exact = refine(drawn.counts, drawn.origin, plain, EXACT)
+    np.testing.assert_array_equal(exact.conversion_gain, auto.conversion_gain)
+    assert (plain.fit_status & FitStatus.COARSE_STEPS == 0).all() or (exact.fit_status == 0).all()
+
+
+def test_the_exact_maximum_is_that_of_scipy():
+    drawn = draw(np.random.default_rng(7), [1.5], 2.2, 0.33)
+    plain = fit_histograms(drawn.counts, drawn.origin)
+    mine = refine(drawn.counts, drawn.origin, plain, EXACT)
+    c = drawn.counts[0]
+    x = drawn.origin[0] + np.flatnonzero(c)
+
+    def cost(p):
+        h, a, mu, noise = np.exp(p[0]), p[1], p[2], np.exp(p[3])
+        return -float(c[c > 0] @ np.log(pcd_mass(x, h, 1 / a, mu, noise)))
+
+    h, g, mu, sigma = drawn.truth[0]
+    start = [np.log(h), 1 / g, mu, np.log(g * np.sqrt(sigma**2 - 1 / 12))]
+    found = minimize(
+        cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-8, "maxiter": 3000}
+    )
+    errors = np.sqrt(np.diagonal(mine.covariance[0]))
+    wanted = [np.exp(found.x[0]), 1 / found.x[1], found.x[2]]
+    assert (np.abs(stack(mine)[0, :3] - wanted) < 0.01 * errors[:3]).all()
+    assert mine.log_likelihood[0] == pytest.approx(-found.fun, abs=1e-3)
+
+
+def test_few_dn_per_electron_have_their_own_starts():
+    drawn = draw(np.random.default_rng(1), np.full(8, 2.0), 1.2, 0.384)
+    plain = fit_histograms(drawn.counts, drawn.origin)
+    mine = refine(drawn.counts, drawn.origin, plain, AUTO)
+    good = mine.fit_status == 0
+    assert good.sum() >= 5
+    pulls = (mine.conversion_gain - 1 / 1.2) / np.sqrt(mine.covariance[:, 1, 1])
+    assert (np.abs(pulls[good]) < 5).all()
+    assert abs(pulls[good].mean()) * np.sqrt(good.sum()) < 5
+    before = (plain.conversion_gain - 1 / 1.2) / np.sqrt(plain.covariance[:, 1, 1])
+    known = np.isfinite(before)
+    assert known.sum() >= 4
+    assert abs(before[known].mean()) * np.sqrt(known.sum()) > 5  # rounding biases the density
+
+
+def test_nothing_to_fit_stays_nothing():
+    counts = np.zeros((2, 9), np.uint32)
+    counts[1, 3] = 50
+    plain = fit_histograms(counts, np.zeros(2, np.int64))
+    found = refine(counts, np.zeros(2, np.int64), plain, EXACT)
+    assert found.fit_status.tolist() == plain.fit_status.tolist()
+    assert np.isnan(found.conversion_gain).all()
+
+
+def test_a_run_says_how_many_pixels_rounding_biases(tmp_path):
+    drawn = draw(np.random.default_rng(3), [1.0, 2.0, 1.5], 2.5, 0.3)
+    dn = drawn.origin[0] + np.arange(drawn.counts.shape[1])
+    np.savez(tmp_path / "h.npz", dn=dn, counts=drawn.counts)
+    gains = {}
+    for likelihood, words in (("density", "biases 100.0% of the pixels by more than 0.05"), ("auto", "")):
+        path = tmp_path / "run.yaml"
+        path.write_text(
+            "run: {store: run.zarr, tile: 8}\ninput: {files: [h.npz]}\n"
+            f"fit: {{likelihood: {likelihood}}}\n"
+        )
+        run_stages(find_run(path), ["ingest", "histogram", "fit"], Command(quiet=True, progress="off"))
+        store = RunStore.open(tmp_path / "run.zarr")
+        record = store.records.read("fit")
+        assert record is not None
+        assert words in " ".join(record.notes)
+        assert ("rounding" in " ".join(record.notes)) == bool(words)
+        gains[likelihood] = store.read("fit/conversion_gain")
+    assert (gains["density"] != gains["auto"]).all()

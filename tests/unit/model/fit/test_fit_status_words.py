@@ -1,0 +1,189 @@
+"""Every status word from a pixel built for it; degenerate input never raises and never hangs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.drawn_pixels import draw
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit import pchem_numba
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, describe
+
+
+def fit_one(counts: NDArray[np.generic], origin: int = 100, **options: object) -> FitResult:
+    return fit_histograms(np.asarray(counts, np.uint32)[None], np.array([origin]), **options)  # type: ignore[arg-type]
+
+
+def drawn(
+    exposure: float, step: float, noise: float, seed: int = 1, n_frames: int = 17_750, **options: object
+) -> FitResult:
+    pixel = draw(np.random.default_rng(seed), exposure, step, noise, n_frames=n_frames)
+    return fit_histograms(pixel.counts, pixel.origin, **options)  # type: ignore[arg-type]
+
+
+def word(result: FitResult) -> FitStatus:
+    return FitStatus(int(result.fit_status[0]))
+
+
+def histogram_of(values: NDArray[np.floating], size: int = 400) -> NDArray[np.int64]:
+    return np.bincount(np.rint(values).astype(int), minlength=size)
+
+
+def test_a_good_pixel_has_no_word() -> None:
+    result = drawn(2.0, 11.0, 0.3)
+    assert word(result) == FitStatus.OK
+    assert np.isfinite(result.covariance).all()
+    assert result.likelihood_gap[0] > 30
+    assert describe(0) == "good fit"
+
+
+def test_no_data() -> None:
+    assert word(fit_one(np.zeros(50))) == FitStatus.NO_DATA
+    assert word(fit_one(np.zeros(0))) == FitStatus.NO_DATA
+    assert word(fit_one(np.zeros(50), adc_limits=(100, 149))) == FitStatus.NO_DATA
+
+
+def test_fewer_than_three_bins() -> None:
+    counts = np.zeros(50)
+    counts[7] = 1000
+    assert word(fit_one(counts)) == FitStatus.TOO_FEW_BINS
+    counts[30] = 10
+    assert word(fit_one(counts)) == FitStatus.TOO_FEW_BINS
+    assert np.isnan(fit_one(counts).bias[0])
+
+
+def test_not_converged_holds_nan() -> None:
+    result = drawn(2.0, 11.0, 0.4, settings=FitSettings(algorithm="em", em_max_iterations=20))
+    assert word(result) & FitStatus.NOT_CONVERGED
+    assert np.isnan(result.quanta_exposure[0])
+    assert np.isnan(result.covariance).all()
+
+
+def test_gain_not_identified_without_electrons() -> None:
+    rng = np.random.default_rng(3)
+    for sigma in (2.0, 3.0, 5.0):
+        assert word(fit_one(histogram_of(rng.normal(60, sigma, 17_750)))) & FitStatus.GAIN_NOT_IDENTIFIED
+
+
+def test_exposure_at_its_lower_bound() -> None:
+    result = drawn(0.03, 11.0, 0.2, settings=FitSettings(minimum_quanta_exposure=0.1))
+    assert word(result) & FitStatus.EXPOSURE_AT_BOUND
+    assert np.isnan(result.conversion_gain[0])
+    assert not word(drawn(0.03, 11.0, 0.2)) & FitStatus.EXPOSURE_AT_BOUND
+
+
+def test_bias_ambiguous() -> None:
+    result = drawn(40.0, 11.0, 0.35)
+    assert word(result) & FitStatus.BIAS_AMBIGUOUS
+    assert result.likelihood_gap[0] < 5
+    assert np.isfinite(result.bias[0])  # a caution, not a failure
+    strict = drawn(40.0, 11.0, 0.35, settings=FitSettings(gap_threshold=0.0))
+    assert not word(strict) & FitStatus.BIAS_AMBIGUOUS
+
+
+def test_not_informative() -> None:
+    result = drawn(1.0, 11.0, 0.6)
+    assert word(result) & FitStatus.NOT_INFORMATIVE
+    assert np.isfinite(result.conversion_gain[0])
+    assert (
+        not word(drawn(1.0, 11.0, 0.6, settings=FitSettings(read_noise_limit=0.9)))
+        & FitStatus.NOT_INFORMATIVE
+    )
+
+
+def test_adc_limits() -> None:
+    pixel = draw(np.random.default_rng(1), 2.0, 11.0, 0.3)
+    seen = pixel.origin[0] + np.flatnonzero(pixel.counts[0])
+    low, high = int(seen[0]), int(seen[-1])
+    for limits, expected in (((low, high + 9), True), ((low - 9, high), True), ((low - 1, high + 1), False)):
+        result = fit_histograms(pixel.counts, pixel.origin, adc_limits=limits)
+        assert bool(word(result) & FitStatus.ADC_LIMIT) is expected
+
+
+def test_outside_the_window() -> None:
+    pixel = draw(np.random.default_rng(1), 2.0, 11.0, 0.3)
+    for name in ("under", "over"):
+        result = fit_histograms(pixel.counts, pixel.origin, **{name: np.array([3])})
+        assert word(result) == FitStatus.OUTSIDE_WINDOW
+        assert np.isfinite(result.bias[0])
+    nothing = fit_histograms(pixel.counts, pixel.origin, np.array([0]), np.array([0]))
+    assert word(nothing) == FitStatus.OK
+
+
+def test_poor_fit_of_a_telegraph_pixel() -> None:
+    rng = np.random.default_rng(5)
+    values = rng.normal(50, 3, 17_750) + 30.0 * (rng.random(17_750) < 0.5)
+    result = fit_one(histogram_of(values))
+    assert word(result) & FitStatus.POOR_FIT
+    assert result.goodness_p[0] < 1e-6
+
+
+def test_coarse_steps() -> None:
+    assert word(drawn(2.0, 2.2, 0.35)) & FitStatus.COARSE_STEPS
+    assert not word(drawn(2.0, 4.0, 0.3)) & FitStatus.COARSE_STEPS
+
+
+def test_every_word_has_a_sentence_and_the_loops_agree_on_the_bits() -> None:
+    assert set(MEANINGS) == set(FitStatus)
+    everything = int(sum(FitStatus))
+    assert describe(everything).count(";") >= len(MEANINGS) - 1
+    assert (FAILED & FitStatus.BIAS_AMBIGUOUS) == 0
+    names = {"FIT_NOT_CONVERGED": "NOT_CONVERGED"}
+    for name in ("NO_DATA", "TOO_FEW_BINS", "FIT_NOT_CONVERGED", "GAIN_NOT_IDENTIFIED", "EXPOSURE_AT_BOUND",
+                 "BIAS_AMBIGUOUS", "NOT_INFORMATIVE", "COARSE_STEPS"):  # fmt: skip
+        assert getattr(pchem_numba, name) == FitStatus[names.get(name, name)]
+
+
+def degenerate_pixels() -> dict[str, NDArray[np.generic]]:
+    rng = np.random.default_rng(0)
+    pixel = draw(rng, 2.0, 11.0, 0.3)
+    values = pixel.origin[0] + np.repeat(np.arange(pixel.counts.shape[1]), pixel.counts[0])
+    three = np.zeros(60)
+    three[[7, 8, 9]] = [100, 50, 2]
+    spread = np.zeros(4000)
+    spread[[0, 1999, 3999]] = [5, 50, 5]
+    huge = np.zeros(300)
+    huge[[0, 10, 20, 21]] = [4e9, 3e9, 1e9, 10]
+    return {
+        "three bins": three,
+        "three bins far apart": spread,
+        "uniform": np.full(256, 70),
+        "comb": np.where(np.arange(300) % 7 == 0, 60_000, 0),
+        "needles at every DN": np.full(30, 600),
+        "saturated high": histogram_of(np.minimum(values, 105.0)),
+        "saturated low": histogram_of(np.maximum(values, 120.0)),
+        "mirrored": histogram_of(300.0 - values),
+        "huge outlier above": histogram_of(np.append(values, 5000.0), 5001),
+        "huge outlier below": histogram_of(np.append(values + 5000.0, 0.0), 5300),
+        "one frame": histogram_of(values[:1]),
+        "four frames": histogram_of(values[::5000]),
+        "huge counts": huge,
+        "hot": histogram_of(rng.poisson(300, 17_750) * 11.0 + rng.normal(60, 3, 17_750), 6000),
+    }
+
+
+@pytest.mark.timeout(60)
+def test_degenerate_pixels_end_with_a_word_or_an_answer() -> None:
+    for algorithm in ("newton", "em"):
+        settings = FitSettings(algorithm=algorithm, em_max_iterations=200)  # type: ignore[arg-type]
+        for name, counts in degenerate_pixels().items():
+            result = fit_one(counts, settings=settings)
+            failed = bool(word(result) & FAILED)
+            assert np.isnan(result.conversion_gain[0]) == failed, name
+            assert result.n_iterations[0] < 6000, name
+            if name not in ("huge outlier above", "huge outlier below", "hot", "four frames"):
+                assert word(result) != FitStatus.OK, name
+
+
+def test_an_outlier_does_not_spoil_a_pixel() -> None:
+    pixel = draw(np.random.default_rng(1), 2.0, 11.0, 0.3)
+    clean = fit_histograms(pixel.counts, pixel.origin)
+    counts = np.zeros((1, 600), np.uint32)
+    counts[0, : pixel.counts.shape[1]] = pixel.counts[0]
+    counts[0, 590] = 1
+    hit = fit_histograms(counts, pixel.origin)
+    assert hit.conversion_gain[0] == pytest.approx(clean.conversion_gain[0], rel=0.01)
+    assert word(hit) == FitStatus.OK

@@ -1,0 +1,291 @@
+"""The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from helpers.drawn_pixels import draw
+from helpers.joint_material import draw_series
+from helpers.reference_pchem import Theta, memberships
+from iminuit import Minuit
+
+from pchem_pipeline.model.fit import joint_climb_numba, joint_likelihood_numba, joint_types_numba
+from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao
+from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.grown_inputs import pack
+from pchem_pipeline.model.law.grown_types_numba import N_LOBE_ROWS
+from pchem_pipeline.model.law.pcd import pcd, pcd_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+EXACT = FitSettings(likelihood="exact")
+
+
+class Pixel:
+    """One pixel of a series as the loops take it."""
+
+    def __init__(self, series):
+        self.places = np.concatenate([[0], np.cumsum([c.shape[1] for c in series.counts])]).astype(np.int64)
+        counts = np.concatenate([c[0] for c in series.counts])
+        most = int(np.diff(self.places).max())
+        self.samples = joint_types_numba.make_samples(len(series.counts), most, np.array(series.dark))
+        origin = np.array([o[0] for o in series.origins], np.int64)
+        self.middle = joint_types_numba.load_samples(counts, self.places, origin, self.samples)
+        law = pack(MarginalModel(), 1)
+        self.bench = joint_types_numba.make_bench(most, law, np.empty((N_LOBE_ROWS, 1)))
+        self.answers = joint_types_numba.make_answers(len(series.counts))
+
+    def theta(self, exposures, step, bias, v):
+        log = [np.log(h) if h > 0 else -60.0 for h in exposures]
+        return np.array([*log, step, bias - self.middle, v])
+
+    def __call__(self, theta, exact, kernel=joint_likelihood_numba.evaluate_joint):
+        return kernel(self.samples, self.middle, theta, exact, self.bench, self.answers)
+
+    def dense(self):
+        """Score and information as one vector and matrix."""
+        n = self.samples.dark.size
+        score, matrix = np.zeros(n + 3), np.zeros((n + 3, n + 3))
+        for j in range(n):
+            where = [j, n, n + 1, n + 2]
+            score[where] += self.answers.score[j]
+            matrix[np.ix_(where, where)] += self.answers.information[j]
+        return score, matrix
+
+
+@pytest.fixture
+def pixel():
+    return Pixel(draw_series(np.random.default_rng(5), [0.7, 3.0, 0.0], 0.35, 1, n_frames=600))
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_score_and_information_are_the_derivatives(pixel, exact):
+    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
+    free = [0, 1, 3, 4, 5]
+    pixel(theta, exact)
+    score, information = pixel.dense()
+    for i in free:
+        h = 1e-4 * max(1.0, abs(theta[i]))
+        ends = []
+        for sign in (1, -1):
+            moved = theta.copy()
+            moved[i] += sign * h
+            value = pixel(moved, exact)
+            ends.append((value, pixel.dense()[0]))
+        assert score[i] == pytest.approx((ends[0][0] - ends[1][0]) / (2 * h), rel=1e-5, abs=1e-3)
+        slope = -(ends[0][1] - ends[1][1]) / (2 * h)
+        np.testing.assert_allclose(
+            information[i, free], slope[free], rtol=1e-4, atol=1e-3 * np.abs(slope).max()
+        )
+
+
+def test_the_likelihood_is_that_of_the_samples(pixel):
+    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
+    for exact in (False, True):
+        total = 0.0
+        for j, exposure in enumerate((0.8, 2.7, 0.0)):
+            facts = pixel.samples.facts[j]
+            n = int(facts[joint_types_numba.N_BINS])
+            first = pixel.middle + facts[joint_types_numba.CENTRE] + facts[joint_types_numba.FIRST]
+            x, c = first + np.arange(n), pixel.samples.weights[j, :n]
+            if exact:
+                law = pcd_mass(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0) / 9.7)
+            else:
+                law = pcd(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0))
+            total += float(c[c > 0] @ np.log(law[c > 0]))
+        assert pixel(theta, exact) == pytest.approx(total, rel=1e-9)
+
+
+def test_the_compiled_loop_equals_the_plain_one():
+    tiny = Pixel(draw_series(np.random.default_rng(2), [0.5, 0.0], 0.3, 1, step=4.0, n_frames=12))
+    theta = tiny.theta([0.6, 0.0], 4.2, 100.0, np.log(1.6))
+    value = tiny(theta, False)
+    before = tiny.dense()
+    assert tiny(theta, False, joint_likelihood_numba.evaluate_joint.py_func) == pytest.approx(
+        value, rel=1e-12
+    )
+    for one, other in zip(before, tiny.dense(), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_the_arrow_is_solved_as_the_dense_matrix(pixel):
+    theta = pixel.theta([0.72, 3.05, 0.0], 9.95, 100.4, np.log(12.2))
+    pixel(theta, False)
+    score, information = pixel.dense()
+    free = [0, 1, 3, 4, 5]
+    step = np.empty(6)
+    held = np.array([False, False, True, False, False, False])
+    squared = joint_likelihood_numba.solve_arrow(pixel.answers, 0.0, held, step, np.zeros((4, 4)))
+    wanted = np.linalg.solve(information[np.ix_(free, free)], score[free])
+    np.testing.assert_allclose(step[free], wanted, rtol=1e-8)
+    assert squared == pytest.approx(float(score[free] @ wanted), rel=1e-8)
+    covariance = np.empty((6, 6))
+    assert joint_likelihood_numba.joint_covariance(
+        pixel.answers, theta, pixel.samples.dark, False, covariance
+    )
+    scale = np.array([0.72, 3.05, 1.0, 1.0, 1.0])
+    matrix = information[np.ix_(free, free)] / np.outer(scale, scale)
+    matrix[[0, 1], [0, 1]] += score[:2] / scale[:2] ** 2
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(matrix), rtol=1e-7)
+    assert (covariance[2] == 0).all()
+
+
+def test_an_em_step_is_that_of_the_paper_with_all_samples(pixel):
+    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
+    pixel(theta, False)
+    out = np.empty(6)
+    assert joint_climb_numba.joint_em_step(pixel.samples, theta, pixel.answers, -20.0, out)
+    a, b, c, x1, x2, n, mean_k = [], [], [], [], [], [], []
+    for j, exposure in enumerate((0.8, 2.7, 0.0)):
+        facts = pixel.samples.facts[j]
+        bins = int(facts[joint_types_numba.N_BINS])
+        first = pixel.middle + facts[joint_types_numba.CENTRE] + facts[joint_types_numba.FIRST]
+        x = np.repeat(first + np.arange(bins), pixel.samples.weights[j, :bins].astype(int))
+        k = np.zeros((x.size, 1))
+        gamma = np.ones((x.size, 1))
+        if exposure > 0:
+            gamma = memberships(x, Theta(exposure, 1 / 9.7, 100.9, np.sqrt(13.0)))
+            k = np.arange(gamma.shape[1])[None, :]
+        k1, k2 = (gamma * k).sum(axis=1), (gamma * k**2).sum(axis=1)
+        mean_k.append(k1.mean())
+        for total, value in zip(
+            (a, b, c, x1, x2, n), (k1, k2, x * k1, x, x**2, np.ones(x.size)), strict=True
+        ):
+            total.append(value.sum())
+    a, b, c, x1, x2 = (sum(total) / sum(n) for total in (a, b, c, x1, x2))
+    step = (c - x1 * a) / (b - a**2)
+    bias = x1 - a * step
+    variance = x2 - x1**2 - (b - a**2) * step**2
+    np.testing.assert_allclose(np.exp(out[:2]), mean_k[:2], rtol=1e-9)
+    np.testing.assert_allclose(out[3:], [step, bias - pixel.middle, np.log(variance)], rtol=1e-8)
+
+
+@pytest.mark.parametrize("settings", [FitSettings(), EXACT])
+def test_one_sample_is_the_single_fit(settings):
+    drawn = draw(np.random.default_rng(3), [0.5, 2.0, 6.0], 10.0, 0.3)
+    single = fit_histograms(drawn.counts, drawn.origin)
+    joint = fit_joint([drawn.counts], [drawn.origin], settings=settings)
+    errors = np.sqrt(np.diagonal(single.covariance, axis1=1, axis2=2))
+    close = 1e-4 if settings.likelihood == "density" else 0.05
+    for i, name in enumerate(("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")):
+        mine = np.ravel(getattr(joint, name))
+        assert (np.abs(mine - getattr(single, name)) < close * errors[:, i]).all()
+    np.testing.assert_allclose(
+        np.diagonal(joint.covariance, axis1=1, axis2=2), errors**2, rtol=1e-3 if close < 1e-3 else 0.05
+    )
+    assert (joint.fit_status == single.fit_status).all()
+
+
+def minus_log_likelihood(series, pixel, h1, h2, g, mu, sigma):
+    value = 0.0
+    noise = g * np.sqrt(max(sigma**2 - 1 / 12, 1e-9))
+    for counts, origin, h in zip(series.counts, series.origins, (h1, h2, 0.0), strict=True):
+        c = counts[pixel]
+        x = origin[pixel] + np.flatnonzero(c)
+        value -= c[c > 0] @ np.log(pcd_mass(x, h, g, mu, noise))
+    return value
+
+
+def test_iminuit_finds_the_same_maximum():
+    series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.6, 2)
+    joint = fit_joint(series.counts, series.origins, dark=series.dark, settings=EXACT)
+    for pixel in range(2):
+        found = Minuit(partial(minus_log_likelihood, series, pixel), 0.7, 2.8, 0.105, 101.0, 6.1)
+        found.errordef = Minuit.LIKELIHOOD
+        found.limits = [(0.01, 20), (0.01, 20), (0.02, 1), (80, 120), (1, 20)]
+        found.migrad()
+        found.hesse()
+        order = [0, 1, 3, 4, 5]
+        mine = np.concatenate(
+            [
+                joint.quanta_exposure[pixel, :2],
+                [joint.conversion_gain[pixel], joint.bias[pixel], joint.read_noise_dn[pixel]],
+            ]
+        )
+        errors = np.sqrt(np.diagonal(joint.covariance[pixel])[order])
+        np.testing.assert_allclose(mine, np.array(found.values), atol=0.02 * errors.min(), rtol=1e-2)
+        assert (np.abs(mine - np.array(found.values)) < 0.02 * errors).all()
+        np.testing.assert_allclose(errors, np.array(found.errors), rtol=0.03)
+
+
+def test_a_pixel_does_not_depend_on_the_others():
+    series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.5, 4)
+    together = fit_joint(series.counts, series.origins)
+    alone = fit_joint([c[2:3] for c in series.counts], [o[2:3] for o in series.origins])
+    assert together.conversion_gain[2] == alone.conversion_gain[0]
+    np.testing.assert_array_equal(together.covariance[2], alone.covariance[0])
+
+
+def test_words_say_why_a_pixel_has_no_value():
+    series = draw_series(np.random.default_rng(6), [0.6, 2.5, 0.0], 0.3, 3)
+    series.counts[1][0] = 0
+    for j in (0, 1):
+        series.counts[j][1] = 0
+        series.counts[j][1, 5] = 4000
+    found = fit_joint(series.counts, series.origins, dark=series.dark, adc_limits=(0, 150), outside=[0, 0, 3])
+    assert found.fit_status[0] & FitStatus.NO_DATA
+    assert found.fit_status[1] & FitStatus.TOO_FEW_BINS
+    assert np.isnan(found.conversion_gain[:2]).all()
+    assert found.fit_status[2] & FitStatus.ADC_LIMIT
+    assert found.fit_status[2] & FitStatus.OUTSIDE_WINDOW
+    assert np.isfinite(found.conversion_gain[2])
+
+
+def test_samples_without_any_electrons_do_not_give_a_gain():
+    series = draw_series(np.random.default_rng(6), [0.0, 0.0], 0.3, 3)
+    found = fit_joint(series.counts, series.origins, dark=[False, True])
+    assert np.isnan(found.conversion_gain).all()
+    lacking = FitStatus.GAIN_NOT_IDENTIFIED | FitStatus.EXPOSURE_AT_BOUND | FitStatus.NOT_CONVERGED
+    assert ((found.fit_status & int(lacking)) != 0).all()
+
+
+def test_what_does_not_fit_together_is_refused():
+    series = draw_series(np.random.default_rng(6), [0.6, 2.5], 0.3, 3)
+    with pytest.raises(ValueError, match="no sample holds electrons"):
+        fit_joint(series.counts, series.origins, dark=[True, True])
+    with pytest.raises(ValueError, match="one entry for each sample"):
+        fit_joint(series.counts, series.origins[:1])
+    with pytest.raises(ValueError, match=r"different numbers of pixels: \[2, 3\]"):
+        fit_joint([series.counts[0], series.counts[1][:2]], series.origins)
+
+
+def test_the_bound_of_one_sample_is_the_single_one_and_more_samples_only_help():
+    from pchem_pipeline.model.errors.fisher import cramer_rao
+
+    one = joint_cramer_rao([2.0], 0.1, 5.0, 1000)
+    np.testing.assert_allclose(one, cramer_rao(2.0, 0.1, 5.0, 1000), rtol=1e-6)
+    more = joint_cramer_rao([2.0, 0.0], 0.1, 5.0, [1000, 1000])
+    assert (np.diagonal(more)[[0, 2, 3, 4]] < np.diagonal(one)).all()
+    assert (more[1] == 0).all()
+
+
+def test_plain_em_climbs_to_the_same_place():
+    series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.3, 2)
+    newton = fit_joint(series.counts, series.origins)
+    em = fit_joint(series.counts, series.origins, settings=FitSettings(algorithm="em"))
+    errors = np.sqrt(newton.covariance[:, 2, 2])
+    assert (np.abs(em.conversion_gain - newton.conversion_gain) < 0.01 * errors).all()
+    assert (em.n_iterations > newton.n_iterations).all()
+
+
+def test_a_few_glitches_do_not_move_the_estimates():
+    series = draw_series(np.random.default_rng(12), [0.6, 3.0, 0.0], 0.4, 6)
+    clean = fit_joint(series.counts, series.origins, dark=series.dark)
+    assert (clean.outlier_share == 0).all()
+    counts = [np.pad(sample, ((0, 0), (0, 3000))) for sample in series.counts]
+    for j, place in ((0, 2500), (1, 900), (2, 1700)):
+        counts[j][:, place] += 2
+    errors = np.sqrt(np.diagonal(clean.covariance, axis1=1, axis2=2))[:, [0, 1, 3, 4, 5]]
+    shifts = {}
+    for guard in (1e-3, 0.0):
+        found = fit_joint(counts, series.origins, dark=series.dark, settings=FitSettings(tail_guard=guard))
+        mine, others = (
+            np.column_stack([f.quanta_exposure[:, :2], f.conversion_gain, f.bias, f.read_noise_dn])
+            for f in (found, clean)
+        )
+        shifts[guard] = np.abs(mine - others) / errors
+        if guard:
+            np.testing.assert_allclose(found.outlier_share, 6 / (3 * 4000 + 6), rtol=1e-9)
+    assert shifts[1e-3].max() < 0.1
+    assert not (shifts[0.0].max(axis=1) < 2.0).any()

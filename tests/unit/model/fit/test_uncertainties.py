@@ -1,0 +1,271 @@
+"""Standard errors, sandwich errors and profile intervals against independent computations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.drawn_pixels import Drawn, draw, samples
+from iminuit import Minuit
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+from pchem_pipeline.base.variables import INTERVALS, interval_names
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
+from pchem_pipeline.model.errors import information_numba
+from pchem_pipeline.model.errors.fisher import correlations, covariance_from, sandwich_covariance
+from pchem_pipeline.model.fit import profile_numba
+from pchem_pipeline.model.fit.intervals import INTERVAL_NAMES, profile_intervals, quantile_of
+from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.stages.fit.fit import fit_tile
+
+Array = NDArray[np.float64]
+CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.2), (1.5, 12.0, 0.46)]
+N = 3000
+
+
+def estimates(fit: FitResult) -> Array:
+    return np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+
+
+def fitted(case: tuple[float, float, float], seed: int = 3) -> tuple[Drawn, Array, Array]:
+    pixel = draw(np.random.default_rng(seed), *case, n_frames=N)
+    fit = fit_histograms(pixel.counts, pixel.origin, settings=FitSettings(tolerance=1e-12))
+    return pixel, estimates(fit)[0], fit.covariance[0]
+
+
+def occupied(pixel: Drawn) -> tuple[Array, Array]:
+    codes = np.flatnonzero(pixel.counts[0])
+    return (pixel.origin[0] + codes).astype(float), pixel.counts[0, codes].astype(float)
+
+
+def minuit(pixel: Drawn, at: Array) -> Minuit:
+    x, c = occupied(pixel)
+
+    def cost(h: float, g: float, mu: float, sigma: float) -> float:
+        return -float(c @ log_pcd(x, h, g, mu, sigma))
+
+    found = Minuit(cost, *at)
+    found.errordef = Minuit.LIKELIHOOD
+    found.tol = 1e-4
+    found.migrad()
+    return found
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_errors_and_intervals_are_those_of_minuit(case: tuple[float, float, float]) -> None:
+    pixel, at, covariance = fitted(case)
+    found = minuit(pixel, at)
+    found.hesse()
+    np.testing.assert_allclose(
+        np.array(found.covariance), covariance, rtol=0.02, atol=2e-3 * np.abs(covariance).max()
+    )
+    np.testing.assert_allclose(np.array(found.errors), np.sqrt(np.diag(covariance)), rtol=0.01)
+    found.minos(cl=0.6827)
+    ends = profile_intervals(pixel.counts, pixel.origin, at[None], 0.6827)[0]
+    for place, name in enumerate(("h", "g", "mu", "sigma")):
+        other = found.merrors[name]
+        width = ends[place, 1] - ends[place, 0]
+        np.testing.assert_allclose(ends[place] - at[place], (other.lower, other.upper), atol=0.01 * width)
+
+
+def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
+    pixel, at, _ = fitted(CASES[2])
+    x, c = occupied(pixel)
+
+    def cost(h: float, g: float, mu: float, noise: float) -> float:
+        return -float(c @ log_pcd(x, h, g, mu, noise / g))
+
+    found = Minuit(cost, at[0], at[1], at[2], at[1] * at[3])
+    found.errordef = Minuit.LIKELIHOOD
+    found.tol = 1e-4
+    found.migrad().minos("noise", cl=0.95)
+    ends = profile_intervals(pixel.counts, pixel.origin, at[None], 0.95)[
+        0, INTERVAL_NAMES.index("read_noise_e")
+    ]
+    other = found.merrors["noise"]
+    np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
+    # and it is far from symmetric here: standard errors would not do
+    assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
+
+
+def expectations(x: Array, theta: Array) -> tuple[Array, Array, Array, Array]:
+    """E[k], E[k^2] and membership of raw samples under (log H, a, mu, log s2), in plain numpy."""
+    k = np.arange(40)
+    e = x[:, None] - theta[2] - k * theta[1]
+    logged = k * theta[0] - gammaln(k + 1) - 0.5 * e**2 * np.exp(-theta[3])
+    return np.exp(logged - logsumexp(logged, axis=1, keepdims=True)), k.astype(float), e, x
+
+
+def gradient_q(theta: Array, given: Array, x: Array) -> Array:
+    """Gradient in theta of the expected complete-data log-likelihood, memberships taken at ``given``."""
+    gamma, k, _, _ = expectations(x, given)
+    e = x[:, None] - theta[2] - k * theta[1]
+    inverse = np.exp(-theta[3])
+    return np.array(
+        [
+            (gamma * (k - np.exp(theta[0]))).sum(),
+            (gamma * k * e).sum() * inverse,
+            (gamma * e).sum() * inverse,
+            (gamma * (0.5 * e**2 * inverse - 0.5)).sum(),
+        ]
+    )
+
+
+@pytest.mark.parametrize("case", CASES[:2])
+def test_information_is_that_of_oakes(case: tuple[float, float, float]) -> None:
+    """Oakes (1999): -d2 l = -(d2 Q / d theta2 + d2 Q / d theta d given), both at the maximum."""
+    pixel, at, covariance = fitted(case)
+    x = samples(pixel.counts[0], int(pixel.origin[0]))
+    theta = np.array([np.log(at[0]), 1 / at[1], at[2], 2 * np.log(at[3])])
+    hessian = np.empty((4, 4))
+    for i, step in enumerate((1e-5, 1e-5, 1e-5, 1e-5)):
+        up, down = theta.copy(), theta.copy()
+        up[i] += step
+        down[i] -= step
+        own = gradient_q(up, theta, x) - gradient_q(down, theta, x)
+        mixed = gradient_q(theta, up, x) - gradient_q(theta, down, x)
+        hessian[i] = (own + mixed) / (2 * step)
+    slope = np.array([at[0], -(at[1] ** 2), 1.0, 0.5 * at[3]])
+    oakes = np.linalg.inv(-hessian) * np.outer(slope, slope)
+    np.testing.assert_allclose(oakes, covariance, rtol=1e-4, atol=1e-6 * np.abs(covariance).max())
+
+
+def test_errors_are_those_of_a_parametric_bootstrap() -> None:
+    _, at, covariance = fitted(CASES[0])
+    again = draw(np.random.default_rng(8), np.full(500, at[0]), 1 / at[1], at[1] * at[3], at[2], n_frames=N)
+    scatter = estimates(fit_histograms(again.counts, again.origin)).std(axis=0)
+    # five standard errors of a standard deviation of 500, and 2 % of the pixel's own information
+    np.testing.assert_allclose(scatter / np.sqrt(np.diag(covariance)), 1.0, atol=5 / np.sqrt(1000) + 0.02)
+
+
+@pytest.mark.parametrize("case", [*CASES, (5.0, 10.0, 0.8)])
+def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, float, float]) -> None:
+    h, a, noise = case
+    at = np.array([h, 1 / a, 100.3, noise * a])
+    weights = information_numba.log_poisson(h, 60)
+    np.testing.assert_allclose(information_numba.log_poisson.py_func(h, 60), weights)
+    for x in (80.0, 100.0, 104.0, 131.0, 170.0):
+        score, plain = np.empty(4), np.empty(4)
+        logged = information_numba.sample_score(x, at, weights, score)
+        assert logged == pytest.approx(float(log_pcd(np.array([x]), *at)[0]), abs=1e-8)
+        assert information_numba.sample_score.py_func(x, at, weights, plain) == pytest.approx(
+            logged, rel=1e-12
+        )
+        np.testing.assert_allclose(plain, score, rtol=1e-9)
+        for i in range(4):
+            up, down = at.copy(), at.copy()
+            up[i] *= 1 + 1e-6
+            down[i] *= 1 - 1e-6
+            numeric = float((log_pcd(np.array([x]), *up) - log_pcd(np.array([x]), *down))[0]) / (2e-6 * at[i])
+            assert score[i] == pytest.approx(numeric, rel=1e-4, abs=1e-5)
+
+
+def test_loops_are_the_same_compiled_and_plain() -> None:
+    pixel, at, covariance = fitted(CASES[1])
+    at, covariance, counts = at[None], covariance[None], pixel.counts
+    for name, arguments, shape in (
+        ("outer_scores", (counts, pixel.origin, at, 1e-3), (1, 4, 4)),
+        ("curve_variance", (at, covariance, 90.0, 1.0), (40,)),
+        ("grouped_trace", (pixel.origin, pixel.origin + 150, np.array([float(N)]), at, covariance), (1,)),
+    ):
+        kernel = getattr(information_numba, name)
+        compiled, plain = np.zeros(shape), np.zeros(shape)
+        kernel(*arguments, compiled)
+        kernel.py_func(*arguments, plain)
+        np.testing.assert_allclose(plain, compiled, rtol=1e-10, err_msg=name)
+    ends, plain_ends = np.empty((1, 5, 2)), np.empty((1, 5, 2))
+    profile_numba.profile_tile(counts, pixel.origin, at, 1.0, ends)
+    profile_numba.profile_tile.py_func(counts, pixel.origin, at, 1.0, plain_ends)
+    np.testing.assert_allclose(plain_ends, ends, rtol=1e-9)
+
+
+def test_groups_of_single_dn_determine_all_four_parameters() -> None:
+    pixel, at, covariance = fitted(CASES[0])
+    known = np.empty(2)
+    origin = np.repeat(pixel.origin, 2)
+    last = origin + pixel.counts.shape[1] - 1
+    frames = np.array([1e9, 300.0])  # no DN but the farthest are merged; many are
+    scaled = covariance * np.array([N / 1e9, N / 300.0])[:, None, None]
+    information_numba.grouped_trace(origin, last, frames, np.repeat(at[None], 2, axis=0), scaled, known)
+    # the covariance is of the observed information, 2 % off the expected one
+    assert known[0] == pytest.approx(4.0, abs=0.2)
+    assert 2.0 < known[1] < 3.9
+
+
+def test_covariance_is_six_correlations_and_four_errors() -> None:
+    root = np.random.default_rng(2).standard_normal((3, 4, 4))
+    covariance = root @ np.swapaxes(root, 1, 2)
+    covariance[2, 0] = covariance[2, :, 0] = np.nan
+    stderr = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    correlation = correlations(covariance)
+    assert correlation.shape == (3, 6)
+    np.testing.assert_allclose(covariance_from(stderr, correlation), covariance, rtol=1e-12)
+
+
+def test_false_discoveries_are_those_of_scipy() -> None:
+    from scipy.stats import false_discovery_control
+
+    p = np.random.default_rng(5).random((6, 7)) ** 3
+    np.testing.assert_allclose(false_discovery(p), false_discovery_control(p, axis=None).reshape(6, 7))
+    p[2, 3] = np.nan
+    q = false_discovery(p)
+    assert np.isnan(q[2, 3])
+    np.testing.assert_allclose(q[np.isfinite(q)], false_discovery_control(p[np.isfinite(p)]))
+    assert np.isnan(false_discovery(np.full(3, np.nan))).all()
+
+
+def test_the_poorest_come_first_even_where_p_is_zero() -> None:
+    chi2 = np.array([[50.0, 9000.0], [7000.0, 60.0]])
+    dof = np.array([[50.0, 50.0], [50.0, 0.0]])
+    assert poorest(chi2, dof, 5) == [(0, 1), (1, 0), (0, 0)]
+    assert np.isnan(misfit(chi2, dof)[1, 1])
+    assert abs(misfit(np.array([49.33]), np.array([50.0]))[0]) < 0.01
+
+
+def test_quantiles() -> None:
+    assert quantile_of(0.682689492) == pytest.approx(1.0)
+    assert quantile_of(0.95) == pytest.approx(1.959964)
+
+
+def tile(n: int = 4) -> tuple[Drawn, dict[str, NDArray[np.generic]]]:
+    pixels = draw(np.random.default_rng(9), np.full(n, 1.5), 11.0, 0.3, n_frames=N)
+    flat = {name: np.zeros((1, n), np.uint32) for name in ("under", "over")}
+    return pixels, {"counts": pixels.counts[None], "origin": pixels.origin[None].astype(np.int32), **flat}
+
+
+def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
+    pixels, histogram = tile()
+    plain = fit_tile(histogram, FitSettings(), None)
+    full = fit_tile(histogram, FitSettings(intervals="profile", errors="sandwich", interval_level=0.95), None)
+    ends = profile_intervals(pixels.counts, pixels.origin, pixels.truth * np.nan, 0.95)
+    assert np.isnan(ends).all()
+    for name in INTERVALS:
+        low, high = (full[path][0] for path in interval_names(name))
+        middle = full[name][0] if name in full else full["conversion_gain"][0] * full["read_noise_dn"][0]
+        assert (low < middle).all()
+        assert (middle < high).all()
+        assert f"{name}_low" not in plain
+    fit = fit_histograms(pixels.counts, pixels.origin)
+    sandwich = sandwich_covariance(pixels.counts, pixels.origin, estimates(fit), fit.covariance)
+    np.testing.assert_allclose(full["bias_stderr"][0], np.sqrt(sandwich[:, 2, 2]), rtol=1e-12)
+    assert (full["bias_stderr"] != plain["bias_stderr"]).all()
+    np.testing.assert_array_equal(full["bias"], plain["bias"])
+    # under a grown model the profile of the plain one is left out
+    assert "bias_low" not in fit_tile(
+        histogram, FitSettings(intervals="profile"), None, [RowNoise(row_noise_dn=1.0)]
+    )
+
+
+def test_a_hit_pixel_goes_through_the_plain_loop_as_through_the_compiled() -> None:
+    pixel = draw(np.random.default_rng(12), *CASES[1], n_frames=500)
+    counts = np.zeros((1, 400), np.uint32)
+    counts[:, 100 : 100 + pixel.counts.shape[1]] = pixel.counts
+    counts[0, [2, 390]] = 1
+    fit = fit_histograms(counts, pixel.origin - 100)
+    clean = fit_histograms(pixel.counts, pixel.origin)
+    np.testing.assert_allclose(estimates(fit), estimates(clean), rtol=1e-6)
+    assert fit.outlier_share[0] == pytest.approx(2 / 502)
+    assert clean.outlier_share[0] == 0

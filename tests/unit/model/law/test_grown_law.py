@@ -1,0 +1,207 @@
+"""Masses under a grown law, their derivatives, and what the law refuses."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from helpers.grown_reference import EVERYTHING, LAWS, reference_mass
+from scipy.stats import norm
+
+from pchem_pipeline.model.fit.grown import lobe_threshold, log_likelihood, marginal_mass
+from pchem_pipeline.model.fit.grown_numba import make_cells, make_lobes
+from pchem_pipeline.model.law.electron_laws_numba import (
+    FARTHEST,
+    STEPS,
+    _one_law,
+    electron_number,
+    fill_normal_table,
+    normal_tail,
+)
+from pchem_pipeline.model.law.grown_cells_numba import evaluate
+from pchem_pipeline.model.law.grown_inputs import pack
+from pchem_pipeline.model.law.grown_types_numba import make_room
+from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+PIXELS = [(2.0, 1 / 12, 100.0, 3.0), (0.4, 0.1, 99.3, 2.0), (9.0, 1 / 5.5, 97.7, 1.1)]
+CODES = range(70, 220)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_mass_is_the_docstring_term_by_term(name: str) -> None:
+    model = LAWS[name]
+    got = marginal_mass(model, list(np.transpose(PIXELS)), list(CODES))
+    for pixel, row in zip(PIXELS, got, strict=True):
+        expected = np.array(reference_mass(model, pixel, CODES))
+        np.testing.assert_allclose(row, expected, rtol=0, atol=3e-15)
+        seen = expected > 1e-200
+        np.testing.assert_allclose(row[seen], expected[seen], rtol=3e-8)
+        close = expected > 1e-12
+        np.testing.assert_allclose(row[close], expected[close], rtol=1e-11)
+
+
+def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> None:
+    laws = [LAWS["levels"], MarginalModel().with_variance(e2=0.04, dn2=0.2), LAWS["skew"]]
+    laws[1] = laws[1].with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]])
+    both = MarginalModel().with_levels(scale=[0.98, 1, 1], shift_e=[0.2, 0, 0], curvature=0.0)
+    both = both.with_variance(e2=[0, 0.04, 0], dn2=[0, 0.2, 0])
+    both = both.with_added_exposure([[0, 0], [0, 0.8], [0, 0]], [[1, 0], [0.6, 0.4], [1, 0]])
+    both = both.with_noise(
+        [[1, 0], [1, 0], [0.7, 0.3]],
+        shift_sigma=[[0, 0], [0, 0], [-0.3, 0.7]],
+        width=[[1, 1], [1, 1], [0.9, 0.9]],
+    )
+    columns = list(np.transpose(PIXELS))
+    got = marginal_mass(both, columns, list(CODES))
+    for i, law in enumerate(laws):
+        alone = law.with_levels(curvature=-law.curvature)
+        expected = marginal_mass(alone, [c[i : i + 1] for c in columns], list(CODES))[0]
+        np.testing.assert_allclose(got[i], expected, rtol=1e-12, atol=1e-300)
+    part = marginal_mass(both.of(np.array([2, 0])), [c[[2, 0]] for c in columns], list(CODES))
+    np.testing.assert_array_equal(part, got[[2, 0]])
+
+
+def test_neutral_law_is_the_pcd_and_codes_may_differ_by_pixel() -> None:
+    columns = list(np.transpose(PIXELS))
+    exposure, gain, bias, sigma = columns
+    codes = np.array([60, 70, 80])[:, None] + np.arange(90)
+    analog = gain * np.sqrt(sigma**2 - 1 / 12)
+    expected = pcd_mass(codes, exposure[:, None], gain[:, None], bias[:, None], analog[:, None])
+    np.testing.assert_allclose(
+        marginal_mass(MarginalModel(), columns, codes), expected, rtol=1e-7, atol=1e-280
+    )
+    assert MarginalModel().neutral
+    assert not any(model.neutral for name, model in LAWS.items() if name != "neutral")
+
+
+def test_clipped_codes_hold_all_that_lies_beyond() -> None:
+    columns = [np.array([2.0]), np.array([1 / 12]), np.array([100.0]), np.array([3.0])]
+    plain = marginal_mass(MarginalModel(), columns, np.arange(50, 600))[0]
+    clipped = marginal_mass(MarginalModel().with_clip(97, 130), columns, np.arange(90, 140))[0]
+    assert clipped.sum() == pytest.approx(1.0, abs=1e-14)
+    assert clipped[7] == pytest.approx(plain[: 97 - 50 + 1].sum(), rel=1e-12)
+    assert clipped[130 - 90] == pytest.approx(plain[130 - 50 :].sum(), rel=1e-12)
+    assert not clipped[:7].any()
+    assert not clipped[41:].any()
+    # a window beside the codes that come out, or with their edge at its end, is no special case
+    for low in (60, 80, 90, 97, 98, 121, 131):
+        window = marginal_mass(MarginalModel().with_clip(97, 130), columns, np.arange(low, low + 10))[0]
+        inside = np.arange(low, low + 10) - 90
+        expected = [clipped[i] if 0 <= i < 50 else 0.0 for i in inside]
+        np.testing.assert_allclose(window, expected, rtol=1e-12)
+    tighter = MarginalModel().with_clip(97, 130).with_clip(95, 120)
+    assert (tighter.clip_low, tighter.clip_high) == (97, 120)
+
+
+def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
+    columns = [np.array([2.0]), np.array([1 / 12]), np.array([100.0]), np.array([3.0])]
+    plain = marginal_mass(MarginalModel(), columns, np.arange(70, 200))
+    with_some = marginal_mass(MarginalModel().with_outliers(1e-3, 1000), columns, np.arange(70, 200))
+    np.testing.assert_allclose(with_some, 0.999 * plain + 1e-6, rtol=1e-13)
+
+
+@pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel"])
+@pytest.mark.parametrize("lobe", [0.0, 1.3])
+def test_score_and_information_are_the_derivatives(law: str, lobe: float) -> None:
+    model = EVERYTHING.with_counts(law, 0.06).with_clip(92, 158).with_outliers(1e-3, 4096)
+    counts = np.zeros(90)
+    counts[2:69] = np.arange(67) % 7 * 9 + 1
+    packed = pack(model.with_free_lobes((1.3,)), 1)
+    cells = make_cells(packed, 0, lobe, 90, 120, 90, (counts, np.empty(91), make_lobes(packed)))
+    room = make_room(90)
+    here = np.array([np.log(1.7), 12.0, -20.3, np.log(10.0), 0.2 if lobe else 0.0])
+    evaluate(here, cells, packed, room)
+    score, information = room.score.copy(), room.information.copy()
+    for i in range(5 if lobe else 4):
+        ends = []
+        step = np.zeros(5)
+        step[i] = (1e-5, 1e-4, 1e-4, 1e-5, 1e-5)[i]
+        for point in (here + step, here - step):
+            ends.append((evaluate(point, cells, packed, room), room.score.copy()))
+        (above, score_above), (below, score_below) = ends
+        assert score[i] == pytest.approx((above - below) / 2 / step[i], rel=1e-6, abs=1e-6 * abs(score).max())
+        slope = (score_below - score_above) / 2 / step[i]
+        np.testing.assert_allclose(information[i], slope, rtol=1e-6, atol=1e-7 * abs(slope).max())
+
+
+def test_normal_tail_keeps_its_digits() -> None:
+    table = np.empty((int(FARTHEST * STEPS) + 2, 2))
+    fill_normal_table.py_func(table[:3])
+    fill_normal_table(table)
+    for z in (0.0, 1e-9, 0.3, -1.234567, 5.0039, -8.4999, 12.3456, -37.9, 40.0, -math.inf, math.inf):
+        got = normal_tail.py_func(z, table)
+        tail = mpmath.erfc(abs(mpmath.mpf(z)) / mpmath.sqrt(2)) / 2 if math.isfinite(z) else 0
+        expected = float(tail) * (1 if z <= 0 else -1) if abs(z) < FARTHEST else 0.0
+        tolerance = 1e-13 if abs(z) < 8.5 else 1e-7
+        assert got[0] == pytest.approx(expected, rel=tolerance)
+        assert got[1] == pytest.approx(norm.pdf(z) if abs(z) < FARTHEST else 0.0, rel=max(tolerance, 1e-11))
+
+
+@pytest.mark.parametrize(("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2)])
+def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int, dispersion: float) -> None:
+    # 0.6 e- of the mean are added, and do not grow with H
+    mixtures = np.array([0.25, 0.75]), np.array([1.6, 0.8]), np.array([0.4, 0.6]), np.array([0.0, 1.0])
+    k = np.arange(400)
+    rows = np.array([electron_number(law, dispersion, int(i), 2.4, *mixtures) for i in k])
+    assert rows[:, 0].sum() == pytest.approx(1.0, abs=1e-10)
+    assert rows[:, 0] @ k == pytest.approx(3.0, rel=1e-8)
+    mixed = 2.4**2 * 0.12 + 0.24
+    excess = {0: 3.0, 1: 3.0 + dispersion * (9.0 + mixed), 2: 3.0 / (1 - dispersion) ** 2}[law]
+    assert rows[:, 0] @ (k - 3.0) ** 2 == pytest.approx(excess + mixed, rel=1e-7)
+    h = 1e-4
+    above, below = (
+        np.array([electron_number(law, dispersion, int(i), 2.4 * np.exp(s), *mixtures)[0] for i in k[:40]])
+        for s in (h, -h)
+    )
+    np.testing.assert_allclose(rows[:40, 1], (above - below) / (2 * h), atol=1e-8)
+    np.testing.assert_allclose(rows[:40, 2], (above - 2 * rows[:40, 0] + below) / h**2, atol=1e-6)
+    for i in (0, 1, 7):
+        compiled, plain = (f(law, dispersion, float(i), 2.5) for f in (_one_law, _one_law.py_func))
+        np.testing.assert_allclose(plain, compiled, rtol=1e-13)
+
+
+def test_log_likelihood_is_that_of_the_masses() -> None:
+    columns = list(np.transpose(PIXELS))
+    counts = np.zeros((3, 150), np.uint16)
+    counts[:, 25:80] = 3
+    counts[0, 149] = 1  # far out: every tail counts
+    got = log_likelihood(counts, np.full(3, 70), columns, EVERYTHING)
+    with np.errstate(divide="ignore"):
+        log_mass = np.log(marginal_mass(EVERYTHING, columns, list(CODES)))
+    expected = [float(row[c > 0] @ log[c > 0]) for row, log, c in zip(counts, log_mass, counts, strict=True)]
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    columns[1] = np.array([np.nan, 0.1, 0.2])
+    assert np.isnan(log_likelihood(counts, np.full(3, 70), columns, EVERYTHING)).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_threshold_of_free_lobes_grows_with_the_number_of_trials() -> None:
+    one = MarginalModel().with_free_lobes([1.0])
+    eight = MarginalModel().with_free_lobes(range(1, 9))
+    # half of the chi-square mass: a normal deviate exceeds sqrt(2 rise) with the probability of a trial
+    assert norm.sf(np.sqrt(2 * lobe_threshold(one))) == pytest.approx(1e-4, rel=1e-6)
+    assert norm.sf(np.sqrt(2 * lobe_threshold(eight))) == pytest.approx(1e-4 / 8, rel=1e-6)
+
+
+def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:
+    columns = list(np.transpose(PIXELS))
+    with pytest.raises(ValueError, match="extra_variance_e2 has 2 rows for 3 pixels"):
+        marginal_mass(MarginalModel().with_variance(e2=[0.1, 0.2]), columns, [1, 2])
+    with pytest.raises(ValueError, match="do not sum to 1"):
+        marginal_mass(MarginalModel().with_noise([0.5, 0.4]), columns, [1, 2])
+    with pytest.raises(ValueError, match="do not sum to 1"):
+        marginal_mass(MarginalModel().with_added_exposure([[0, 1]], [[0.5, 0.4]]), columns, [1, 2])
+    with pytest.raises(ValueError, match="increase by 1"):
+        marginal_mass(MarginalModel(), columns, [1, 3])
+
+
+def test_edges_of_several_effects_add_up() -> None:
+    model = MarginalModel().with_edges(10, [0.1, 0.2]).with_edges(8, [0.3, 0.3, 0.3])
+    assert model.edge_first == 8
+    np.testing.assert_allclose(model.edge_shift, [0.3, 0.3, 0.4, 0.2])

@@ -1,0 +1,387 @@
+"""The discrepancy verdict in the report and on its own page."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.discrepancy_material import UNTESTABLE, VERDICTS, discrepancy_data, evidence, result, verdict_of
+from helpers.report_material import report_data
+
+from pchem_pipeline.base.variables import variables_of
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.verdict import Verdict
+from pchem_pipeline.effects.framework.registry import effect_class
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_series
+from pchem_pipeline.report.figures.discrepancy_exhibits import (
+    DISCREPANCY_NAMES,
+    discrepancy_exhibits,
+    telling_pulls,
+)
+from pchem_pipeline.report.figures.discrepancy_maps import telling_maps
+from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
+from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables
+from pchem_pipeline.report.pages.discrepancy_text import remarks
+from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.pages.verdict import flags
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Picture
+from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
+
+QUICK = ReportSettings(figure_formats=(), dpi=72)
+HOSTILE = '<script>alert("x")</script>$x^{ \'{{ 7*7 }}'
+
+
+class Page(HTMLParser):
+    """Every tag with its attributes, and the text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self._style = False
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._style = tag == "style"
+
+    def handle_data(self, data: str) -> None:
+        if not self._style:
+            self.words.append(data)
+        self._style = False
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+@pytest.fixture(scope="module")
+def base() -> ReportData:
+    return ReportData(title="my sensor", shape=(8, 8), run={"store": "run.zarr"})
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texts without pictures: fast."""
+
+    def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> object:
+        return Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
+
+    monkeypatch.setattr(report_module, "draw_picture", dot)
+
+
+def rendered(base: ReportData, data: DiscrepancyData | None) -> RenderedReport:
+    return render_report(replace(base, discrepancy=data), QUICK)
+
+
+def harmless(html: str) -> Page:
+    page = Page(html)
+    for tag, attributes in page.tags:
+        assert tag not in ("script", "link", "iframe", "object", "embed", "base", "form")
+        for name, value in attributes.items():
+            assert not name.startswith("on")
+            if name in ("src", "srcset", "href"):
+                assert str(value).startswith(("data:image/", "#"))
+    ids = [a["id"] for _, a in page.tags if a.get("id")]
+    assert len(ids) == len(set(ids))
+    assert {str(a["href"])[1:] for tag, a in page.tags if tag == "a"} <= set(ids)
+    return page
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_the_verdict_comes_first(base: ReportData, verdict: str) -> None:
+    data = discrepancy_data(verdict)
+    report = rendered(base, data)
+    own = harmless(report.pages["discrepancy.html"])
+    first = own.text.index(data.found.sentence)
+    assert first < own.text.index("Every sample is split")
+    assert own.text[:first].rstrip().endswith(verdict.capitalize())
+    page = harmless(report.html)
+    assert page.text.count(data.found.sentence) >= 2
+    for tag, why in UNTESTABLE.items():
+        assert tag in own.text
+        assert why in own.text
+        assert why in page.text
+    assert json.loads(report.json)["discrepancy"]["verdict"] == verdict
+    levels = {"named": "note", "ambiguous": "caution", "unexplained": "serious", "consistent": "good"}
+    classes = [a["class"] for _, a in own.tags if str(a.get("class")).startswith("verdict ")]
+    assert classes == [f"verdict {levels[verdict]}"]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
+    text = Page(rendered(base, discrepancy_data("named")).pages["discrepancy.html"]).text.replace("\xa0", " ")
+    for words in (
+        "477 → 1.80",
+        "floor 0.660",
+        "99.6 % of the gap closed",
+        "0.3512 ± 0.0041 DN",
+        "placebo (flicker_noise), fitted in the same way, closes 3 % of the gap",
+        "second-best effect (periodic_pickup)",
+        "−16.8 ± 3.3",
+        "0.985",
+        "pixels (y, x) (3, 4), (10, 20), (30, 39)",
+        "148 to 152 DN",
+        "odd_plugin was left out: ValueError: boom",
+        "read noise moved by −0.64 standard errors of a pixel",
+        "a faster or slower row time moves the line of a pickup",
+        "frames to find and fit with",
+        "Janesick 2007",
+    ):
+        assert words in text, words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_without_a_search_the_report_says_how_to_start_one(base: ReportData) -> None:
+    report = rendered(base, None)
+    assert report.pages == {}
+    text = Page(report.html).text
+    assert text.count("pchem discrepancy run.zarr") == 1
+    assert json.loads(report.json)["discrepancy"] is None
+    assert not [flag for flag in flags(base) if "model agrees" in flag.text]
+
+
+def test_every_figure_is_drawn_and_described_with_numbers(base: ReportData) -> None:
+    report = render_report(
+        replace(base, discrepancy=discrepancy_data("named")), ReportSettings(figure_formats=("svg",), dpi=72)
+    )
+    page = harmless(report.pages["discrepancy.html"])
+    shown = [str(a["id"]).removeprefix("figure-") for tag, a in page.tags if tag == "figure"]
+    assert shown == list(DISCREPANCY_NAMES)
+    assert {f"{name}.svg" for name in DISCREPANCY_NAMES} <= set(report.figures)
+    alts = [str(a["alt"]) for tag, a in page.tags if tag == "img"]
+    assert all(re.search(r"\d", alt) and len(alt) > 60 for alt in alts)
+    assert any("+21.8 at 150 DN" in alt or "at 150 DN" in alt for alt in alts)
+    assert any("plain model 477" in alt and "floor 0.660" in alt for alt in alts)
+    sources = [a for tag, a in page.tags if tag == "source"]
+    assert len(sources) == len(DISCREPANCY_NAMES)
+
+
+def kept(spoiled: dict[str, Any], whole: dict[str, Any]) -> Verdict:
+    """The spoiled verdict with its states as they were."""
+    steps = [
+        {**step, "verdict": old["verdict"]}
+        for step, old in zip(spoiled["steps"], whole["steps"], strict=True)
+    ]
+    return Verdict.model_validate({**spoiled, "verdict": whole["verdict"], "steps": steps})
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_hostile_words_are_shown_not_run(base: ReportData) -> None:
+    whole = result("unexplained")
+
+    def spoiled(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {
+                HOSTILE if k in ("row_noise_dn", "odd_plugin") else k: spoiled(v) for k, v in value.items()
+            }
+        if isinstance(value, list):
+            return [spoiled(each) for each in value]
+        return HOSTILE if isinstance(value, str) else value
+
+    # a verdict that is none of those known is refused, and never shown
+    data = DiscrepancyData(kept(spoiled(whole), whole), {}, {HOSTILE: (HOSTILE, HOSTILE)}, {HOSTILE: HOSTILE})
+    report = rendered(base, data)
+    for html in (report.html, report.pages["discrepancy.html"]):
+        page = harmless(html)
+        assert page.text.count('<script>alert("x")</script>') > 20
+        assert "{{ 7*7 }}" in page.text
+
+
+def test_hostile_tags_are_drawn_as_they_are() -> None:
+    spoiled = json.loads(json.dumps(result("named")).replace("row_noise", "<script>$x^{"))
+    for exhibit in discrepancy_exhibits(DiscrepancyData(Verdict.model_validate(spoiled))):
+        exhibit.draw(COLUMN_MM)
+
+
+def test_each_array_may_be_missing() -> None:
+    whole = discrepancy_data("named")
+    names = [exhibit.name for exhibit in discrepancy_exhibits(whole)]
+    assert names == list(DISCREPANCY_NAMES)
+    for key in whole.arrays:
+        arrays = {k: v for k, v in whole.arrays.items() if k != key}
+        for exhibit in discrepancy_exhibits(replace(whole, arrays=arrays)):
+            assert exhibit.alt
+    assert [e.name for e in discrepancy_exhibits(replace(whole, arrays={}))] == [
+        "discrepancy_gap",
+        "discrepancy_pulls",
+    ]
+
+
+@pytest.mark.parametrize("shape", [(1, 6), (3, 3), (2, 90)])
+def test_odd_sensors_are_drawn(shape: tuple[int, int]) -> None:
+    arrays = evidence_arrays(evidence(shape, n_frames=40))
+    for exhibit in discrepancy_exhibits(DiscrepancyData(verdict_of("named"), arrays)):
+        exhibit.draw(COLUMN_MM)
+
+
+def test_ready_made_histograms_have_no_pictures_of_time() -> None:
+    arrays = evidence_arrays(replace(evidence((1, 5)), time=None))
+    names = [e.name for e in discrepancy_exhibits(DiscrepancyData(verdict_of("consistent"), arrays))]
+    assert "discrepancy_frames" not in names
+    assert "discrepancy_lines" not in names
+    assert "discrepancy_codes" in names
+
+
+def test_the_arrays_are_those_of_the_registry() -> None:
+    seen = evidence()
+    z_after = dict.fromkeys(seen.z, 0.0)
+    drift = effect_class("exposure_drift")(drift=0.02)
+    arrays = evidence_arrays(seen, after=z_after, effects=[drift], code_grown=seen.code.expected)
+    # what is added to single pixels is not in the evidence
+    known = {v.name: v for v in variables_of("discrepancy") if not v.name.startswith("added_")}
+    assert set(arrays) == set(known)
+    sizes: dict[str, int] = {}
+    for name, array in arrays.items():
+        assert array.dtype == np.dtype(known[name].dtype), name
+        for dim, size in zip(known[name].dims, array.shape, strict=True):
+            assert sizes.setdefault(dim, size) == size, (name, dim)
+    assert sizes["statistic"] == len(STATISTICS)
+    assert sum(array.nbytes for array in arrays.values()) < 2e6
+
+
+def test_arrays_divided_by_chance_have_unit_spread() -> None:
+    """Lines without stripes scatter as chance has it, within five standard errors; striped ones do not."""
+    seen = evidence(n_frames=2000)
+    arrays = evidence_arrays(seen)
+    error = 1.0 / np.sqrt(2 * 2000 * arrays["column_rms"].shape[1])
+    assert np.mean(arrays["column_rms"] ** 2, axis=1) == pytest.approx(np.ones(2), abs=5 * 2 * error)
+    # the stripes of the material have an amplitude of 1.6 standard deviations
+    assert np.mean(arrays["row_rms"][1] ** 2) == pytest.approx(1 + 1.6**2 / 2, rel=0.05)
+    spread = arrays["block_spread"][:, seen.maps.usable]
+    assert np.abs(spread.mean(axis=1)).max() < 5 / np.sqrt(spread.shape[1]) + 0.02
+    assert spread.std(axis=1) == pytest.approx(np.ones(2), abs=5 / np.sqrt(2 * spread.shape[1]))
+
+
+def test_the_path_of_a_drift_is_what_the_frames_show() -> None:
+    seen = evidence()
+    time = seen.time
+    assert time is not None
+    paths = path_arrays(seen, [effect_class("exposure_drift")(drift=0.02)])
+    position = time.frames / (time.n_run - 1)
+    variance, h = seen.charge_std**2, seen.maps.quanta_exposure
+    share = np.nansum(variance) / np.nansum(h)
+    slope = np.polyfit(position, paths["frame_charge_model"], 1)[0]
+    assert slope == pytest.approx(0.02 * share, rel=1e-6)
+    assert path_arrays(seen, [effect_class("row_noise")(row_noise_dn=0.3)]) == {}
+    assert path_arrays(replace(seen, time=None), [effect_class("exposure_drift")(drift=0.02)]) == {}
+
+
+def test_the_telling_maps_are_those_with_structure() -> None:
+    words = [each.words for each in telling_maps(discrepancy_data().arrays)]
+    assert words[0].startswith("goodness of fit")
+    assert words[1] == "readout: heavy tails (He4)"
+    assert telling_maps({}) == []
+
+
+def test_a_comb_a_pile_up_and_an_alternation_are_in_the_numbers() -> None:
+    arrays = discrepancy_data().arrays
+    dn, residual = discrepancy_series.code_residuals(arrays)
+    assert dn[np.argmax(residual)] == 150
+    number = np.arange(400)
+    noise = np.random.default_rng(1).standard_normal(400)
+    assert abs(discrepancy_series.parity_difference(number, noise, 1.0)) < 5
+    assert discrepancy_series.parity_difference(number, noise + number % 2, 1.0) < -5
+    centre, mean, n = discrepancy_series.trends(number, 0.5 * number)
+    assert n.sum() == 400
+    assert mean == pytest.approx(0.5 * centre)
+
+
+def test_the_gap_has_a_line_for_every_model() -> None:
+    bars = discrepancy_gap.gap_bars(verdict_of("named"))
+    assert [(bar.words, bar.role, round(bar.gap, 1)) for bar in bars] == [
+        ("plain model", "before", 477.0),
+        ("with row_noise", "after", 31.0),
+        ("… and bias_drift", "after", 1.8),
+        ("runner-up: periodic_pickup", "runner-up", 120.0),
+        ("placebo: flicker_noise", "placebo", 116.4),
+    ]
+    doubt = [bar.words for bar in discrepancy_gap.gap_bars(verdict_of("ambiguous"))]
+    assert doubt[1] == "with row_noise or periodic_pickup or interpixel_capacitance"
+    assert [bar.words for bar in discrepancy_gap.gap_bars(verdict_of("consistent"))] == ["plain model"]
+    unmeasured = dict.fromkeys(("before", "after", "floor", "closed_fraction"))
+    assert discrepancy_gap.gap_bars(verdict_of("consistent", gap=unmeasured)) == []
+    rows = discrepancy_gap.families(verdict_of("named"))
+    assert rows[0][0] == "rows, columns, neighbours"
+    assert [round(v, 1) for v in rows[0][1:]] == [401.0, 0.7]
+
+
+def test_pulls_come_from_the_steps_or_from_the_vectors() -> None:
+    data = discrepancy_data("named")
+    assert [round(p.before, 1) for p in telling_pulls(data)[:2]] == [84.0, -31.2]
+    bare = replace(data, found=verdict_of("consistent"))
+    pulls = telling_pulls(bare)
+    assert len(pulls) == 12
+    assert pulls[0].sentence == STATISTICS[pulls[0].statistic].sentence
+    largest = max(np.nanmax(np.abs(data.arrays[name])) for name in ("z_before", "z_after"))
+    assert max(abs(pulls[0].before), abs(pulls[0].after)) == pytest.approx(largest)
+
+
+def test_a_placebo_that_closes_the_gap_is_a_caution() -> None:
+    data = discrepancy_data("named")
+    steps, gap = result("named")["steps"], result("named")["gap"]
+    last = {**steps[-1], "placebo": {"effect": "flicker_noise", "gap_after": 30e-6}}
+    doubted = replace(data, found=verdict_of("named", steps=[steps[0], last]))
+    words = {flag.text: flag.level for flag in remarks(doubted)}
+    assert words["A placebo (flicker_noise), fitted in the same way, closes 75 % of the gap."] == "caution"
+    assert any("above its floor" in text for text in words)
+    closed = replace(data, found=verdict_of("named", gap={**gap, "after": 0.5e-6}))
+    at_floor = [f for f in remarks(closed) if "at its floor" in f.text]
+    assert [flag.level for flag in at_floor] == ["good"]
+
+
+def test_places_of_a_window_are_places_of_the_sensor() -> None:
+    found = verdict_of("named")
+    moved = found.on_sensor((100, 164), (200, 264))
+    assert moved.examined.origin == (100, 200)
+    assert moved.examined.frames == found.examined.frames
+    assert moved.where[2].pixels == ((103, 204), (110, 220), (130, 239))
+    assert moved.where[1] == found.where[1]
+
+
+def test_unit_tables_have_the_same_width_in_every_row() -> None:
+    for verdict in VERDICTS:
+        for tables in discrepancy_tables(discrepancy_data(verdict)).values():
+            for table in tables:
+                assert {len(row) for row in table.rows} == {len(table.head)}, table.id
+
+
+def test_the_report_says_what_was_found_among_its_flags() -> None:
+    data = replace(report_data((8, 8)), discrepancy=discrepancy_data("unexplained"))
+    assert [flag.level for flag in flags(data) if "a comb of codes remains" in flag.text] == ["serious"]
+
+
+def test_the_page_of_a_run(tmp_path: Path) -> None:
+    """From the files of a run: JSON and arrays written, read back, and the same."""
+    from pchem_pipeline.base.errors import StoreError
+    from pchem_pipeline.stages.discrepancy.result import discrepancy_state, read_discrepancy
+    from pchem_pipeline.store.run_store import RunStore
+
+    store = RunStore.create(tmp_path / "run.zarr")
+    assert read_discrepancy(store) is None
+    assert discrepancy_state(store) is None
+    arrays = evidence_arrays(evidence())
+    for name, array in arrays.items():
+        store.write_array(f"discrepancy/{name}", array)
+    store.write_file("discrepancy.json", json.dumps(result("named")).encode())
+    data = read_discrepancy(store)
+    assert data is not None
+    assert set(data.arrays) == set(arrays)
+    np.testing.assert_array_equal(data.arrays["score"], arrays["score"])
+    assert data.found.effects == ("row_noise", "bias_drift")
+    assert discrepancy_state(store) == "named"
+    store.write_file("discrepancy.json", b"[1, 2")
+    with pytest.raises(StoreError, match=r"discrepancy.json is damaged .*run pchem discrepancy with --force"):
+        read_discrepancy(store)

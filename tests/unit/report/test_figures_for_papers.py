@@ -1,0 +1,205 @@
+"""Figures as files: sizes, fonts, styles, and numbers beside them that are what is drawn."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from helpers.report_material import report_data
+from matplotlib.colors import to_rgb
+from matplotlib.patches import StepPatch
+from PIL import Image
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.commands.figures import millimetres
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.drawn_data import drawn_tables
+from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
+from pchem_pipeline.report.figures.figure_data import DataTable, csv_text, figure_tables
+from pchem_pipeline.report.figures.paper import PaperFigure, draw_paper_figure, read_style_sheet
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import BLUE, VERMILION, style_sheet
+
+SETTINGS = ReportSettings()
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return report_data((12, 16), failed=0.05)
+
+
+@pytest.fixture(scope="module")
+def found(data: ReportData) -> dict[str, Exhibit]:
+    return {exhibit.name: exhibit for exhibit in exhibits(data, SETTINGS)}
+
+
+def rows_of(content: bytes) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(content.decode())))
+
+
+def numbers(rows: list[dict[str, str]], heading: str) -> np.ndarray:
+    return np.array([float(row[heading] or "nan") for row in rows])
+
+
+def test_every_figure_of_the_report_has_tables(data: ReportData, found: dict[str, Exhibit]) -> None:
+    own = [name for name, exhibit in found.items() if figure_tables(exhibit, data, SETTINGS)]
+    assert len(own) >= 12
+    assert set(found) <= set(EXHIBIT_NAMES)
+    for exhibit in found.values():
+        # a figure without tables of its own tells what is drawn
+        tables = figure_tables(exhibit, data, SETTINGS) or drawn_tables(exhibit.draw(88.0))
+        assert tables
+        for table in tables:
+            assert len({len(values) for values in table.columns.values()}) == 1
+            assert len(rows_of(csv_text(table).encode())) == len(next(iter(table.columns.values()))) > 0
+        assert len({table.part for table in tables}) == len(tables)
+    assert figure_tables(Exhibit("new", "", "", "", "", lambda width_mm: None), data, SETTINGS) is None
+
+
+def test_the_numbers_are_those_drawn(data: ReportData, found: dict[str, Exhibit]) -> None:
+    files = draw_paper_figure(
+        PaperFigure(found["map_bias"], figure_tables(found["map_bias"], data, SETTINGS), ())
+    )
+    rows = rows_of(files["map_bias_histogram.csv"])
+    figure = found["map_bias"].draw(88.0)
+    [steps] = [artist for artist in figure.axes[0].patches if isinstance(artist, StepPatch)]
+    np.testing.assert_array_equal(numbers(rows, "pixels"), steps.get_data().values)
+    np.testing.assert_array_equal(numbers(rows, "bias (DN) to"), steps.get_data().edges[1:])
+    rows = rows_of(files["map_bias.csv"])
+    place = 5 * 16 + 3
+    assert (rows[place]["y (pixel)"], rows[place]["x (pixel)"]) == ("5", "3")
+    np.testing.assert_array_equal(numbers(rows, "bias (DN)").reshape(12, 16), data.maps["bias"])
+    np.testing.assert_array_equal(numbers(rows, "standard error (DN)"), data.maps["bias_stderr"].ravel())
+    missing = [
+        row["bias (DN)"] for row, value in zip(rows, data.maps["bias"].flat, strict=True) if np.isnan(value)
+    ]
+    assert missing
+    assert set(missing) == {""}
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "x", "y", "label"),
+    [
+        ("cluster_edges_pixel", "", "signal (DN)", "density (1/DN)", "fitted density"),
+        ("electron_numbers", "", "k (e-)", "electron_pmf", "predicted"),
+        ("component_widths", "", "k (e-)", "sd, constant: g (DN)", "constant: g"),
+        ("ensemble", "raw", "dn (DN)", "epcd_exact (1/DN)", "exact mean"),
+    ],
+)  # fmt: skip
+def test_tables_agree_with_the_lines_of_the_figure(
+    data: ReportData, found: dict[str, Exhibit], name: str, part: str, x: str, y: str, label: str
+) -> None:
+    tables = {table.part: table for table in figure_tables(found[name], data, SETTINGS) or []}
+    columns = (np.asarray(tables[part].columns[each], dtype=float) for each in (x, y))
+    known = dict(zip(*columns, strict=True))
+    axes = found[name].draw(180.0).axes[0]
+    [line] = [each for each in axes.lines if str(each.get_label()).startswith(label)][:1]
+    drawn = np.asarray(line.get_data(), dtype=float)
+    assert drawn.shape[1] >= 4
+    np.testing.assert_allclose([known[value] for value in drawn[0]], drawn[1], rtol=1e-12)
+
+
+def test_residuals_of_pixels_have_the_size_that_chance_gives(
+    data: ReportData, found: dict[str, Exhibit]
+) -> None:
+    tables = {table.part: table for table in figure_tables(found["pixel_fits"], data, SETTINGS) or []}
+    residual = np.asarray(tables[""].columns["residual (standard deviations)"], dtype=float)
+    known = residual[np.isfinite(residual)]
+    assert known.size > 100
+    # rounding to DN widens peaks a little: a tenth beyond five standard errors of a variance
+    assert abs(np.mean(known**2) - 1) < 5 * np.sqrt(2 / known.size) + 0.1
+    assert tables["parameters"].columns["y (pixel)"] == [pixel.y for pixel in data.pixels]
+
+
+def test_a_figure_without_tables_tells_what_is_drawn(found: dict[str, Exhibit]) -> None:
+    figure = found["electron_numbers"].draw(88.0)
+    [table] = drawn_tables(figure)
+    rows = rows_of(csv_text(table).encode())
+    bars = [row for row in rows if row["series"] == "estimated electron numbers"]
+    heights = [patch.get_height() for patch in figure.axes[0].patches]
+    assert [float(row["y"]) for row in bars] == heights
+    assert {row["x is"] for row in rows} == {"electron number k (e⁻)"}
+    image = drawn_tables(found["fit_status"].draw(88.0))[-1]
+    assert image.part.startswith("image")
+    assert len(image.columns["value"]) == 12 * 16
+
+
+def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Exhibit]) -> None:
+    wanted = PaperFigure(found["read_noise_histogram"], [], ("pdf", "png", "svg"), 120.0, 200)
+    files = draw_paper_figure(wanted)
+    assert set(files) == {f"read_noise_histogram.{kind}" for kind in ("pdf", "png", "svg")}
+    box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", files["read_noise_histogram.pdf"])
+    assert box is not None
+    assert float(box[1]) == pytest.approx(120.0 / 25.4 * 72, abs=0.05)
+    assert b"/FontFile2" in files["read_noise_histogram.pdf"]
+    assert b"/Type3" not in files["read_noise_histogram.pdf"]
+    with Image.open(io.BytesIO(files["read_noise_histogram.png"])) as image:
+        assert image.width == pytest.approx(120.0 / 25.4 * 200, abs=1)
+    assert b"<text" not in files["read_noise_histogram.svg"]
+    assert draw_paper_figure(wanted) == files
+
+
+def test_a_style_sheet_prevails(found: dict[str, Exhibit], tmp_path: Path) -> None:
+    sheet = tmp_path / "mine.mplstyle"
+    sheet.write_text(
+        "axes.prop_cycle: cycler('color', ['112233', 'AA5500'])\naxes.linewidth: 2.5\nimage.cmap: cividis\n"
+    )
+    with style_sheet(read_style_sheet(str(sheet))):
+        figure = found["map_bias"].draw(88.0)
+    top, bottom = figure.axes[:2]
+    assert top.spines["left"].get_linewidth() == 2.5
+    assert bottom.images[0].get_cmap().name == "cividis"
+    [median] = top.lines
+    assert to_rgb(median.get_color()) == to_rgb("#112233")
+    plain = found["map_bias"].draw(88.0)
+    assert to_rgb(plain.axes[0].lines[0].get_color()) == to_rgb(BLUE)
+    assert plain.axes[1].images[0].get_cmap().name == "viridis"
+    assert mpl.rcParams["axes.linewidth"] == mpl.rcParamsDefault["axes.linewidth"]
+    with style_sheet(read_style_sheet(str(sheet))):
+        status = found["fit_status"].draw(88.0).axes[0].images[0].get_cmap()
+    assert to_rgb(status(1)) == to_rgb("#AA5500")  # vermilion is the second colour
+    assert to_rgb(found["fit_status"].draw(88.0).axes[0].images[0].get_cmap()(1)) == to_rgb(VERMILION)
+
+
+def test_wrong_style_sheets_get_one_line(tmp_path: Path) -> None:
+    assert read_style_sheet("grayscale")["image.cmap"] == "gray"
+    assert "backend" not in read_style_sheet("grayscale")
+    with pytest.raises(ConfigError, match="no such file, and no style of matplotlib"):
+        read_style_sheet("nothing.mplstyle")
+    sheet = tmp_path / "wrong.mplstyle"
+    for text, words in (("axes.linewith: 2\n", "axes.linewith"), ("axes.linewidth: thick\n", "thick")):
+        sheet.write_text(text)
+        with pytest.raises(ConfigError, match=words) as caught:
+            read_style_sheet(str(sheet))
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "mm"), [("88mm", 88), ("8.8 cm", 88), ("3.5in", 88.9), ("120", 120), ("252pt", 88.9)]
+)
+def test_widths(text: str, mm: float) -> None:
+    assert millimetres(text) == pytest.approx(mm)
+
+
+@pytest.mark.parametrize("text", ["", "wide", "-3mm", "88 px", "1mm", "5in5", "900mm"])
+def test_wrong_widths_show_how(text: str) -> None:
+    with pytest.raises(ConfigError, match="--width"):
+        millimetres(text)
+
+
+def test_a_saved_figure_keeps_the_style(found: dict[str, Exhibit], tmp_path: Path) -> None:
+    figure = found["electron_numbers"].draw(88.0)
+    figure.savefig(tmp_path / "a.pdf")
+    assert b"/FontFile2" in (tmp_path / "a.pdf").read_bytes()
+    with Image.open(io.BytesIO(figure._repr_png_())) as image:
+        assert image.width > 400
+
+
+def test_headings_and_gaps_in_csv() -> None:
+    table = DataTable("", {"a, b (DN)": np.array([1.5, np.nan]), "n": [1, 2]})
+    assert csv_text(table) == '"a, b (DN)",n\n1.5,1\n,2\n'

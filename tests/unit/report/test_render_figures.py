@@ -1,0 +1,302 @@
+"""Every figure, on data as they should be and on data as they are."""
+
+import io
+from collections.abc import Callable
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from helpers.report_material import CASES, PARAMETERS, pixel_fit, report_data, true_maps
+from matplotlib.figure import Figure
+from PIL import Image
+
+from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
+from pchem_pipeline.report.data import PixelFit
+from pchem_pipeline.report.figures.ensemble_figures import component_widths, electron_numbers, ensemble
+from pchem_pipeline.report.figures.map_figures import (
+    fit_status_map,
+    map_and_histogram,
+    read_noise_histogram,
+    status_counts,
+)
+from pchem_pipeline.report.figures.pixel_figures import PAPER_EXAMPLE, cluster_edges, pixel_fits, shown_bins
+from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, figure_bytes, small_png
+
+WORDS = {int(bit): text for bit, text in MEANINGS.items()}
+
+
+def drawn(figure: Figure) -> bytes:
+    """Draw at low resolution; warnings are errors."""
+    content = figure_bytes(figure, "png", dpi=50)
+    assert content.startswith(b"\x89PNG")
+    return content
+
+
+def texts(figure: Figure) -> str:
+    found = [text.get_text() for text in figure.findobj(mpl.text.Text)]
+    return "\n".join(found)
+
+
+@pytest.fixture(scope="module")
+def pixel() -> PixelFit:
+    return pixel_fit(true_maps((8, 8)), 3, 4, "low read noise, low exposure")
+
+
+NAN_PIXEL = PixelFit(
+    "failed", 1, 2, 100, np.array([0, 5, 6, 0]), dict.fromkeys((*PARAMETERS, "read_noise_e"), float("nan")),
+    status="fewer than 3 occupied bins; one Gaussian fits as well: the conversion gain is not identified",
+)  # fmt: skip
+EMPTY_PIXEL = replace(NAN_PIXEL, counts=np.zeros(4, dtype=np.uint16))
+
+
+def test_cluster_edges_of_the_paper_lie_at_the_optimal_thresholds() -> None:
+    figure = cluster_edges(PAPER_EXAMPLE)
+    lines = figure.axes[0].collections[0].get_segments()
+    edges = np.array([segment[0, 0] for segment in lines])
+    k = np.arange(edges.size)
+    np.testing.assert_allclose(edges, k + 0.5 + 0.33**2 * np.log((k + 1) / 1.8))
+    assert "signal (e⁻)" in texts(figure)
+    drawn(figure)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"quanta_exposure": 0.01},
+        {"quanta_exposure": 60.0},
+        {"quanta_exposure": 0.0},
+        {"bias": float("nan")},
+    ],
+)
+def test_cluster_edges_of_odd_pixels(pixel: PixelFit, change: dict[str, float]) -> None:
+    drawn(cluster_edges({**pixel.parameters, **change}, counts=pixel.counts, origin=pixel.origin))
+
+
+@pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
+def test_pixel_fits_show_parameters_with_errors_and_the_status(pixel: PixelFit, width: float) -> None:
+    figure = pixel_fits([pixel, NAN_PIXEL, EMPTY_PIXEL], width_mm=width)
+    words = texts(figure)
+    assert "± 0.012 e⁻" in words
+    assert "fewer than 3 occupied bins" in words
+    assert "no fit" in words
+    assert "no frames" in words
+    assert figure.get_size_inches()[0] * 25.4 == pytest.approx(width)
+    drawn(figure)
+
+
+def test_residuals_beyond_the_strip_are_marked(pixel: PixelFit) -> None:
+    wrong = replace(pixel, parameters={**pixel.parameters, "bias": pixel.parameters["bias"] + 5.0})
+    assert "beyond 12 σ" in texts(pixel_fits([wrong]))
+
+
+def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
+    counts = np.zeros(5000, dtype=np.int64)
+    counts[: pixel.counts.size] = pixel.counts
+    counts[4999] = 1
+    figure = pixel_fits([replace(pixel, counts=counts)])
+    assert np.ptp(figure.subfigs[0].axes[0].get_xlim()) < 400
+    assert "1 outside the axis" in texts(figure)
+    drawn(figure)
+
+
+def test_shown_bins_refuse_an_empty_histogram() -> None:
+    with pytest.raises(ValueError, match="empty"):
+        shown_bins(np.zeros(3))
+
+
+def _map(kind: str) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    values = rng.normal(2.0, 0.2, (24, 32))
+    match kind:
+        case "hot":
+            values[3, 4] = 1e4
+        case "holes":
+            values[rng.random(values.shape) < 0.3] = np.nan
+        case "empty":
+            values[:] = np.nan
+        case "constant":
+            values[:] = 2.0
+        case "one value":
+            values[:] = np.nan
+            values[2, 3] = 1.0
+        case "decades":
+            values = np.exp(3 * rng.standard_normal(values.shape))
+        case "tiny":
+            values = values[:8, :8]
+        case "wide":
+            values = values.ravel()[None, :600]
+        case "column":
+            values = values.ravel()[:40, None]
+        case "long":
+            values = values.reshape(4, -1)
+        case "channels":
+            values = values.ravel()[None, :6].copy()
+            values[0, 2] = np.nan
+        case "one pixel":
+            values = values[:1, :1]
+    return values
+
+
+KINDS = (
+    *["plain", "hot", "holes", "empty", "constant", "decades", "tiny", "wide", "column", "long", "channels"],
+    "one value",
+    "one pixel",
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_maps_of_all_kinds(kind: str) -> None:
+    values = _map(kind)
+    for stretch in ("beta", "linear") if kind in ("hot", "empty", "constant") else ("beta",):
+        figure = map_and_histogram(values, "dark_current", stderr=np.abs(values) / 100, stretch=stretch)
+        assert "(e⁻/px/s)" in texts(figure)
+        drawn(figure)
+    drawn(read_noise_histogram(values))
+
+
+def test_pixels_without_a_value_are_counted_in_the_map() -> None:
+    values = _map("holes")
+    assert f"no value: {np.isnan(values).sum()} pixels" in texts(map_and_histogram(values, "bias"))
+    assert "no value:" not in texts(map_and_histogram(_map("plain"), "bias"))
+
+
+def test_the_median_of_the_read_noise_is_marked() -> None:
+    values = _map("plain") * 0.15
+    figure = read_noise_histogram(values)
+    positions = [line.get_xdata()[0] for line in figure.axes[0].lines]
+    assert np.median(values) in positions
+    assert f"median {np.median(values):.3f} e⁻" in texts(figure)
+
+
+@pytest.mark.parametrize("shape", [(12, 20), (1, 9), (8, 8), (60, 2)])
+def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
+    status = np.zeros(shape, dtype=np.uint16)
+    status[0, 0] = int(FitStatus.TOO_FEW_BINS)
+    status[0, 1] = int(FitStatus.POOR_FIT | FitStatus.BIAS_AMBIGUOUS)
+    figure = fit_status_map(status, WORDS)
+    words = texts(figure).replace("\n", " ")
+    for bit in (FitStatus.TOO_FEW_BINS, FitStatus.POOR_FIT, FitStatus.BIAS_AMBIGUOUS):
+        assert f"{MEANINGS[bit]}: 1" in words
+    assert f"good fit: {status.size - 2}" in words
+    drawn(figure)
+
+
+def test_pixels_that_no_fit_has_reached_are_not_called_good() -> None:
+    status, missing = np.zeros((6, 8), dtype=np.uint16), np.zeros((6, 8), dtype=bool)
+    missing[:2] = True
+    words = texts(fit_status_map(status, WORDS, unfitted=missing))
+    assert "not fitted yet: 16 (33 %)" in words
+    assert "good fit: 32 (67 %)" in words
+
+
+def test_every_status_at_once_and_unknown_bits() -> None:
+    status = (1 << np.arange(16, dtype=np.uint16)).reshape(2, 8)
+    rows = status_counts(status, WORDS)
+    assert sum(n for _, _, n in rows) == 16
+    assert any("status bit 32768" in text for _, text, _ in rows)
+    drawn(fit_status_map(status, WORDS))
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, np.ndarray]:
+    return dict(report_data((12, 16)).ensemble)
+
+
+RMSE = {"epcd_exact": 1.3e-4, "noise_floor": 1.2e-4, "nuced_exact": 2e-4}
+
+
+@pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
+def test_ensemble_shows_both_halves_with_rmse(arrays: dict[str, np.ndarray], width: float) -> None:
+    figure = ensemble(arrays, RMSE, n_frames=250, width_mm=width)
+    words = texts(figure)
+    assert "exact mean over pixels, RMSE 1.3×10⁻⁴" in words
+    assert "sampling noise alone, RMSE 1.2×10⁻⁴" in words
+    assert "raw data, 250 frames" in words
+    drawn(figure)
+
+
+def _half(arrays: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
+    return {name: arrays[name] for name in names}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a: {},
+        lambda a: _half(a, "dn", "counts", "density"),
+        lambda a: _half(a, "electrons", "nuced_counts", "nuced_density", "nuced_exact"),
+        lambda a: {**_half(a, "dn", "counts", "density", "epcd_exact"), "counts": np.zeros_like(a["counts"])},
+        lambda a: {"dn": np.array([100]), "counts": np.array([7]), "density": np.array([1.0])},
+    ],
+)
+def test_ensemble_with_parts_missing(
+    arrays: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
+) -> None:
+    drawn(ensemble(change(arrays), {}))
+
+
+def test_electron_numbers(arrays: dict[str, np.ndarray]) -> None:
+    k, mass, pmf = (arrays[name] for name in ("k", "electron_mass", "electron_pmf"))
+    drawn(
+        electron_numbers(k, mass, pmf, pmf_map=arrays["electron_pmf_map"], counts=arrays["electron_counts"])
+    )
+    drawn(electron_numbers(k[:1], np.ones(1), np.ones(1)))
+    drawn(electron_numbers(k, np.zeros(k.size), np.zeros(k.size), counts=np.zeros(k.size)))
+
+
+@pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
+def test_component_widths(arrays: dict[str, np.ndarray], width: float) -> None:
+    variance = arrays["component_variance"]
+    k = np.arange(variance.shape[1])
+    figure = component_widths(
+        k,
+        variance,
+        CASES,
+        nuced_variance=arrays["nuced_component_variance"],
+        highlight=("none", "H, g"),
+        width_mm=width,
+    )
+    assert "constant: H, g" in texts(figure)
+    drawn(figure)
+    drawn(component_widths(k[:1], variance[:1, :1], CASES[:1]))
+    drawn(component_widths(k, np.zeros_like(variance), CASES))
+
+
+@pytest.mark.parametrize("kind", ["svg", "png", "pdf"])
+def test_the_same_figure_gives_the_same_bytes(pixel: PixelFit, kind: str) -> None:
+    parameters, counts, origin = pixel.parameters, pixel.counts, pixel.origin
+    first, second = (
+        figure_bytes(cluster_edges(parameters, counts=counts, origin=origin), kind, dpi=60, title="a <title>")
+        for _ in range(2)
+    )
+    assert first == second
+
+
+def test_fonts_are_embedded(pixel: PixelFit) -> None:
+    figure = cluster_edges(pixel.parameters)
+    svg = figure_bytes(figure, "svg").decode()
+    assert "<text" not in svg
+    pdf = figure_bytes(figure, "pdf")
+    assert b"/FontFile2" in pdf
+
+
+def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
+    with mpl.rc_context({"font.size": 31.0, "axes.facecolor": "red"}):
+        before = dict(mpl.rcParams)
+        figure = cluster_edges(pixel.parameters)
+        figure_bytes(figure, "svg")
+        assert dict(mpl.rcParams) == before
+        assert figure.axes[0].get_facecolor() != (1.0, 0.0, 0.0, 1.0)
+
+
+def test_a_palette_does_not_change_a_map_visibly() -> None:
+    full = figure_bytes(map_and_histogram(_map("holes"), "bias"), "png", dpi=150)
+    few = small_png(full)
+    assert len(few) < len(full)
+    before, after = (
+        np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=float) for png in (full, few)
+    )
+    assert np.abs(before - after).mean() < 1.0
+    assert np.abs(before - after).max() < 32

@@ -1,0 +1,362 @@
+"""The HTML report: complete in itself, readable by everyone, and safe with hostile names."""
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from helpers.report_material import pixel_fit, report_data, true_maps
+
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
+from pchem_pipeline.report.inspector.inspector import script
+from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.pages.verdict import flags, sentence
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.pictures import Picture
+
+#: Fast drawings: no files, coarse maps.
+QUICK = ReportSettings(figure_formats=(), dpi=72)
+
+
+class Page(HTMLParser):
+    """Every tag with its attributes, and the text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.style = ""
+        self._in_style = False
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._in_style = tag == "style"
+
+    def handle_data(self, data: str) -> None:
+        if self._in_style:
+            self.style += data
+            self._in_style = False
+        else:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+    def of(self, tag: str) -> Iterator[dict[str, str | None]]:
+        return (attributes for name, attributes in self.tags if name == tag)
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return report_data((24, 32))
+
+
+@pytest.fixture(scope="module")
+def report(data: ReportData) -> RenderedReport:
+    return render_report(data, ReportSettings(figure_formats=("svg",), dpi=72))
+
+
+@pytest.fixture(scope="module")
+def page(report: RenderedReport) -> Page:
+    return Page(report.html)
+
+
+def test_nothing_is_loaded_from_anywhere(page: Page) -> None:
+    for tag, attributes in page.tags:
+        assert tag not in ("link", "iframe", "object", "embed", "base", "form")
+        for name, value in attributes.items():
+            assert not name.startswith("on")
+            if name in ("src", "srcset", "href", "data", "poster", "action", "background"):
+                assert value is not None
+                assert value.startswith(("data:image/", "#")), (tag, name, value[:60])
+    assert "url(" not in page.style
+    assert "@import" not in page.style
+    policy = next(a for a in page.of("meta") if a.get("http-equiv") == "Content-Security-Policy")
+    rules = dict(rule.strip().split(" ", 1) for rule in str(policy["content"]).split(";"))
+    assert (
+        rules["default-src"] == rules["connect-src"] == rules["base-uri"] == rules["form-action"] == "'none'"
+    )
+    assert rules["img-src"] == "data:"
+    # no script but the one whose hash is in the policy; data blocks are not run
+    scripts = [a for a in page.of("script") if a.get("type") not in ("application/json", "text/plain")]
+    assert all(set(a) <= {"type", "id"} for a in page.of("script"))
+    digest = base64.b64encode(hashlib.sha256(script().encode()).digest()).decode()
+    assert rules.get("script-src", "") == (f"'sha256-{digest}'" if scripts else "")
+    assert len(scripts) == (1 if "script-src" in rules else 0)
+
+
+def test_every_figure_of_the_paper_is_there_and_described(
+    page: Page, report: RenderedReport, data: ReportData
+) -> None:
+    images = list(page.of("img"))
+    shown = {str(a["id"]).removeprefix("figure-") for a in page.of("figure")}
+    assert shown == set(EXHIBIT_NAMES)
+    assert set(report.figures) == {f"{name}.svg" for name in EXHIBIT_NAMES}
+    assert len(images) == len(EXHIBIT_NAMES)
+    for image in images:
+        alt = str(image["alt"])
+        assert re.search(r"\d", alt), alt
+        assert len(alt) > 40
+        assert image["width"]
+    median = np.nanmedian(data.maps["read_noise_e"])
+    assert any(f"read noise: median {median:.4f}" in str(image["alt"]) for image in images)
+
+
+def test_contents_lead_somewhere_and_ids_are_unique(page: Page) -> None:
+    ids = [a["id"] for _, a in page.tags if a.get("id")]
+    assert len(ids) == len(set(ids))
+    targets = [str(a["href"])[1:] for a in page.of("a")]
+    assert len(targets) >= 10
+    assert set(targets) <= set(ids)
+
+
+def test_tables_have_headings_and_scroll_by_keyboard(page: Page) -> None:
+    scopes = [a.get("scope") for a in page.of("th")]
+    assert scopes
+    assert set(scopes) == {"col", "row"}
+    regions = [a for a in page.of("div") if a.get("role") == "region"]
+    assert len(regions) == len(list(page.of("table")))
+    assert all(a["tabindex"] == "0" for a in regions)
+
+
+def test_the_first_screen_has_the_numbers(page: Page, data: ReportData) -> None:
+    assert sentence(data) in page.text
+    assert "Can these results be believed?" in page.text
+    assert "± " in sentence(data)
+    assert "RMSE of 1.3×10⁻⁴; sampling noise alone gives 1.2×10⁻⁴" in page.text
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "Estimates against the truth",
+        "Moments of the ensemble",
+        "Fit status by reason",
+        "algorithm: newton",
+        "xxh3_128:0123456789abcdef",
+        "45.6 s",
+        "512.0 MB",
+        "raw, independent parameters",
+        "2026-01-02T03:04:05Z",
+    ],
+)
+def test_the_tables_are_there(page: Page, words: str) -> None:
+    assert words in page.text
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texts without pictures: fast."""
+
+    def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> object:
+        return Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
+
+    monkeypatch.setattr(report_module, "draw_picture", dot)
+
+
+HOSTILE = (
+    '<script>alert("x")</script><img src=http://evil.example/x onerror=alert(1)>"\'{{ 7*7 }} '
+    "$x^{ \u4e2d\U0001f600"
+)
+
+
+def test_hostile_metadata_is_shown_not_run(data: ReportData) -> None:
+    small = report_data((8, 8))
+    pixel = replace(small.pixels[0], label=HOSTILE, status=HOSTILE)
+    odd = replace(
+        small,
+        title=HOSTILE,
+        pixels=[pixel],
+        config_yaml=f"input: {HOSTILE}",
+        run={HOSTILE: HOSTILE},
+        inputs=[{"name": HOSTILE, "size": 1, "hash": HOSTILE}],
+        stages=[{"stage": HOSTILE, "state": HOSTILE, "seconds": 1.0, "notes": [HOSTILE]}],
+        missing={"components": HOSTILE},
+        status_words={1 << i: HOSTILE for i in range(16)},
+        ensemble={},
+    )
+    rendered = render_report(odd, QUICK)
+    shown = Page(rendered.html)
+    test_nothing_is_loaded_from_anywhere(shown)
+    assert shown.text.count('<script>alert("x")</script>') >= 6
+    assert "{{ 7*7 }}" in shown.text
+    assert json.loads(rendered.json)["title"] == HOSTILE
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_third_of_the_pixels_failed() -> None:
+    data = report_data((24, 24), failed=0.34)
+    levels = {flag.level: flag.text for flag in flags(data)}
+    assert "more than the 10 % that is allowed" in levels["serious"]
+    page = Page(render_report(data, QUICK).html)
+    assert "one Gaussian fits as well" in page.text
+    assert "✕ Serious" in page.text
+
+
+def test_cautions_are_of_pixels_with_a_value_and_failures_have_reasons() -> None:
+    data = report_data((24, 24), failed=0.34)
+    status = data.fit["fit_status"].copy()
+    failed = (status & data.failed_mask) != 0
+    status[failed] |= int(FitStatus.BIAS_AMBIGUOUS)
+    status[~failed] = 0
+    said = flags(replace(data, fit={**data.fit, "fit_status": status}))
+    assert not [flag for flag in said if "bias ambiguous" in flag.text]
+    lost = int(((status & int(FitStatus.TOO_FEW_BINS)) != 0).sum())
+    assert f"fewer than 3 occupied bins ({lost})" in next(f.text for f in said if f.level == "serious")
+
+
+def all_failed() -> ReportData:
+    data = report_data((8, 8))
+    nan = np.full((8, 8), np.nan)
+    lost = replace(
+        data.pixels[0],
+        parameters=dict.fromkeys(data.pixels[0].parameters, float("nan")),
+        stderr={},
+        status="no data",
+    )
+    return replace(
+        data,
+        maps=dict.fromkeys(data.maps, nan),
+        fit={"fit_status": np.full((8, 8), int(FitStatus.TOO_FEW_BINS), np.uint16), "goodness_p": nan},
+        pixels=[lost, lost],
+        ensemble={},
+        ensemble_facts={},
+        moments=(),
+        missing=dict.fromkeys(("maps", "ensemble", "electrons", "components"), "no pixel has a value"),
+    )
+
+
+def channels() -> ReportData:
+    data = report_data((1, 5))
+    maps = {name: values for name, values in data.maps.items() if "dark" not in name}
+    missing = {"dark_current": "no integration time", "ensemble": "no frames", "electrons": "no frames"}
+    return replace(
+        data,
+        maps=maps,
+        ensemble={},
+        ensemble_facts={},
+        moments=(),
+        n_frames=None,
+        integration_time=None,
+        truth={},
+        missing=missing,
+        channel_names=("dark", "red", "green", "blue", "far <red>"),
+    )
+
+
+def bare() -> ReportData:
+    return ReportData(title="empty", shape=(4, 4))
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_all_pixels_failed() -> None:
+    page = Page(render_report(all_failed(), QUICK).html)
+    assert "None of the 64 pixels could be fitted" in page.text
+    assert "no pixel has a value" in page.text
+    assert "not known" not in sentence(all_failed())
+    assert {str(a["id"]) for a in page.of("figure")} == {
+        "figure-cluster_edges_example",
+        "figure-pixel_fits",
+        "figure-fit_status",
+    }
+
+
+def test_ready_made_histograms_are_channels_and_say_what_is_left_out() -> None:
+    page = Page(render_report(channels(), QUICK).html)
+    assert "of 5 channels" in page.text
+    assert "4 far <red>" in page.text
+    assert "Left out: no integration time" in page.text
+    assert "Left out: no frames" in page.text
+    assert "dark_current" not in [str(a["id"]).removeprefix("figure-map_") for a in page.of("figure")]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_nothing_at_all() -> None:
+    rendered = render_report(bare(), QUICK)
+    assert "None of the 16 pixels" in Page(rendered.html).text
+    assert json.loads(rendered.json)["summary"] == {}
+
+
+def test_a_large_sensor_stays_small_on_disk() -> None:
+    """512 x 512 pixels of noise, the worst case for the maps: below 8 MB."""
+    rng = np.random.default_rng(6)
+    base = report_data((16, 16))
+    shape = (512, 512)
+    maps = {name: 1.0 + 0.1 * rng.standard_normal(shape) for name in MAP_NAMES}
+    status = (rng.random(shape) < 0.3).astype(np.uint16) * int(FitStatus.POOR_FIT)
+    large = replace(base, shape=shape, maps=maps, fit={"fit_status": status}, truth={}, pixels=())
+    html = render_report(large, ReportSettings(figure_formats=())).html
+    assert 0.5e6 < len(html.encode()) < 8e6
+
+
+def test_settings_decide_files_and_stretch() -> None:
+    data = report_data((8, 8))
+    lean = replace(data, ensemble={}, pixels=(), maps={"bias": data.maps["bias"]}, fit={})
+    rendered = render_report(lean, ReportSettings(figure_formats=("pdf",), dpi=72, map_stretch="linear"))
+    assert {name.rsplit(".")[-1] for name in rendered.figures} == {"pdf"}
+    assert "between the 1st and the 99th percentile" in rendered.html
+    names = [exhibit.name for exhibit in exhibits(data, QUICK)]
+    assert names == list(EXHIBIT_NAMES)
+
+
+def test_settings_refuse_doubles() -> None:
+    with pytest.raises(ValueError, match="listed twice"):
+        ReportSettings(figure_formats=("svg", "svg"))
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        ({"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}, "serious", "does not explain"),
+        ({"rmse": {"epcd_exact": 2e-4, "noise_floor": 1e-4}}, "caution", "small differences"),
+        ({"rmse": {"epcd_exact": 1.1e-4, "noise_floor": 1e-4}}, "good", "explains the data"),
+    ],
+)
+def test_flags_of_the_ensemble(
+    data: ReportData, change: dict[str, dict[str, float]], level: str, words: str
+) -> None:
+    found = [flag for flag in flags(replace(data, ensemble_facts=change)) if "raw ensemble" in flag.text]
+    assert [(flag.level, words in flag.text) for flag in found] == [(level, True)]
+
+
+def test_poor_goodness_of_fit_is_said(data: ReportData) -> None:
+    p = np.full(data.shape, 0.5)
+    p[:4] = 1e-9
+    found = [
+        flag for flag in flags(replace(data, fit={**data.fit, "goodness_p": p})) if "Goodness" in flag.text
+    ]
+    assert [flag.level for flag in found] == ["serious"]
+    assert flags(data)[0].level != "serious"
+
+
+def test_unfinished_stages_and_high_read_noise_are_said(data: ReportData) -> None:
+    odd = replace(
+        data,
+        stages=[{"stage": "fit", "state": "3 of 4 units"}],
+        maps={
+            **data.maps,
+            "read_noise_e": data.maps["read_noise_e"] + 0.4,
+            "conversion_gain": data.maps["conversion_gain"] * 6,
+        },
+    )
+    words = " ".join(flag.text for flag in flags(odd))
+    assert "Stage fit is 3 of 4 units" in words
+    assert "above 0.5 e⁻" in words
+    assert "above 0.4 e⁻/DN" in words
+
+
+def test_a_pixel_beside_its_numbers() -> None:
+    pixel = pixel_fit(true_maps((4, 4)), 1, 2, "mine")
+    data = replace(report_data((4, 4)), pixels=[pixel])
+    alt = next(e.alt for e in exhibits(data, QUICK) if e.name == "pixel_fits")
+    assert f"quanta exposure {pixel.parameters['quanta_exposure']:.3f} ± 0.012 e⁻" in alt

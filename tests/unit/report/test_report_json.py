@@ -1,0 +1,100 @@
+"""``report.json``: the shape that programs rely on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.report_material import report_data
+
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.report_json import report_json
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return report_data((16, 20), failed=0.1)
+
+
+@pytest.fixture(scope="module")
+def numbers(data: ReportData) -> dict[str, object]:
+    content: dict[str, object] = json.loads(report_json(data))
+    return content
+
+
+def test_the_keys_that_others_read(numbers: dict, data: ReportData) -> None:
+    assert numbers["summary"]["read_noise_e"]["median"] == pytest.approx(
+        np.nanmedian(data.maps["read_noise_e"])
+    )
+    assert set(numbers["ensemble"]["rmse"]) >= {
+        "epcd_exact",
+        "epcd_dependent",
+        "epcd_independent",
+        "nuced_dependent",
+        "nuced_independent",
+        "noise_floor",
+    }
+    assert set(numbers) >= {
+        "summary",
+        "ensemble",
+        "fit_status",
+        "run",
+        "inputs",
+        "stages",
+        "moments",
+        "electron_numbers",
+    }
+
+
+def test_every_map_is_summarised_with_its_unit(numbers: dict, data: ReportData) -> None:
+    names = {name for name in data.maps if not name.endswith("_stderr")}
+    assert set(numbers["summary"]) == names
+    noise = numbers["summary"]["read_noise_e"]
+    assert noise["unit"] == "e-"
+    assert noise["percentiles"]["50"] == noise["median"]
+    assert noise["n_pixels"] + noise["n_without_value"] == data.shape[0] * data.shape[1]
+    assert noise["pixel_stderr"] == pytest.approx(np.nanmedian(data.maps["read_noise_e_stderr"]))
+
+
+def test_fit_status_counts_pixels_by_reason(numbers: dict, data: ReportData) -> None:
+    status = data.fit["fit_status"]
+    found = numbers["fit_status"]
+    assert found["n_pixels"] == status.size
+    assert found["n_good"] == (status == 0).sum()
+    assert found["n_good"] + found["n_caution"] + found["n_failed"] == status.size
+    few = found["reasons"]["too_few_bins"]
+    assert few["pixels"] == ((status & int(FitStatus.TOO_FEW_BINS)) != 0).sum() > 0
+    assert few["failed"] is True
+    assert found["reasons"]["poor_fit"]["failed"] is False
+
+
+def test_pulls_of_simulated_data(numbers: dict) -> None:
+    bias = numbers["truth"]["bias"]
+    n = numbers["summary"]["bias"]["n_pixels"]
+    assert abs(bias["pull_mean"]) < 5 / np.sqrt(n)
+    assert abs(bias["pull_sd"] - 1) < 5 / np.sqrt(2 * n)
+
+
+def test_electron_numbers_add_up(numbers: dict) -> None:
+    assert sum(numbers["electron_numbers"]["mass"]) == pytest.approx(1.0)
+    assert numbers["electron_numbers"]["k"][:3] == [0, 1, 2]
+    assert numbers["ensemble"]["error_rate"] == 0.107
+
+
+def test_what_is_not_known_is_null_and_the_text_is_strict_json(data: ReportData) -> None:
+    odd = replace(
+        data,
+        maps={"bias": np.full(data.shape, np.nan), "bias_stderr": np.full(data.shape, np.nan)},
+        run={"seed": np.int64(7), "rate": np.float64("inf"), "path": object, "flags": (np.bool_(True),)},
+        ensemble_facts={"rmse": {"epcd_exact": float("nan")}, "error_sizes": np.arange(3)},
+    )
+    text = report_json(odd)
+    numbers = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert numbers["summary"]["bias"]["median"] is None
+    assert numbers["ensemble"]["rmse"]["epcd_exact"] is None
+    assert numbers["ensemble"]["error_sizes"] == [0, 1, 2]
+    assert numbers["run"]["seed"] == 7
+    assert numbers["run"]["rate"] is None
+    assert numbers["run"]["flags"] == [True]
+    assert text.endswith("\n")

@@ -1,0 +1,324 @@
+"""The driver of the stages, with small stages of our own."""
+
+import functools
+import json
+import signal
+
+import numpy as np
+import pytest
+from helpers.commands import sigint
+
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
+from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.run import runner
+from pchem_pipeline.run.declaration import Stage
+from pchem_pipeline.run.fingerprint import differences, status
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import InterruptedRunError, StopRequest, stop_on_signals
+from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
+from pchem_pipeline.store.run_store import RunStore
+
+CALLS: list[str] = []
+BROKEN: set[str] = set()
+
+
+def number_tile(path, value, tile):
+    CALLS.append(tile.key)
+    if tile.key in BROKEN:
+        raise ValueError("this tile is odd")
+    open_store(path).write("fit/bias", tile.region, np.full(tile.shape, value + tile.iy))
+    return {"iy": tile.iy}
+
+
+def double_tile(path, tile):
+    store = open_store(path)
+    store.write("maps/bias", tile.region, 2 * store.read("fit/bias", tile.region))
+
+
+def fit_run(context):
+    context.create_maps(["fit/bias"])
+    value = context.config.fit.gap_threshold
+    context.run_units(context.tiles(), functools.partial(number_tile, context.store.path, value))
+
+
+def maps_run(context):
+    context.create_maps(["maps/bias"])
+    context.run_units(context.tiles(), functools.partial(double_tile, context.store.path), needs="fit")
+
+
+def ensemble_run(context):
+    context.run_units([WHOLE], lambda unit: {"sum": 1})
+
+
+def stage(name, upstream, settings, writes, run):
+    return Stage(name, 1, upstream, settings, (), writes, f"{__name__}:{run.__name__}")
+
+
+FAKES = {
+    "fit": stage("fit", (), ("fit.gap_threshold",), ("fit",), fit_run),
+    "maps": stage("maps", ("fit",), (), ("maps",), maps_run),
+    "ensemble": stage("ensemble", ("maps",), (), (), ensemble_run),
+}
+
+
+@pytest.fixture
+def make(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "STAGES", FAKES)
+    CALLS.clear()
+    BROKEN.clear()
+    open_store.cache_clear()
+    store = RunStore.create(tmp_path / "run.zarr")
+    SensorInfo("frames", 10, 20, 30, "uint16", 14, 4.87, "copy", {}).write(store)
+
+    reporter = Reporter("off", quiet=True, log=tmp_path / "log.jsonl")
+
+    def context(config="", **options):
+        text = f"input: {{files: [a]}}\nrun: {{tile: 8}}\n{config}"
+        return StageContext(
+            parse_config(text), tmp_path, store, SerialExecutor(), reporter, StopRequest(), Options(**options)
+        )
+
+    yield context
+    reporter.close()
+
+
+def test_a_second_run_does_nothing(make):
+    assert execute("fit", make()).state == "complete"
+    assert len(CALLS) == 12
+    assert execute("fit", make()).state == "complete"
+    assert len(CALLS) == 12
+
+
+def test_a_changed_setting_redoes_the_stages_that_read_it(make):
+    execute("fit", make())
+    execute("maps", make())
+    changed = make("fit: {gap_threshold: 7}")
+    state = status(FAKES["fit"], changed)
+    assert state.words() == "stale - fit.gap_threshold 5.0 -> 7.0"
+    execute("fit", changed)
+    assert status(FAKES["maps"], changed).words() == "stale - fit was done again"
+    execute("maps", changed)
+    assert changed.store.read("maps/bias")[0, 0] == 14
+
+
+def test_a_setting_that_no_stage_reads_redoes_nothing(make):
+    execute("fit", make())
+    assert status(FAKES["fit"], make("compute: {workers: 7}")).state == "complete"
+
+
+def test_one_bad_tile_stops_nothing_and_is_retried(make):
+    BROKEN.add("1.2")
+    context = make()
+    state = execute("fit", context)
+    assert state.state == "failed"
+    assert "first 1.2: ValueError: this tile is odd" in state.why
+    assert status(FAKES["fit"], context).words().startswith("partial 11 of 12 - 1 failed")
+    assert np.isnan(context.store.read("fit/bias")[8, 16])
+    maps = make()
+    assert execute("maps", maps).state == "failed"
+    assert maps.failed == {"1.2": "stage fit has not finished it"}
+    BROKEN.clear()
+    CALLS.clear()
+    assert execute("fit", make()).state == "complete"
+    assert CALLS == ["1.2"]
+    assert execute("maps", make()).state == "complete"
+    assert np.isfinite(context.store.read("maps/bias")).all()
+    assert status(FAKES["maps"], make()).state == "complete"
+
+
+def test_an_undivided_stage_starts_again_when_upstream_grew(make):
+    BROKEN.add("0.0")
+    execute("fit", make())
+    execute("maps", make())
+    execute("ensemble", make())
+    assert status(FAKES["ensemble"], make()).state == "complete"
+    BROKEN.clear()
+    execute("fit", make())
+    execute("maps", make())
+    assert status(FAKES["ensemble"], make()).words() == "stale - maps was done again"
+
+
+def test_tiles_redo_a_part_only_with_force(make):
+    execute("fit", make())
+    CALLS.clear()
+    execute("fit", make(tiles="0.0,2.3"))
+    assert CALLS == []
+    execute("fit", make(tiles="0.0,2.3", force=True))
+    assert CALLS == ["0.0", "2.3"]
+    execute("fit", make(roi=(0, 3, 0, 9), force=True))
+    assert CALLS[2:] == ["0.0", "0.1"]
+    execute("fit", make(force=True))
+    assert len(CALLS) == 4 + 12
+
+
+def test_tiles_of_a_new_stage_leave_it_partial(make):
+    assert execute("fit", make(tiles="0.0")).words() == "partial 1 of 12"
+    assert execute("fit", make()).state == "complete"
+
+
+def test_unknown_tiles_are_refused(make):
+    with pytest.raises(ConfigError, match="no tile 9"):
+        execute("fit", make(tiles="9.9"))
+
+
+def test_unknown_tiles_are_refused_even_where_nothing_is_to_be_done(make):
+    assert execute("fit", make()).state == "complete"
+    for wrong in ({"tiles": "9.9"}, {"roi": (0, 9, 90, 99)}):
+        with pytest.raises(ConfigError):
+            execute("fit", make(**wrong))
+    assert execute("fit", make(tiles="0.0")).state == "complete"
+
+
+def test_changes_of_the_input_are_said_in_words():
+    settings = {"version": 1, "settings": {}, "upstream": {}}
+    time, later = ({**settings, "input": {"integration_time": value}} for value in (4.87, 5.0))
+    assert differences(time, later) == ["input.integration_time 4.87 -> 5.0"]
+    digest, other = ({**settings, "input": {"content": value}} for value in ("ab", "cd"))
+    assert differences(digest, other) == ["the content of the input changed"]
+
+
+def test_dry_run_writes_nothing(make):
+    context = make(dry_run=True)
+    assert execute("fit", context).state == "missing"
+    assert context.store.records.read("fit") is None
+    assert CALLS == []
+
+
+def test_a_stage_without_its_upstream_names_the_command(make):
+    with pytest.raises(StoreError, match="maps needs fit first; run: pchem fit"):
+        execute("maps", make())
+
+
+def test_a_signal_stops_between_units_and_the_rest_is_done_later(make):
+    context = make()
+
+    class Interrupting(SerialExecutor):
+        def map(self, function, items, on_result):
+            def hear(item, outcome):
+                if len(CALLS) == 3:
+                    context.stop.signal = signal.SIGTERM
+                on_result(item, outcome)
+
+            super().map(function, items, hear)
+
+    context.executor = Interrupting()
+    with pytest.raises(InterruptedRunError, match="stopped by SIGTERM") as caught:
+        execute("fit", context)
+    assert caught.value.exit_code == 143
+    assert status(FAKES["fit"], make()).words() == "partial 3 of 12"
+    CALLS.clear()
+    execute("fit", make())
+    assert len(CALLS) == 9
+
+
+def test_work_after_the_last_unit_is_made_up_for(make):
+    """A stop between the last unit and the end of a stage must not leave it complete."""
+    context = make()
+
+    class StopAtTheEnd(SerialExecutor):
+        def map(self, function, items, on_result):
+            super().map(function, items, on_result)
+            context.stop.signal = signal.SIGINT
+
+    context.executor = StopAtTheEnd()
+    with pytest.raises(InterruptedRunError):
+        execute("fit", context)
+    assert status(FAKES["fit"], make()).words() == "partial 12 of 12 - interrupted"
+    CALLS.clear()
+    assert execute("fit", make()).state == "complete"
+    assert CALLS == []
+
+
+def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
+    """It may have made some of its arrays only."""
+    execute("fit", make())
+    context = make("fit: {gap_threshold: 9}")
+    context.stop.signal = signal.SIGTERM
+    monkeypatch.setattr(context, "create_maps", lambda names: context.stop.check())
+    with pytest.raises(InterruptedRunError):
+        execute("fit", context)
+    assert not context.store.has("fit/bias")
+    again = make("fit: {gap_threshold: 9}")
+    assert execute("fit", again).state == "complete"
+    assert again.fresh
+    assert again.store.read("fit/bias")[0, 0] == 9
+
+
+def test_the_total_is_known_while_a_stage_runs(make):
+    context, totals = make(), []
+
+    class Looking(SerialExecutor):
+        def map(self, function, items, on_result):
+            totals.append(context.store.records.read("fit").keys)
+            super().map(function, items, on_result)
+
+    context.executor = Looking()
+    execute("fit", context)
+    assert totals == [12]
+
+
+def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
+    before = signal.getsignal(signal.SIGTERM)
+    with stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.signal == signal.SIGTERM
+        with pytest.raises(InterruptedRunError):
+            stop.check()
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_what_the_shell_ignores_stays_ignored():
+    with sigint(signal.SIG_IGN), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal is None
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.signal == signal.SIGTERM
+    with sigint(signal.default_int_handler), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal == signal.SIGINT
+
+
+def test_a_full_disk_stops_the_run_at_once(make, monkeypatch):
+    import errno
+
+    def full(self, name, region, data):
+        with self._translated(name):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RunStore, "write", full)
+    with pytest.raises(StoreError, match="free some space"):
+        execute("fit", make())
+    assert CALLS == ["0.0"]
+
+
+def test_vanished_camera_files_stop_the_run_at_once(make, monkeypatch):
+    def vanished(self, name, region, data):
+        raise InputError("frames.raw vanished; put it back")
+
+    monkeypatch.setattr(RunStore, "write", vanished)
+    with pytest.raises(InputError, match="put it back") as caught:
+        execute("fit", make())
+    assert caught.value.exit_code == 4
+    assert CALLS == ["0.0"]
+
+
+def test_record_keeps_what_was_used(make):
+    context = make()
+    execute("fit", context)
+    record = context.store.records.read("fit")
+    assert record is not None
+    assert record.content["settings"] == {"fit.gap_threshold": 5.0}
+    assert record.versions["numpy"] == np.__version__
+    assert record.seconds > 0
+    assert record.peak_rss_bytes > 0
+    text = json.dumps(record.content)
+    assert str(context.store.path) not in text
+
+
+def test_json_log_has_one_object_a_line(make, tmp_path):
+    execute("fit", make())
+    events = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert {"start", "progress", "info"} <= {event["event"] for event in events}

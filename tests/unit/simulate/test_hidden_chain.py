@@ -1,0 +1,353 @@
+"""The chain that hides effects: a plain stack obeys the PCD, each effect has the size that its key states."""
+
+import json
+import subprocess
+import sys
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.places import TESTS
+from hidden.chain import ALL, LIBRARY, OUTSIDE, UNTESTABLE, hide
+
+HIDDEN = TESTS / "hidden"
+SHAPE, FRAMES = (24, 20), 500
+SEED = 5
+
+
+@cache
+def made(tag=None, seed=SEED):
+    return hide((tag,) if tag else (), 4.0, seed, SHAPE, FRAMES)
+
+
+class View:
+    """Deviations of a stack from what the true maps say, and their variance."""
+
+    def __init__(self, hiding):
+        s = hiding.sensor
+        self.h, self.step = s.exposure, s.step
+        self.quantum = 1 / (12 * s.step**2)
+        self.e = (hiding.frames - s.bias) / s.step
+        self.d = self.e - s.exposure
+        self.var = s.exposure + s.noise**2 + self.quantum
+        # fourth central moment of Poisson plus normal
+        self.fourth = 3 * self.var**2 + s.exposure
+        self.c = self.e - self.e.mean(axis=0)
+
+
+def regress(v, regressor, scale=1.0):
+    """Multiple of a regressor (e-) in the deviations, and its standard error."""
+    regressor = np.broadcast_to(regressor, v.d.shape)
+    weight = regressor / v.var
+    norm = (weight * regressor).sum()
+    return scale * (weight * v.d).sum() / norm, scale / np.sqrt(norm)
+
+
+def times(effect):
+    return effect.strength * np.array([effect.course(t) for t in range(FRAMES)])[:, None, None]
+
+
+def covariance(v, one, other, expected):
+    """Covariance of pairs of samples over the one expected of unit strength, and its standard error."""
+    spread = np.sqrt((v.var[one[1:]] * v.var[other[1:]]).sum() * v.c[one].shape[0])
+    return (v.c[one] * v.c[other]).sum() / expected, spread / expected
+
+
+def neighbours(v, weight):
+    """Mean of both axes of the covariance of neighbours over ``weight`` (H_i + H_j)."""
+    a, f = slice(None), slice(None, -1)
+    t = slice(1, None)
+    both = []
+    for one, other in (((a, a, f), (a, a, t)), ((a, f, a), (a, t, a))):
+        expected = weight * (v.h[one[1:]] + v.h[other[1:]]).sum() * FRAMES
+        both.append(covariance(v, one, other, expected))
+    (x, sx), (y, sy) = both
+    return (x + y) / 2, np.hypot(sx, sy) / 2
+
+
+def lagged(v, expected):
+    spread = np.sqrt((v.var**2).sum() * (FRAMES - 1))
+    product = (v.c[1:] * v.c[:-1]).sum() + v.c.var(axis=0).sum() * (FRAMES - 1) / FRAMES
+    return product / expected / (FRAMES - 1), spread / expected / (FRAMES - 1)
+
+
+def excess(v, axes, unit):
+    """Variance of means along axes beyond that of their samples, per unit^2, and its standard error."""
+    w = unit / v.var
+    mean = (w * v.d).sum(axis=axes) / (w * unit * np.ones_like(v.var)).sum(axis=tuple(a - 1 for a in axes))
+    w2 = (w**2 * v.var * np.ones_like(v.var)).sum(axis=tuple(a - 1 for a in axes))
+    plain = w2 / (w * unit * np.ones_like(v.var)).sum(axis=tuple(a - 1 for a in axes)) ** 2
+    got = (mean**2 - plain).mean()
+    return got, np.sqrt(2 * (plain**2).mean() / mean.size)
+
+
+def overdispersion(v, e):
+    error = np.sqrt(FRAMES * (v.fourth - v.var**2).sum())
+    norm = FRAMES * (v.h**2).sum()
+    return (v.d**2 - v.var).sum() / norm, error / norm
+
+
+def amplifier(v, e):
+    half = SHAPE[1] // 2
+    left, right = v.c[:, :, :half], v.c[:, :, half:][:, :, ::-1]
+    expected = v.h[:, :half].sum() * FRAMES
+    spread = np.sqrt((v.var[:, :half] * v.var[:, half:][:, ::-1]).sum() * FRAMES)
+    return (left * right).sum() / expected, spread / expected
+
+
+#: by tag: (estimate of the strength, standard error) from a view of a stack and the effect
+ESTIMATES = {
+    "exposure_drift": lambda v, e: regress(v, v.h * times(e), e.strength),
+    "persistence": lambda v, e: regress(v, np.array([e.exposure(t, 0) for t in range(FRAMES)]), e.strength),
+    "exposure_flicker": lambda v, e: excess(v, (1, 2), v.h),
+    "overdispersed_counts": overdispersion,
+    "branching_counts": lambda v, e: regress(v, v.h / (1 - e.strength)),
+    "optical_crosstalk": lambda v, e: neighbours(v, 1 / 4),
+    "nonlinearity": lambda v, e: regress(v, (v.h + v.h**2) / 5 * e.parameters["sign"]),
+    "interpixel_capacitance": lambda v, e: neighbours(v, 1),
+    "analog_memory": lambda v, e: lagged(v, v.h.sum()),
+    "gain_drift": lambda v, e: regress(v, v.h * times(e), e.strength),
+    "bias_drift": lambda v, e: regress(v, times(e) / v.step, e.strength),
+    "bias_jumps": lambda v, e: regress(v, e.course[:, e.part] / v.step, e.strength),
+    "frame_noise": lambda v, e: excess(v, (1, 2), 1 / v.step),
+    "row_noise": lambda v, e: excess(v, (2,), 1 / v.step),
+    "column_noise": lambda v, e: excess(v, (1,), 1 / v.step),
+    "periodic_pickup": lambda v, e: regress(
+        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
+    ),
+    "readout_alternation": lambda v, e: regress(
+        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
+    ),
+    "checkerboard_offset": lambda v, e: regress(
+        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
+    ),
+    "output_crosstalk": amplifier,
+    "spurious_charge": lambda v, e: regress(v, np.ones(SHAPE)),
+}
+#: what grows with the square of the strength
+SQUARED = ("exposure_flicker", "frame_noise", "row_noise", "column_noise")
+
+
+@pytest.mark.parametrize("tag", sorted(ESTIMATES))
+def test_an_effect_has_the_strength_that_its_key_states(tag):
+    hiding = made(tag)
+    (effect,) = hiding.effects
+    expected = effect.strength ** (2 if tag in SQUARED else 1)
+    value, error = ESTIMATES[tag](View(hiding), effect)
+    # the effect itself adds to the noise of its own estimate
+    assert abs(value - expected) < 5 * error + 0.15 * expected
+    assert expected > 5 * error
+    value, error = ESTIMATES[tag](View(made()), effect)
+    assert abs(value) < 5 * error
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_plain_stack_has_the_moments_of_the_pcd(seed):
+    hiding = made(seed=seed)
+    v, n = View(hiding), FRAMES
+    assert 0.3 <= v.h.min() <= v.h.max() <= 5
+    assert 8 <= v.step.min() <= v.step.max() <= 20
+    assert 0.2 <= hiding.sensor.noise.min() <= hiding.sensor.noise.max() <= 0.45
+    mean = v.d.mean(axis=0) / np.sqrt(v.var / n)
+    variance = (v.d.var(axis=0, ddof=1) - v.var) / np.sqrt((v.fourth - v.var**2) / n)
+    for pulls in (mean, variance):
+        assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size)
+        assert abs((pulls**2).mean() - 1) < 5 * np.sqrt(2.5 / pulls.size)
+    # third central moment of Poisson plus normal: H
+    third = (v.d**3).mean() - v.h.mean()
+    assert abs(third) < 5 * np.sqrt((15 * v.var**3 + 25 * v.fourth + v.h).mean() / v.d.size)
+    for value, error in (neighbours(v, 1), lagged(v, v.h.sum())):
+        assert abs(value) < 5 * error
+
+
+def noise_of(tag, k=None, n=400):
+    """The hook of a noise effect on normal numbers, in units of the plain noise."""
+    (effect,) = made(tag).effects
+    rng = np.random.default_rng(1)
+    s = effect.sensor.noise
+    k = np.zeros(SHAPE, int) if k is None else k
+    plain = [s * rng.standard_normal(SHAPE) for _ in range(n)]
+    return effect, np.array([effect.noise(t, p, k) / s for t, p in enumerate(plain)])
+
+
+def test_rts_widens_the_chosen_pixels_only():
+    hiding = made("rts_noise")
+    (effect,) = hiding.effects
+    pulls = lambda v: (v.c.var(axis=0, ddof=1) - v.var) / np.sqrt((v.fourth - v.var**2) / FRAMES)  # noqa: E731
+    inside, outside = pulls(View(hiding))[effect.affected], pulls(View(hiding))[~effect.affected]
+    assert inside.sum() > 5 * np.sqrt(inside.size)
+    assert abs(outside.mean()) < 5 / np.sqrt(outside.size)
+    assert abs(pulls(View(made()))[effect.affected].sum()) < 5 * np.sqrt(inside.size)
+
+
+def test_the_trap_of_averaged_reads_moves_in_steps():
+    for seed in range(30):
+        (effect,) = hide(("rts_noise",), 4.0, seed, (8, 8), 40).effects
+        jumps = np.array([effect.noise(t, np.zeros((8, 8)), None)[effect.where] for t in range(40)])
+        levels = jumps / effect.amplitude * max(effect.reads, 1)
+        if effect.reads:
+            np.testing.assert_allclose(levels, np.round(levels), atol=1e-9)
+            assert abs(levels).max() <= effect.reads
+            assert levels.min() < 0 < levels.max()
+        else:
+            assert len(np.unique(levels[:, 0].round(9))) <= 2
+
+
+def test_blinking_pixels_follow_their_defects():
+    hiding = made("dark_current_rts")
+    (effect,) = hiding.effects
+    regressor = np.zeros((FRAMES, *SHAPE))
+    regressor[:, *effect.where] = effect.extra
+    value, error = regress(View(hiding), regressor)
+    assert abs(value - 1) < 5 * max(error, 0.02)
+    assert 5 * error < 1
+    value, error = regress(View(made()), regressor)
+    assert abs(value) < 5 * error
+
+
+def test_heavy_tails_and_skew():
+    effect, noise = noise_of("heavy_tailed_noise")
+    kurtosis = (noise**4).mean() / (noise**2).mean() ** 2 - 3
+    # a mixture of widths, or Student's law of the same excess kurtosis
+    expected = 3 * effect.strength * (effect.parameters.get("width", 3.0) ** 2 - 1) ** 2
+    assert abs(kurtosis - expected) < 0.3 * expected
+    assert expected > 5 * np.sqrt(24 / noise.size)
+    effect, noise = noise_of("noise_skew")
+    assert abs((noise**2).mean() - 1) < 0.05
+    assert abs((noise**3).mean() - 2 * effect.side * effect.strength**3) < 0.15
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_flicker_keeps_the_power_and_correlates_its_part(seed):
+    (effect,) = hide(("flicker_noise",), 100.0, seed, (64, 64), 400).effects
+    rng = np.random.default_rng(seed)
+    s = effect.sensor.noise
+    noise = np.array([effect.noise(t, s * rng.standard_normal(s.shape), None) / s for t in range(60)])
+    assert abs((noise**2).mean() - 1) < 0.05
+    expected = effect.strength * np.exp(-1 / effect.tau).mean()
+    assert abs((noise[1:] * noise[:-1]).mean() - expected) < 5 / np.sqrt(noise.size) + 0.05 * expected
+    assert expected > 10 / np.sqrt(noise.size)
+
+
+def test_noise_grows_with_the_electrons():
+    effect, noise = noise_of("signal_dependent_noise", k=np.full(SHAPE, 4))
+    expected = 1 + effect.each**2 * 4 ** (2 * effect.power) * (1 / effect.sensor.noise**2).mean()
+    assert abs((noise**2).mean() - expected) < 5 * np.sqrt(2 / noise.size) * expected
+    assert expected - 1 > 5 * np.sqrt(2 / noise.size)
+    empty = noise_of("signal_dependent_noise")[1]
+    assert abs((empty**2).mean() - 1) < 5 * np.sqrt(2 / noise.size)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_codes_have_the_widths_of_their_pattern(seed):
+    (effect,) = hide(("adc_dnl",), 40.0, seed, (8, 8), 400).effects
+    fine = np.arange(80, 240, 1 / 2000)
+    code = effect.convert(0, fine, np.floor(fine + 0.5).astype(int))
+    assert (np.diff(code) >= 0).all()
+    width = np.bincount(code, minlength=300)[90:230] / 2000
+    np.testing.assert_allclose(width, 1 + np.diff(effect.edges)[90:230], atol=2e-3)
+    assert abs(width - 1).max() > 0.1
+    assert abs(width.mean() - 1) < 0.02
+
+
+def test_a_bent_converter_stays_within_its_amplitude():
+    (effect,) = made("adc_inl").effects
+    dn = np.linspace(*effect.sensor.code_range, 1000)
+    bend = effect.voltage(0, dn) - dn
+    assert 0.9 * effect.strength < abs(bend).max() <= effect.strength * (1 + 1e-9)
+
+
+def test_clipping_catches_the_part_that_is_asked():
+    for seed in (1, 2, 3, 4):
+        hiding = hide(("clipping",), 4.0, seed, SHAPE, FRAMES)
+        (effect,) = hiding.effects
+        plain = made(seed=seed).frames
+        limit = effect.parameters["limit_dn"]
+        cut = np.maximum(plain, limit) if effect.side == "low" else np.minimum(plain, limit)
+        np.testing.assert_array_equal(hiding.frames, cut)
+        assert 0.4 < effect.parameters["samples"] / (effect.strength * plain.size) < 2.5
+
+
+def test_repeats_are_exact_and_where_the_key_says():
+    hiding, plain = made("repeated_frames"), made().frames
+    (effect,) = hiding.effects
+    same = (hiding.frames[1:, effect.rows] == hiding.frames[:-1, effect.rows]).all(axis=(1, 2))
+    assert (np.flatnonzero(same) + 1).tolist() == effect.parameters["frames"]
+    assert not (plain[1:] == plain[:-1]).all(axis=(1, 2)).any()
+
+
+def test_particles_leave_what_no_electron_count_does():
+    hot = View(made("cosmic_rays")).d > 40
+    assert 4 <= hot.any(axis=(1, 2)).sum() <= made("cosmic_rays").effects[0].parameters["tracks"]
+    assert not (View(made()).d > 40).any()
+
+
+@pytest.mark.parametrize("tag", UNTESTABLE)
+def test_the_untestable_leave_the_electrons_poisson_and_independent(tag):
+    hiding = made(tag)
+    v = View(hiding)
+    inner = np.s_[:, 1:-1, 1:-1]
+    noise = (v.var - v.h)[inner[1:]]
+    mean, variance = v.e[inner].mean(axis=0), v.e[inner].var(axis=0, ddof=1)
+    error = np.sqrt((2 * variance**2 + 2 * mean).sum() / FRAMES)
+    assert abs((variance - noise - mean).sum()) < 5 * error
+    for value, error in (neighbours(v, 1), lagged(v, v.h.sum())):
+        assert abs(value) < 5 * error
+    assert (hiding.frames != made().frames).mean() > 0.1
+
+
+def test_those_outside_the_library_do_something():
+    trapped = hide(("trap_limited_lag",), 20.0, SEED, SHAPE, FRAMES)
+    v = View(trapped)
+    value, error = lagged(v, v.h.sum())
+    assert value < -5 * error
+    (effect,) = made("self_trigger_cut").effects
+    k = np.random.default_rng(2).poisson(effect.sensor.exposure, (400, *SHAPE))
+    cut = np.array([effect.electrons(0, one) for one in k])
+    expected = ((k == 0).sum(axis=0) * (1 + effect.strength * np.expm1(-effect.sensor.exposure))).sum()
+    assert abs((cut == 0).sum() / expected - 1) < 0.01
+    assert (cut == 0).sum() < 0.995 * (k == 0).sum()
+
+
+def test_every_effect_is_there_and_checked():
+    named = {
+        "rts_noise bias_drift bias_jumps frame_noise row_noise column_noise periodic_pickup",
+        "readout_alternation flicker_noise heavy_tailed_noise noise_skew signal_dependent_noise",
+        "nonlinearity gain_drift adc_dnl adc_inl clipping interpixel_capacitance analog_memory",
+        "exposure_drift persistence dark_current_rts exposure_flicker overdispersed_counts",
+        "branching_counts optical_crosstalk cosmic_rays repeated_frames",
+    }
+    assert set(LIBRARY) == set(" ".join(named).split())
+    assert len(OUTSIDE) >= 3
+    assert set(ALL) == set(LIBRARY) | set(UNTESTABLE) | set(OUTSIDE)
+
+
+def test_the_sensor_does_not_depend_on_what_is_hidden():
+    alone, pair = made("row_noise"), hide(("row_noise", "adc_dnl"), 4.0, SEED, SHAPE, FRAMES)
+    for sensor in (alone.sensor, pair.sensor):
+        np.testing.assert_array_equal(sensor.exposure, made().sensor.exposure)
+    assert alone.effects[0].parameters == pair.effects[0].parameters
+    with pytest.raises(SystemExit, match="nothing known as ghost"):
+        hide(("ghost",), 4.0, 1)
+
+
+def test_a_process_of_its_own_writes_the_stack_and_seals_the_key_elsewhere(tmp_path):
+    out = tmp_path / "stack"
+    small = ["--shape", "6", "5", "--frames", "30", "--seed", "3"]
+    command = [sys.executable, HIDDEN / "make.py", "--effect", "row_noise,clipping", "--out", out, *small]
+    subprocess.run([str(part) for part in command], check=True)
+    frames = np.load(out / "frames.npy")
+    assert frames.dtype == np.uint16
+    assert frames.shape == (30, 6, 5)
+    assert [path.name for path in out.iterdir()] == ["frames.npy"]
+    key = json.loads((tmp_path / "sealed" / "stack.json").read_text())
+    assert [effect["tag"] for effect in key["effects"]] == ["row_noise", "clipping"]
+    maps = np.load(tmp_path / "sealed" / "stack.npz")
+    assert maps["quanta_exposure"].shape == (6, 5)
+    again = hide(("row_noise", "clipping"), 4.0, 3, (6, 5), 30).frames
+    np.testing.assert_array_equal(frames, again)
+
+
+def test_the_chain_shares_no_code_with_the_package():
+    imports = [line for path in HIDDEN.glob("*.py") for line in path.read_text().splitlines()]
+    assert not [line for line in imports if "import" in line and "pchem" in line]

@@ -1,0 +1,170 @@
+"""Frames appended to a finished run: what all frames together give, without reading the old ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import arrays_of
+from helpers.small_stacks import small_stack
+
+from pchem_pipeline.base.errors import InputError, StoreError
+from pchem_pipeline.commands.append import append_frames
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.session import Command, run_stages, run_status
+from pchem_pipeline.run.stage import open_store
+from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.stages.fit.start import kept_fit
+from pchem_pipeline.store.run_store import RunStore
+
+QUIET = Command(quiet=True)
+GROUPS = ("frames", "histogram", "summary")
+
+
+@pytest.fixture(scope="module")
+def frames():
+    stack = small_stack((70, 20), 700, 3)
+    stack[650, 5, 6] = 30_000  # a glitch among the new frames
+    return stack
+
+
+@pytest.fixture(autouse=True)
+def _forget_stores():
+    yield
+    open_store.cache_clear()
+
+
+def write(folder: Path, frames, cuts) -> None:
+    for number, part in enumerate(np.split(frames, cuts)):
+        np.save(folder / f"f{number}.npy", part)
+
+
+def target(folder: Path, store: str, files: tuple[str, ...] = ("f*.npy",), **sections) -> Target:
+    content = {"run": {"store": store, "tile": 16}, "input": {"files": list(files), "mode": "reference"}}
+    content |= {"histogram": {"window_frames": 64, "block_frames": 96}, "compute": {"workers": 2}}
+    for name, values in sections.items():
+        content[name] = {**content.get(name, {}), **values}
+    path = folder / f"{store}.yaml"
+    path.write_text(dump_config(RunConfig.model_validate(content)))
+    return find_run(path)
+
+
+@pytest.mark.parametrize(
+    ("cuts", "mode", "summaries"),
+    [
+        ((301, 650), "reference", True),
+        ((192, 480), "copy", True),
+        ((100,), "copy", True),
+        ((90,), "copy", False),
+    ],
+)
+def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, mode, summaries):
+    monkeypatch.setattr("pchem_pipeline.stages.ingest._CHUNK", (32, 16, 16))
+    sections = {"input": {"mode": mode}, "histogram": {"summaries": summaries}}
+    write(tmp_path, frames[: cuts[0]], [])
+    grown = target(tmp_path, "grown.zarr", **sections)
+    run_stages(grown, ["ingest", "histogram"], QUIET)
+    for number, part in enumerate(np.split(frames, cuts)[1:], 1):
+        np.save(tmp_path / f"f{number}.npy", part)
+        assert [state.state for state in append_frames(grown, QUIET)] == ["complete", "complete"]
+    assert append_frames(grown, QUIET) == []
+    whole = target(tmp_path, "whole.zarr", **sections)
+    run_stages(whole, ["ingest", "histogram"], QUIET)
+    expected, found = (arrays_of(tmp_path / name, GROUPS) for name in ("whole.zarr", "grown.zarr"))
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    one, other = (RunStore.open(tmp_path / name) for name in ("whole.zarr", "grown.zarr"))
+    assert one.attributes("frames") == other.attributes("frames")
+    for stage in ("ingest", "histogram"):
+        assert one.records.read(stage).fingerprint == other.records.read(stage).fingerprint
+
+
+def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
+    from pchem_pipeline.frames import sequence
+
+    write(tmp_path, frames, [600])
+    (tmp_path / "f1.npy").rename(tmp_path / "later")
+    run = target(tmp_path, "run.zarr")
+    run_stages(run, ["ingest", "histogram"], QUIET)
+    (tmp_path / "later").rename(tmp_path / "f1.npy")
+    assert [state.state for state in run_status(run)][:2] == ["stale", "stale"]  # a look changes nothing
+    seen = []
+    real = sequence.FrameSequence.pieces
+    monkeypatch.setattr(
+        sequence.FrameSequence,
+        "pieces",
+        lambda self, t0, t1: [seen.append((t0, t1)), *real(self, t0, t1)][1:].__iter__(),
+    )
+    append_frames(run, QUIET)
+    assert min(t0 for t0, _ in seen) == 600
+    assert max(t1 for _, t1 in seen) == 700
+
+
+def test_the_fit_starts_from_the_old_answer_and_ends_at_the_same_maximum(tmp_path, frames):
+    write(tmp_path, frames, [400])
+    (tmp_path / "f1.npy").rename(tmp_path / "later")
+    run = target(tmp_path, "run.zarr")
+    run_stages(run, ["ingest", "histogram", "fit"], QUIET)
+    old = arrays_of(tmp_path / "run.zarr", ("fit",))
+    (tmp_path / "later").rename(tmp_path / "f1.npy")
+    append_frames(run, QUIET)
+    start = kept_fit(tmp_path / "run.zarr", (slice(None), slice(None)))
+    good = old["fit/fit_status"] == 0
+    np.testing.assert_array_equal(np.isfinite(start).all(axis=2), good)
+    np.testing.assert_array_equal(start[good][:, 2], old["fit/bias"][good])
+    run_stages(run, ["fit"], QUIET)
+    assert kept_fit(tmp_path / "run.zarr", (slice(None), slice(None))) is None
+    whole = target(tmp_path, "whole.zarr")
+    run_stages(whole, ["ingest", "histogram", "fit"], QUIET)
+    warm, cold = (arrays_of(tmp_path / name, ("fit",)) for name in ("run.zarr", "whole.zarr"))
+    both = good & (cold["fit/fit_status"] == 0)
+    assert both.mean() > 0.5
+    for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn"):
+        sigma = cold[f"fit/{name}_stderr"][both]
+        # the stop rule leaves a rise of 1e-8 nats: 1.4e-4 standard errors
+        assert np.nanmax(np.abs(warm[f"fit/{name}"] - cold[f"fit/{name}"])[both] / sigma) < 1e-3
+        # the answer moved by the new frames, so it is no copy of the old one
+        assert np.nanmedian(np.abs(old[f"fit/{name}"] - cold[f"fit/{name}"])[both] / sigma) > 0.05
+    assert warm["fit/n_iterations"][both].sum() < 0.6 * cold["fit/n_iterations"][both].sum()
+
+
+def test_what_cannot_be_appended_is_said(tmp_path, frames):
+    write(tmp_path, frames[:300], [])
+    run = target(tmp_path, "run.zarr")
+    with pytest.raises(StoreError, match="ingest is not complete"):
+        append_frames(run, QUIET)
+    run_stages(run, ["ingest", "histogram"], QUIET)
+    np.save(tmp_path / "f1.npy", frames[300:, :, :10])
+    with pytest.raises(InputError, match=r"f1\.npy"):
+        append_frames(run, QUIET)
+    np.save(tmp_path / "f1.npy", frames[300:])
+    other = target(tmp_path, "run.zarr", histogram={"block_frames": 64})
+    with pytest.raises(StoreError, match="other settings"):
+        append_frames(other, QUIET)
+    short = target(tmp_path, "run.zarr", compute={"max_memory": 64})
+    with pytest.raises(StoreError, match="appending needs"):
+        append_frames(short, QUIET)
+    np.save(tmp_path / "a.npy", frames[:10])
+    earlier = target(tmp_path, "run.zarr", files=("a.npy", "f*.npy"))
+    with pytest.raises(InputError, match="come behind them"):
+        append_frames(earlier, QUIET)
+    # nothing of that harmed the run; files that were only touched are the same
+    (tmp_path / "f0.npy").touch()
+    assert [state.state for state in append_frames(target(tmp_path, "run.zarr"), QUIET)] == ["complete"] * 2
+
+
+def test_more_frames_than_sixteen_bits_can_count(tmp_path):
+    frames = np.random.default_rng(1).integers(100, 110, (70_000, 2, 3)).astype(np.uint16)
+    write(tmp_path, frames, [60_000])
+    (tmp_path / "f1.npy").rename(tmp_path / "later")
+    run = target(tmp_path, "run.zarr", histogram={"window_frames": 4096, "block_frames": 8192})
+    run_stages(run, ["ingest", "histogram"], QUIET)
+    assert RunStore.open(tmp_path / "run.zarr").array("histogram/counts").dtype == np.uint16
+    (tmp_path / "later").rename(tmp_path / "f1.npy")
+    append_frames(run, QUIET)
+    counts = RunStore.open(tmp_path / "run.zarr").read("histogram/counts")
+    assert counts.dtype == np.uint32
+    np.testing.assert_array_equal(counts.sum(axis=2), np.full((2, 3), 70_000))

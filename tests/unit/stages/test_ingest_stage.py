@@ -1,0 +1,330 @@
+"""The ingest stage: copy and reference, resume, identity, histograms, bad input."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from helpers.places import SIPM
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run import input_identity
+from pchem_pipeline.run.fingerprint import StageState, status
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
+from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.stages import ingest
+from pchem_pipeline.store.run_store import RunStore
+
+STACK = np.random.default_rng(16).integers(0, 4096, (40, 30, 26)).astype(np.uint16)
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make many units of a small stack."""
+    monkeypatch.setattr(ingest, "_CHUNK", (16, 8, 8))
+    monkeypatch.setattr(ingest, "_UNIT_BYTES", 16 * 8 * 26 * 2)
+
+
+def write_stack(folder: Path, parts: int = 4) -> None:
+    folder.mkdir(exist_ok=True)
+    for i, part in enumerate(np.array_split(STACK, parts)):
+        tifffile.imwrite(folder / f"f{i + 8}.tif", part, photometric="minisblack")
+
+
+def make_context(
+    folder: Path,
+    *,
+    executor: Executor | None = None,
+    options: Options | None = None,
+    stop: StopRequest | None = None,
+    **settings: Any,
+) -> StageContext:
+    given = {"files": ["cam"], **settings}
+    return StageContext(
+        RunConfig.model_validate({"input": given}),
+        folder,
+        RunStore.create(folder / "run.zarr"),
+        executor or SerialExecutor(),
+        Reporter("off", quiet=True),
+        stop or StopRequest(),
+        options=options or Options(),
+    )
+
+
+def run(context: StageContext) -> StageState:
+    return execute("ingest", context)
+
+
+@pytest.mark.parametrize("backend", ["serial", "threads"])
+def test_copy(tmp_path: Path, small_chunks: None, backend: str) -> None:
+    write_stack(tmp_path / "cam")
+    executor = make_executor(ComputeSettings(backend=backend, workers=2))
+    context = make_context(tmp_path, executor=executor, integration_time=4.87, bit_depth=12)
+    assert run(context).state == "complete"
+    array = context.store.array("frames/dn")
+    assert array.chunks == (16, 8, 8)
+    assert array.metadata.dimension_names == ("frame", "y", "x")
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    sensor = context.sensor
+    assert (sensor.kind, sensor.n_frames, sensor.shape, sensor.dtype) == ("frames", 40, (30, 26), "uint16")
+    assert (sensor.bit_depth, sensor.integration_time, sensor.mode) == (12, None, "copy")
+    assert sensor.identity["n_files"] == 4
+    assert [file["name"] for file in sensor.identity["files"]] == ["f8.tif", "f9.tif", "f10.tif", "f11.tif"]
+    assert status(ingest, context).done == 3 * 4
+    assert run(context).state == "complete"
+
+
+def test_copy_by_processes(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    context = make_context(tmp_path, executor=make_executor(ComputeSettings(backend="processes", workers=1)))
+    assert run(context).state == "complete"
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+
+
+def test_copy_applies_region_range_and_shift(tmp_path: Path) -> None:
+    (tmp_path / "cam").mkdir()
+    np.save(tmp_path / "cam" / "a.npy", STACK << 4)
+    context = make_context(tmp_path, roi=(3, 20, 5, 25), frame_range=(2, 39), bit_shift=4)
+    run(context)
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK[2:39, 3:20, 5:25])
+    assert context.sensor.bit_depth == 12
+
+
+def test_reference_copies_nothing(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    context = make_context(tmp_path, mode="reference")
+    assert run(context).state == "complete"
+    assert not context.store.has("frames/dn")
+    assert context.sensor.mode == "reference"
+    assert (context.sensor.n_frames, context.sensor.shape) == (40, (30, 26))
+
+
+def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    context = make_context(tmp_path, options=Options(tiles="0.0"))
+    assert run(context).state == "complete"
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+
+
+def test_stop_and_resume(tmp_path: Path, small_chunks: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_stack(tmp_path / "cam")
+    stop, done = StopRequest(), []
+    real = ingest._copy
+
+    def copy(unit: ingest.CopyUnit, **rest: Any) -> dict[str, Any]:
+        done.append(unit.key)
+        if len(done) == 5:
+            stop.signal = 2
+        return real(unit, **rest)
+
+    monkeypatch.setattr(ingest, "_copy", copy)
+    with pytest.raises(InterruptedRunError):
+        run(make_context(tmp_path, stop=stop))
+    open_store.cache_clear()
+    context = make_context(tmp_path)
+    assert status(ingest, context).words().startswith("partial 5 of 12")
+    assert run(context).state == "complete"
+    assert len(done) == len(set(done)) == 12
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+
+
+def test_identity_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_stack(tmp_path / "cam")
+    hashed: list[list[str]] = []
+    real = input_identity.content_identity
+
+    def content(paths: list[Path], advance: Any) -> dict[str, Any]:
+        hashed.append([path.name for path in paths])
+        return real(paths, advance)
+
+    monkeypatch.setattr(input_identity, "content_identity", content)
+    run(make_context(tmp_path))
+    assert len(hashed) == 1
+    again = make_context(tmp_path)
+    assert status(ingest, again).state == "complete"
+    assert len(hashed) == 1
+    # another time of change, the same content: hashed again, still complete
+    os.utime(tmp_path / "cam" / "f9.tif", ns=(5, 5))
+    assert status(ingest, make_context(tmp_path)).state == "complete"
+    assert len(hashed) == 2
+    # other content: stale, and why
+    changed = STACK[:10].copy()
+    changed[0, 0, 0] ^= 1
+    tifffile.imwrite(tmp_path / "cam" / "f8.tif", changed, photometric="minisblack")
+    state = status(ingest, make_context(tmp_path))
+    assert (state.state, state.why) == ("stale", "the content of the input changed")
+    context = make_context(tmp_path)
+    assert run(context).state == "complete"
+    assert context.store.read("frames/dn", (slice(0, 1), slice(0, 1), slice(0, 1))).item() == changed[0, 0, 0]
+
+
+def test_moved_and_renamed_input_is_the_same(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    run(make_context(tmp_path))
+    shutil.move(tmp_path / "cam", tmp_path / "elsewhere")
+    for i in range(8, 12):
+        (tmp_path / "elsewhere" / f"f{i}.tif").rename(tmp_path / "elsewhere" / f"dark{i}.tif")
+    assert status(ingest, make_context(tmp_path, files=["elsewhere/*.tif"])).state == "complete"
+
+
+def test_input_that_is_gone_leaves_the_copy_valid(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    run(make_context(tmp_path))
+    shutil.rmtree(tmp_path / "cam")
+    context = make_context(tmp_path)
+    assert run(context).state == "complete"
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    # but another, mistyped name is a mistake
+    with pytest.raises(InputError, match="no such file or folder"):
+        run(make_context(tmp_path, files=["camm"]))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "stale"),
+    [
+        ("roi", (0, 10, 0, 10), True),
+        ("mode", "reference", True),
+        ("bit_depth", 12, True),
+        ("frame_range", (0, 20), True),
+        ("integration_time", 3.0, False),
+        ("files", ["cam/*.tif"], False),
+    ],
+)
+def test_which_settings_make_it_stale(tmp_path: Path, key: str, value: Any, stale: bool) -> None:
+    write_stack(tmp_path / "cam")
+    run(make_context(tmp_path))
+    state = status(ingest, make_context(tmp_path, **{key: value}))
+    assert state.state == ("stale" if stale else "complete")
+    assert (f"input.{key}" in state.why) == stale
+
+
+def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path: Path) -> None:
+    (tmp_path / "cam").mkdir()
+    tifffile.imwrite(
+        tmp_path / "cam" / "a.tif", STACK, photometric="minisblack", metadata={"integration_time": 4.87}
+    )
+    context = make_context(tmp_path)
+    run(context)
+    assert context.sensor.integration_time == context.integration_time == 4.87
+    configured = make_context(tmp_path, integration_time=2.0)
+    run(configured)
+    assert configured.sensor.integration_time == 4.87
+    assert configured.integration_time == 2.0
+
+
+def test_bad_files_stop_or_are_left_out(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    broken = tmp_path / "cam" / "f10.tif"
+    broken.write_bytes(broken.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"1 of 4 input files cannot be used: .*f10\.tif: .*truncated"):
+        run(make_context(tmp_path))
+    context = make_context(tmp_path, on_bad_file="skip")
+    assert run(context).state == "complete"
+    np.testing.assert_array_equal(context.store.read("frames/dn"), np.concatenate([STACK[:20], STACK[30:]]))
+    record = context.store.records.read("ingest")
+    assert record is not None
+    assert "truncated" in record.notes[0]
+    assert "left out (input.on_bad_file: skip)" in record.notes[0]
+
+
+def test_file_that_vanishes_while_copying(
+    tmp_path: Path, small_chunks: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_stack(tmp_path / "cam")
+    real = ingest._copy
+
+    def copy(unit: ingest.CopyUnit, **rest: Any) -> dict[str, Any]:
+        if unit.t0 == 16:
+            (tmp_path / "cam" / "f11.tif").unlink(missing_ok=True)
+        return real(unit, **rest)
+
+    monkeypatch.setattr(ingest, "_copy", copy)
+    with pytest.raises(
+        InputError, match=r"f11\.tif: the file vanished while it was being read; restore"
+    ) as caught:
+        run(make_context(tmp_path))
+    assert caught.value.exit_code == 4
+    monkeypatch.setattr(ingest, "_copy", real)
+    write_stack(tmp_path / "cam")
+    context = make_context(tmp_path)
+    assert status(ingest, context).words().startswith("partial 4 of 12")
+    assert run(context).state == "complete"
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+
+
+def test_small_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_stack(tmp_path / "cam")
+    monkeypatch.setattr(RunStore, "free_bytes", lambda self: 1000)
+    context = make_context(tmp_path)
+    run(context)
+    assert any("set input.mode: reference" in note for note in context.notes)
+
+
+def test_ready_made_histograms(tmp_path: Path) -> None:
+    context = make_context(tmp_path, files=[str(SIPM / "*.csv")])
+    assert run(context).state == "complete"
+    sensor = SensorInfo.read(context.store)
+    assert sensor.kind == "histograms"
+    assert sensor.shape == (1, 6)
+    assert sensor.names[-1] == "M11_LED_dark"
+    assert sensor.n_frames == 19107824
+    assert sensor.dtype == "uint16"
+    assert sensor.integration_time is None
+    assert not context.store.has("frames/dn")
+    assert len(sensor.identity["files"]) == 6
+    assert run(make_context(tmp_path, files=[str(SIPM / "*.csv")])).state == "complete"
+
+
+def test_bad_histograms(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,-2\n")
+    with pytest.raises(InputError, match="negative counts"):
+        run(make_context(tmp_path, files=["a.csv"]))
+
+
+def test_sidecar_belongs_to_the_content(tmp_path: Path) -> None:
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / "a.raw").write_bytes(STACK.tobytes())
+    side = tmp_path / "cam" / "a.raw.json"
+    side.write_text('{"shape": [30, 26], "dtype": "uint16"}')
+    run(make_context(tmp_path))
+    side.write_text('{"shape": [26, 30], "dtype": "uint16"}')
+    context = make_context(tmp_path)
+    assert status(ingest, context).state == "stale"
+    run(context)
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK.reshape(40, 26, 30))
+
+
+@given(
+    n=st.integers(2, 40_000),
+    ny=st.integers(1, 9000),
+    nx=st.integers(1, 9000),
+    itemsize=st.sampled_from([1, 2, 4]),
+)
+def test_units_are_whole_chunks_within_memory(n: int, ny: int, nx: int, itemsize: int) -> None:
+    shape = (n, ny, nx)
+    chunk = ingest.chunk_shape(shape, itemsize)
+    units = ingest.copy_units(shape, itemsize, chunk)
+    t = y = 0
+    for number, unit in enumerate(units):
+        assert (unit.t0, unit.y0) == (t, y)
+        assert unit.t0 % chunk[0] == unit.y0 % chunk[1] == 0
+        assert unit.t1 == n or unit.t1 % chunk[0] == 0
+        assert unit.y1 == ny or unit.y1 % chunk[1] == 0
+        assert (unit.t1 - unit.t0) * (unit.y1 - unit.y0) * nx * itemsize <= 128 << 20
+        t, y = (unit.t0, unit.y1) if unit.y1 < ny else (unit.t1, 0)
+        if number > 200:
+            return
+    assert (t, y) == (n, 0)

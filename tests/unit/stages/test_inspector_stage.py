@@ -1,0 +1,221 @@
+"""What the inspector is given: which maps, which pixels, and how much of a large sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.inspector_material import page_without_pictures, write_run
+from helpers.report_material import report_data
+
+from pchem_pipeline.base import variables
+from pchem_pipeline.base.variables import Variable
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.inspector.inspector import embedded
+from pchem_pipeline.report.pages import sections
+from pchem_pipeline.report.pages.answers import answers
+from pchem_pipeline.report.pages.sections import Section
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.report import inspector
+from pchem_pipeline.stages.report.inspected_pixels import choose_inspected
+from pchem_pipeline.stages.report.inspector import gather_inspector, listed_maps, map_entry
+from pchem_pipeline.store.run_store import RunStore
+
+SHAPE = (12, 16)
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return report_data(SHAPE, failed=0.1)
+
+
+@pytest.fixture
+def store(tmp_path: Path, data: ReportData) -> RunStore:
+    return write_run(tmp_path, data, n_frames=30)
+
+
+def test_the_list_is_that_of_the_store(store: RunStore) -> None:
+    store.write_array("summary/lag1_covariance", np.zeros(SHAPE))
+    store.write_array("discrepancy/goodness", np.zeros((4, 4), np.float32))
+    store.write_array("fit/bias", np.zeros(SHAPE))
+    paths = [each.variable.path for each in listed_maps(store, SHAPE)]
+    assert paths[0] == "maps/quanta_exposure"
+    assert "maps/bias" in paths
+    assert "fit/bias" not in paths, "a repetition of maps/bias"
+    assert "discrepancy/goodness" not in paths, "of a window, not of the sensor"
+    assert "summary/lag1_covariance" in paths
+    assert len(paths) == len(set(paths)) >= 14
+
+
+@pytest.mark.parametrize("group", ["fit", "joint"])
+def test_a_new_array_appears_by_itself(
+    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch, group: str
+) -> None:
+    new = Variable(f"{group}/far_share", ("y", "x"), "float64", "DN", "share of samples far away")
+    monkeypatch.setitem(variables.VARIABLES, new.path, new)
+    store.write_array(new.path, np.full(SHAPE, 0.25))
+    shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
+    entry = next(each for each in shown.maps if each.path == new.path)
+    assert (entry.label, entry.unit, entry.sentence) == ("far share", "DN", "share of samples far away")
+    assert entry.packed is not None
+    assert (shown.sample.exact[new.path] == 0.25).all()
+
+
+def test_words_and_kinds(store: RunStore) -> None:
+    store.write_array("maps/quality", np.zeros(SHAPE, np.uint8))
+    store.write_array("truth/defect", np.zeros(SHAPE, np.uint8))
+    entries = {each.variable.path: map_entry(each) for each in listed_maps(store, SHAPE)}
+    assert entries["maps/bias"].label == "bias"
+    assert entries["maps/bias_stderr"].kind == "stderr"
+    assert entries["maps/bias_stderr"].label == "standard error of the bias"
+    assert entries["fit/fit_status"].words == {int(bit): text for bit, text in MEANINGS.items()}
+    assert entries["maps/quality"].words == {0: "good", 1: "use with caution", 2: "no value"}
+    assert entries["truth/defect"].words == {0: "nothing", 1: "hot", 2: "dead", 3: "stuck"}
+    assert entries["fit/goodness_p"].label == "goodness of fit p"
+
+
+def test_what_does_not_fit_is_left_to_the_server(
+    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspector, "_MAPS_BUDGET", 1500.0)
+    shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
+    here = [each.path for each in shown.maps if each.packed is not None]
+    assert 4 * sum(len(each.packed.data) for each in shown.maps if each.packed) / 3 <= 1500
+    assert here[-1] == "fit/fit_status"
+    assert set(here) <= {"fit/fit_status", *inspector._FIRST[1:]}
+    assert len(here) < len(shown.maps)
+    alike = [each.path for each in shown.maps if each.same_as]
+    assert {each.same_as[0] for each in shown.maps if each.same_as} <= set(here)
+    assert set(shown.sample.exact) == {*here, *alike}
+
+
+def test_the_dark_current_costs_nothing(store: RunStore, data: ReportData) -> None:
+    shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
+    entry = next(each for each in shown.maps if each.path == "maps/dark_current")
+    assert entry.packed is None
+    assert entry.same_as == ("maps/quanta_exposure", pytest.approx(1 / 4.87))
+
+
+def test_a_sensor_of_the_papers_size_takes_three_to_four_megabytes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    base = report_data((8, 8))
+    store = write_run(tmp_path, base, n_frames=20)
+    shape, maps = (512, 512), {}
+    for name in base.maps:
+        middle = float(np.nanmedian(base.maps[name]))
+        spread = 0.15 if name.endswith("_stderr") else 0.1
+        maps[name] = middle * (1.0 + spread * rng.standard_normal(shape))
+        store.write_array(f"maps/{name}", maps[name])
+    fit = {"fit_status": np.zeros(shape, np.uint16), "goodness_p": rng.random(shape)}
+    for name, values in fit.items():
+        store.write_array(f"fit/{name}", values)
+    store.write_array("histogram/origin", np.full(shape, 90, np.int32))
+    counts = np.tile(rng.poisson(120, 128).astype(np.uint16), (8, 8, 1))
+    store.create_array("histogram/counts", (*shape, 128), chunks=(64, 64, 128), dtype=np.uint16)
+    for y, x in ((0, 0), (256, 320)):
+        store.write("histogram/counts", (slice(y, y + 64), slice(x, x + 64)), np.tile(counts, (8, 8, 1)))
+    sensor = replace(SensorInfo.read(store), ny=512, nx=512)
+    shown = gather_inspector(store, sensor, maps, fit, [(1, 1)])
+    size = sum(len(text) for _, text in embedded(replace(base, shape=shape, inspector=shown)).blobs)  # type: ignore[union-attr]
+    assert 2.5e6 < size < 4.2e6
+    assert shown.sample.index.size == 2400
+    at = (1, 1)
+    assert shown.sample.counts[0].tolist() == counts[at].tolist()
+
+
+# -- which pixels ----------------------------------------------------------------------------
+
+
+def test_a_small_sensor_is_there_whole(data: ReportData) -> None:
+    chosen = choose_inspected(data.maps, data.fit, [(3, 4)], everything=4096, most=100)
+    assert chosen.index[0] == 3 * 16 + 4
+    assert sorted(chosen.index.tolist()) == list(range(12 * 16))
+
+
+def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
+    data = report_data((100, 120), failed=0.01)
+    p = np.array(data.fit["goodness_p"])
+    p[40, 50] = 1e-12
+    chosen = choose_inspected(
+        data.maps, {**data.fit, "goodness_p": p}, [(1, 2)], [(5, 6)], everything=4096, most=1500
+    )
+    reasons = dict(chosen.reasons)
+    assert chosen.index.size == np.unique(chosen.index).size == 1500
+    assert reasons["shown in the report"] == (1 * 120 + 2,)
+    assert reasons["named by the discrepancy verdict"] == (5 * 120 + 6,)
+    assert reasons["poorest goodness of fit"][0] == 40 * 120 + 50
+    known = np.where(np.isfinite(data.maps["bias"]), data.maps["bias"], -np.inf)
+    assert reasons["largest bias"][0] == known.argmax()
+    status = data.fit["fit_status"].ravel()
+    for bit, words in MEANINGS.items():
+        where = set(np.flatnonzero(status & int(bit)).tolist())
+        found = reasons.get(words, ())
+        assert set(found) <= where
+        assert len(found) == min(len(where), 40)
+    assert {i for _, where in chosen.reasons for i in where} <= set(chosen.index.tolist())
+    # every tenth of the rows and columns has its share of the sample
+    for line, n in ((chosen.index // 120, 100), (chosen.index % 120, 120)):
+        parts = np.histogram(line, bins=10, range=(0, n))[0]
+        assert parts.min() > 100
+
+
+def test_the_choice_repeats() -> None:
+    data = report_data((100, 120))
+    choices = [choose_inspected(data.maps, data.fit, [], everything=10, most=300).index for _ in range(2)]
+    np.testing.assert_array_equal(*choices)
+
+
+# -- the first screen and the sections -------------------------------------------------------
+
+
+def test_all_right_and_to_be_believed(data: ReportData) -> None:
+    clean = replace(report_data((40, 40), failed=0.0), fit={"fit_status": np.zeros((40, 40), np.uint16)})
+    sensor, belief = answers(clean)
+    assert (sensor.level, sensor.question) == ("good", "Is this sensor all right?")
+    assert sensor.text.startswith("All 1,600 pixels have a value; median read noise 0.299 e⁻")
+    assert (belief.level, belief.word) == ("good", "Yes")
+    assert belief.text == (
+        "2 checks of the model against the data passed. What the model may be missing was not looked for."
+    )
+
+
+def test_a_third_failed_is_not_all_right() -> None:
+    sensor, belief = answers(report_data((40, 40), failed=0.34))
+    assert (sensor.level, sensor.word) == ("serious", "No")
+    assert (belief.level, belief.word) == ("caution", "For the pixels with a value")
+
+
+def test_a_noisy_sensor_counts_no_electrons() -> None:
+    data = report_data((40, 40), failed=0.0)
+    noisy = {**data.maps, "read_noise_e": data.maps["read_noise_e"] + 0.4}
+    assert answers(replace(data, maps=noisy))[0].word == "Too noisy to count electrons"
+
+
+def test_a_wrong_model_is_not_to_be_believed() -> None:
+    data = report_data((40, 40), failed=0.0)
+    rmse = {"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}
+    belief = answers(replace(data, ensemble_facts=rmse))[1]
+    assert (belief.level, belief.word) == ("serious", "Not as they are")
+    assert "does not explain the data" in belief.text
+
+
+def test_no_fit_at_all() -> None:
+    data = report_data((8, 8))
+    status = np.full((8, 8), int(FitStatus.TOO_FEW_BINS), np.uint16)
+    assert int(FitStatus.TOO_FEW_BINS) & int(FAILED)
+    lost = replace(data, fit={"fit_status": status}, maps=dict.fromkeys(data.maps, np.full((8, 8), np.nan)))
+    assert [answer.level for answer in answers(lost)] == ["serious", "serious"]
+
+
+def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
+    def mine(material: sections.Material) -> Section:
+        return Section("mine", "My <section>", "text", {"text": f"{material.data.title} & more"})
+
+    monkeypatch.setattr(sections, "PAGE", (*sections.PAGE, mine, lambda _: None))
+    page = page_without_pictures(data)
+    assert '<li><a href="#mine">My &lt;section&gt;</a></li>' in page
+    assert '<h2 id="mine-heading">My &lt;section&gt;</h2>' in page
+    assert "demo sensor &amp; more" in page
