@@ -1,4 +1,9 @@
-"""The one way in which loops are compiled: without the interpreter's lock, cached on disk, IEEE division."""
+"""Compiled loops: one decorator, one error model, one cache on disk.
+
+A kernel that other kernels call is translated, but neither optimised nor turned into machine code by itself:
+the kernel that Python calls is optimised once, with all that it calls. numba's own way is to optimise and to
+emit every kernel at every level of calls and to wrap each for Python twice: twice the time for the same code.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba import _dynfunc
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, DefaultPassBuilder, _LowerResult
+from numba.core.compiler_machinery import register_pass
+from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import NativeLowering
+
+from pchem_pipeline.base.kernel_cache import KernelCache, values_of_closure
 
 __all__ = ["kernel"]
 
@@ -14,11 +27,88 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False) 
     """Compile a loop when it is first called.
 
     Division by zero gives infinity or NaN as in numpy, never an exception, so that loops vectorise; no kernel
-    reorders sums (``fastmath``), so that its bits do not depend on who compiled it.
+    reorders sums (``fastmath``), so that its bits do not depend on who compiled it. The interpreter's lock is
+    released while it runs.
 
     Args:
         function: of scalars and arrays.
         inline: put the code of the function into its callers, where they could not be optimised otherwise.
     """
-    compiled = numba.njit(nogil=True, cache=True, error_model="numpy", inline="always" if inline else "never")
-    return compiled if function is None else compiled(function)
+    if function is None:
+        return lambda function: kernel(function, inline=inline)
+    if numba.config.DISABLE_JIT:
+        return function
+    values = values_of_closure(function)
+    if values:
+        # of two machine codes with one name only the first that is loaded is run, and numba's names tell the
+        # functions of one maker apart within a process only
+        function.__qualname__ += "_".join(("", *values))
+    options = {
+        "nopython": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "inline": "always" if inline else "never",
+        "no_cfunc_wrapper": True,
+    }
+    return _Kernel(function, options)
+
+
+class _Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A kernel as Python sees it; kernels that call it see ``callee``."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options)
+        self._cache = KernelCache(function)
+        self.callee = CPUDispatcher(
+            function, targetoptions={**options, "no_cpython_wrapper": True}, pipeline_class=_CalleeCompiler
+        )
+
+    @property
+    def _numba_type_(self) -> Any:
+        return self.callee._numba_type_
+
+
+class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """The code of a kernel for the kernels that call it: linked into theirs, never run by itself."""
+
+    def _optimize_final_module(self) -> None:
+        """Leave it to the caller."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _CalleeLowering(NativeLowering):  # type: ignore[misc]
+    """Translate to LLVM's language, and no further."""
+
+    _name = "callee_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """See :class:`NativeLowering`."""
+        name = state.func_id.func_qualname
+        state.library = _CalleeLibrary(state.targetctx.codegen(), name)
+        state.library.enable_object_caching()
+        state.flags.no_compile = True
+        super().run_pass(state)
+        done = state["cr"]
+        # numba knows what can be called by a function of Python; this one would not work, and nobody has it
+        entry = _dynfunc.make_function(
+            done.fndesc.lookup_module(), name.split(".")[-1], "", 0, done.env, (state.library,)
+        )
+        state.targetctx.insert_user_function(entry, done.fndesc, [state.library])
+        state["cr"] = _LowerResult(done.fndesc, done.call_helper, cfunc=entry, env=done.env)
+        return True
+
+
+class _CalleeCompiler(Compiler):  # type: ignore[misc]
+    """numba's compiler with the last step left out."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Return the passes."""
+        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        manager.add_pass_after(_CalleeLowering, NativeLowering)
+        manager.passes = [each for each in manager.passes if each[0] is not NativeLowering]
+        manager.finalize()
+        return [manager]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import resource
 import sys
-import tempfile
-import zlib
 from pathlib import Path
+
+from pchem_pipeline.base.kernel_cache import cache_folder
 
 __all__ = ["available_memory", "available_workers", "cpu_seconds", "peak_rss_bytes", "prepare_environment"]
 
@@ -19,43 +19,12 @@ def prepare_environment() -> None:
 
     Inner thread pools are set to one thread, since the tiles are the parallelism. Compiled kernels are
     cached in ``NUMBA_CACHE_DIR``, by default in the user's cache folder, or in a temporary one where the home
-    is read-only; always in a folder of its own for each state of the kernels' source.
+    is read-only.
     """
     for name in _POOLS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("MPLBACKEND", "Agg")
-    tag = _kernel_tag()
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    if given is None:
-        os.environ["NUMBA_CACHE_DIR"] = str(_cache_folder(tag))
-    elif Path(given).name != tag:
-        os.environ["NUMBA_CACHE_DIR"] = str(Path(given) / tag)
-
-
-def _kernel_tag() -> str:
-    """Return a name for this state of all kernels.
-
-    numba looks only at the file of a function itself: without this, a kernel would go on calling the old
-    version of one that it imports, after an upgrade or beside another copy of the package.
-    """
-    state = 0
-    for path in sorted(Path(__file__).parents[1].rglob("*_numba.py")):
-        state = zlib.crc32(path.read_bytes(), zlib.crc32(str(path).encode(), state))
-    return f"py{sys.version_info[0]}{sys.version_info[1]}-{state:08x}"
-
-
-def _cache_folder(tag: str) -> Path:
-    from platformdirs import user_cache_path
-
-    folder = user_cache_path("pchem_pipeline") / "kernels" / tag
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        folder = Path(tempfile.gettempdir()) / f"pchem_pipeline-{os.getuid()}" / tag
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        return folder
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder()))
 
 
 def available_workers() -> int:

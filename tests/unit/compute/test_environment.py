@@ -1,4 +1,3 @@
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,19 +18,6 @@ def cache_folder(place, **environment):
     command = [sys.executable, "-c", CODE]
     result = subprocess.run(command, cwd="/", env=environment, capture_output=True, text=True, check=True)
     return Path(result.stdout.strip())
-
-
-def test_each_state_of_the_kernels_has_a_cache_of_its_own(tmp_path):
-    copy = tmp_path / "pchem_pipeline"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    given = {"NUMBA_CACHE_DIR": str(tmp_path / "mine")}
-    before = cache_folder(tmp_path, **given)
-    assert before.parent == tmp_path / "mine"
-    assert cache_folder(tmp_path, **given) == before
-    assert cache_folder(PACKAGE.parent, **given) != before
-    with (copy / "model" / "polish_numba.py").open("a") as file:
-        file.write("\n# another version\n")
-    assert cache_folder(tmp_path, **given) != before
 
 
 def test_the_cache_lies_in_the_users_cache_folder_or_where_one_can_write(tmp_path):

@@ -1,0 +1,141 @@
+"""Compiled kernels on disk: when they are compiled again, by whom, and that nobody gets another's."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pchem_pipeline
+from pchem_pipeline.base import kernel_cache
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.electrons import electrons_numba
+
+INNER = """
+from pchem_pipeline.base.kernel import kernel
+@kernel
+def shifted(x):
+    if x < 0:
+        raise ValueError("negative")
+    return x + {shift}
+"""
+OUTER = """
+from pchem_pipeline.base.kernel import kernel
+from sample.inner_numba import shifted
+@kernel
+def doubled(x):
+    return 2 * shifted(x)
+"""
+APART = """
+from pchem_pipeline.base.kernel import kernel
+def powered(power):
+    @kernel
+    def raised(x):
+        total = 1
+        for _ in range(power):
+            total *= x
+        return total
+    return raised
+squared, cubed = powered(2), powered(3)
+"""
+CALLS = (
+    "from sample.outer_numba import doubled; from sample.apart_numba import {names}\n"
+    "kernels = doubled, {names}\n"
+    "print([each(3) for each in kernels], sum(sum(each.stats.cache_misses.values()) for each in kernels))"
+)
+
+
+@pytest.fixture
+def sample(tmp_path):
+    """A package of three modules with kernels, one of which calls another's."""
+    folder = tmp_path / "here" / "sample"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "inner_numba.py").write_text(INNER.format(shift=1))
+    (folder / "outer_numba.py").write_text(OUTER)
+    (folder / "apart_numba.py").write_text(APART)
+    return folder
+
+
+def start(sample, names="squared, cubed", cache=None):
+    """Call kernels in a process of its own, which prints their values and how many it compiled."""
+    path = [sample.parent, Path(pchem_pipeline.__file__).parents[1]]
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(cache or sample.parents[1] / "cache"),
+        "PYTHONPATH": os.pathsep.join(map(str, path)),
+    }
+    command = [sys.executable, "-c", CALLS.format(names=names)]
+    return subprocess.Popen(
+        command, cwd="/", env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def end(process):
+    stdout, stderr = process.communicate(timeout=200)
+    assert process.returncode == 0, stderr
+    return stdout.strip()
+
+
+def test_only_what_uses_a_changed_file_is_compiled_again(sample):
+    # the functions of one maker are compiled by different processes: nobody may run another's
+    assert end(start(sample, "squared")) == "[8, 9] 2"
+    assert end(start(sample, "cubed")) == "[8, 27] 1"
+    assert end(start(sample)) == "[8, 9, 27] 0"
+    (sample / "inner_numba.py").write_text(INNER.format(shift=5))
+    assert end(start(sample)) == "[16, 9, 27] 1"
+    (sample / "inner_numba.py").write_text(INNER.format(shift=1))
+    elsewhere = (
+        sample.parents[1] / "there" / "sample"
+    )  # what was compiled before, and for another copy, serves
+    elsewhere.parent.mkdir()
+    sample.rename(elsewhere)
+    assert end(start(elsewhere)) == "[8, 9, 27] 0"
+    for file in (sample.parents[1] / "cache").glob("*doubled*.nbc"):
+        file.write_bytes(file.read_bytes()[:1000])
+    assert end(start(elsewhere)) == "[8, 9, 27] 1"
+    assert end(start(elsewhere)) == "[8, 9, 27] 0"
+
+
+def test_a_kernel_is_compiled_by_one_of_two_processes(sample):
+    both = [start(sample), start(sample)]
+    answers = sorted(end(process) for process in both)
+    assert [answer.split("] ")[0] for answer in answers] == ["[8, 9, 27", "[8, 9, 27"]
+    assert sum(int(answer.split("] ")[1]) for answer in answers) == 3
+    assert len(list((sample.parents[1] / "cache").iterdir())) == 3  # no locks are left
+
+
+def test_where_nothing_can_be_written_kernels_are_compiled_each_time(sample):
+    assert end(start(sample, cache="/proc/nowhere")) == "[8, 9, 27] 3"
+
+
+def test_the_state_of_a_source_is_that_of_all_that_it_imports():
+    found = {}
+    kernel_cache._collect(electrons_numba.__name__, {"pchem_pipeline"}, found)
+    assert {"pchem_pipeline.model.ensemble.ensemble_numba", "pchem_pipeline.base.kernel"} <= found.keys()
+    assert not any(name.startswith(("pchem_pipeline.store", "pchem_pipeline.stages")) for name in found)
+
+
+@kernel
+def _checked(x):
+    if x < 0:
+        raise ValueError("negative")
+    return np.sqrt(x)
+
+
+@kernel
+def _sum_of_roots(values):
+    total = 0.0
+    for x in values:
+        total += _checked(x)
+    return total
+
+
+def test_kernels_call_kernels_and_hand_on_their_errors():
+    assert _sum_of_roots(np.array([4.0, 9.0])) == 5
+    assert _sum_of_roots.py_func(np.array([4.0, 9.0])) == 5
+    with pytest.raises(ValueError, match="negative"):
+        _sum_of_roots(np.array([4.0, -9.0]))
+    assert _checked(np.float64(9)) == 3  # and Python calls what other kernels call
