@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from pchem_pipeline.planning.frames import contour_data
 from pchem_pipeline.planning.plan import LEAST_SHARE, Plan, SamplesPlan, plan_one_sample, plan_samples
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
-from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.files import write_atomic, write_json
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -104,7 +103,7 @@ def make_plan(request: PlanRequest) -> str:
         _draw(request.figure, targets or [Target("conversion_gain", 1.0, "%")], content, gain)
         lines += ["", str(request.figure)]
     if request.json is not None:
-        write_atomic(request.json, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+        write_json(request.json, content)
         lines += [str(request.json)]
     return "\n".join(lines)
 

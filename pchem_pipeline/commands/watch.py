@@ -11,7 +11,7 @@ from typing import Any
 from pchem_pipeline.run.fingerprint import StageState
 from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.store.progress_file import read_beacon
+from pchem_pipeline.store.progress_file import read_progress
 
 __all__ = ["json_line", "pace_words", "rows", "watch"]
 
@@ -115,7 +115,7 @@ def _snapshots(target: Target, follow: bool, sleep: Callable[[float], None]) -> 
     """Look at the run; where asked again and again, the last time after the command's end."""
     while True:
         # before the states: what is done when nobody works is done for good
-        progress = read_beacon(target.store)
+        progress = read_progress(target.store)
         yield run_status(target), progress
         if not follow or progress is None:
             return

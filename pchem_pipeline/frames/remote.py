@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pchem_pipeline.base.errors import InputError, MissingDependencyError
-from pchem_pipeline.frames.atomic import temporary
+from pchem_pipeline.store.files import whole_file, write_atomic
 
 __all__ = ["fetch", "is_remote"]
 
@@ -93,9 +93,9 @@ def _fetched(storage: Any, name: str) -> Path:
     if target.exists() and stamp.exists() and stamp.read_text() == state:
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
-    with temporary(target) as part:
+    with whole_file(target) as part:
         storage.get_file(name, str(part))
-    stamp.write_text(state)
+    write_atomic(stamp, state.encode())
     return target
 
 

@@ -56,7 +56,7 @@ def write_frames(
 
     Raises:
         ConfigError: an unknown format, or an optional library is missing.
-        InputError: the folder cannot be written.
+        StoreError: the folder cannot be written.
         ValueError: the blocks do not make up ``shape``.
     """
     if format not in WRITERS:

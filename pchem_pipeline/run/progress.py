@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.store.progress_file import Beacon
+from pchem_pipeline.store.progress_file import ProgressFile
 
 __all__ = ["Advance", "Reporter", "paced"]
 
@@ -62,9 +62,9 @@ class Reporter:
         *,
         quiet: bool = False,
         log: Path | None = None,
-        beacon: Beacon | None = None,
+        progress_file: ProgressFile | None = None,
     ) -> None:
-        self._beacon = beacon
+        self._file = progress_file
         self._disable = {"auto": None, "on": False, "off": True}[progress] if not quiet else True
         self._quiet = quiet
         self._log: TextIO | None = None
@@ -122,8 +122,8 @@ class Reporter:
                 last = time.monotonic()
                 pace = paced(label, unit, count, total, count - done, last - start)
                 self.event("progress", **pace)
-                if self._beacon is not None:
-                    self._beacon.show(pace)
+                if self._file is not None:
+                    self._file.show(pace)
 
             def advance(n: int = 1) -> None:
                 nonlocal count
@@ -137,8 +137,8 @@ class Reporter:
 
     def close(self) -> None:
         """Close the log file, and take back what others could see."""
-        if self._beacon is not None:
-            self._beacon.remove()
+        if self._file is not None:
+            self._file.remove()
         if self._log is not None:
             self._log.close()
 

@@ -20,7 +20,7 @@ from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_json
-from pchem_pipeline.store.progress_file import Beacon
+from pchem_pipeline.store.progress_file import ProgressFile
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["Command", "cropped", "run_stages", "run_status", "up_to", "working_run"]
@@ -115,12 +115,14 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
     """
     target = with_overrides(target, command)
     store = RunStore.create(target.store)
-    beacon = Beacon(store.path)
-    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json, beacon=beacon)
+    progress_file = ProgressFile(store.path)
+    reporter = Reporter(
+        command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
+    )
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(store.locked())
-        beacon.show({"stage": ""})
+        progress_file.show({"stage": ""})
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(target.config))
         write_json(store.path / ".pchem" / "location.json", _location(target))

@@ -16,8 +16,8 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery, poores
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
-from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
@@ -92,7 +92,7 @@ def _summarise(context: StageContext, names: list[str]) -> None:
         values = context.store.read(f"maps/{name}")
         summary = summarise(values, percentiles=settings.percentiles, outlier_sigmas=settings.outlier_sigmas)
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
-        found[name] = plain(asdict(summary) | {"percentiles": percentiles})
+        found[name] = without_nan(asdict(summary) | {"percentiles": percentiles})
     status = context.store.read("fit/fit_status")
     facts = {"summary": found, "fit_status": status_counts(status), "goodness": _misfits(context)}
     context.store.set_attributes("maps", facts)

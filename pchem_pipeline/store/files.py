@@ -1,19 +1,30 @@
-"""Small files of a run, written so that a kill at any moment leaves the old or the new one, whole."""
+"""Files that appear only when they are whole: a kill at any moment leaves the old one or the new one."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import json
+import math
 import os
-import tempfile
+import secrets
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = ["canonical_json", "read_json", "storage_error", "write_atomic", "write_json"]
+__all__ = [
+    "canonical_json",
+    "read_json",
+    "storage_error",
+    "whole_file",
+    "without_nan",
+    "write_atomic",
+    "write_json",
+]
 
 _CURES = {
     errno.ENOSPC: "the disk is full: free some space and run again, finished tiles are kept",
@@ -37,10 +48,15 @@ def is_fatal(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _CURES
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write ``data`` beside ``path``, flush it to the disk, and rename it into place.
+def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
+    """Write a small file, so that whoever reads it finds the old or the new one, whole.
 
     An object of an object storage is put at once: it appears whole or not at all.
+
+    Args:
+        path: the file; folders above it are made.
+        data: its content.
+        sync: it is on the disk before it takes its place, so that a power cut cannot leave it empty.
 
     Raises:
         StoreError: the file system, or the object storage, refused.
@@ -48,35 +64,72 @@ def write_atomic(path: Path, data: bytes) -> None:
     if isinstance(path, RemotePath):
         path.write_bytes(data)
         return
+    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    with _put_in_place(path, aside, sync) as part:
+        part.write_bytes(data)
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a path beside ``path`` to write a large file or a folder to, which then takes its place.
+
+    If something is raised inside, nothing is left of it. What a killed process left goes with the next
+    writing, so only one process may write a file. The name aside keeps the suffix, since some libraries look
+    at it.
+
+    Raises:
+        StoreError: the file system refused.
+    """
+    with _put_in_place(path, path.with_name(f".partial-{path.name}"), sync=False) as part:
+        yield part
+
+
+@contextlib.contextmanager
+def _put_in_place(path: Path, aside: Path, sync: bool) -> Iterator[Path]:
+    """Give ``aside`` to write to, and rename it to ``path``: the one place where files appear."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
-        temporary = Path(name)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-                file.flush()
+        _remove(aside)
+        yield aside
+        if sync:
+            with aside.open("rb") as file:
                 os.fsync(file.fileno())
-            # mkstemp makes private files; the rest of the store follows the user's umask
-            temporary.chmod(0o666 & ~_umask())
-            temporary.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
+        if path.is_dir():
+            shutil.rmtree(path)
+        aside.replace(path)
     except OSError as error:
         raise storage_error(error, path) from error
+    finally:
+        _remove(aside)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _remove(aside: Path) -> None:
+    if aside.is_dir():
+        shutil.rmtree(aside, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            aside.unlink()
 
 
 def canonical_json(value: Any) -> bytes:
     """Return the one JSON text of a value: sorted keys, no spaces, no NaN."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def without_nan(value: Any) -> Any:
+    """Return JSON data: NaN and infinities, which JSON has not, become None.
+
+    Args:
+        value: numbers, text, and lists and dictionaries of them.
+
+    Returns:
+        The same, with None where a number is not finite.
+    """
+    if isinstance(value, dict):
+        return {key: without_nan(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: Path, value: Any) -> None:

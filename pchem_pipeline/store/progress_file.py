@@ -11,12 +11,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.store.remote_path import RemotePath
+from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.store.files import write_atomic
 
-__all__ = ["Beacon", "read_beacon"]
+__all__ = ["ProgressFile", "read_progress"]
 
 
-class Beacon:
+class ProgressFile:
     """The file ``.pchem/progress.json`` of a run; it is there while a command works on the run.
 
     A disk that cannot take it stops nothing: progress is not a result.
@@ -34,12 +35,8 @@ class Beacon:
             "pid": os.getpid(),
             "host": socket.gethostname(),
         }
-        remote = isinstance(self._path, RemotePath)  # where an object appears whole
-        aside = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
-        with contextlib.suppress(OSError):
-            (self._path if remote else aside).write_text(json.dumps(content) + "\n", encoding="utf-8")
-            if not remote:
-                aside.replace(self._path)
+        with contextlib.suppress(StoreError):
+            write_atomic(self._path, (json.dumps(content) + "\n").encode(), sync=False)
             self._shown = True
 
     def remove(self) -> None:
@@ -50,7 +47,7 @@ class Beacon:
                     self._path.unlink()
 
 
-def read_beacon(store: Path) -> dict[str, Any] | None:
+def read_progress(store: Path) -> dict[str, Any] | None:
     """Return what the command that works on a run tells, or None where none does.
 
     A file that a killed process of this machine left counts as none.

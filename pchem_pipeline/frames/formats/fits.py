@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, MissingDependencyError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["FitsReader", "write_frames"]
 
@@ -202,7 +202,7 @@ def write_frames(
     if bit_depth is not None:
         header["BITDEPTH"] = (bit_depth, "bits of the ADC")
     top = dtype.type(1 << (8 * dtype.itemsize - 1))
-    with temporary(path) as part, part.open("wb") as stream:
+    with whole_file(path) as part, part.open("wb") as stream:
         stream.write(header.tostring().encode("ascii"))
         for block in blocks:
             values = np.asarray(block, dtype) if dtype.itemsize == 1 else np.asarray(block, dtype) ^ top

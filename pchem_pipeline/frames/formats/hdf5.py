@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["Hdf5Reader", "write_frames"]
 
@@ -181,7 +181,7 @@ def write_frames(
     _require()
     import h5py
 
-    with temporary(path) as part, h5py.File(part, "w") as file:
+    with whole_file(path) as part, h5py.File(part, "w") as file:
         dataset = file.create_dataset("frames", shape, dtype)
         start = 0
         for block in blocks:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.registry import require
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["MapImage", "write_fits", "write_npz", "write_tiff"]
 
@@ -46,7 +46,7 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
         The file written.
 
     Raises:
-        InputError: the folder cannot be written.
+        StoreError: the folder cannot be written.
         MissingDependencyError: astropy is not installed.
     """
     require("astropy.io.fits", "fits", "FITS files")
@@ -62,7 +62,7 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
         hdu.header["BUNIT"] = image.unit
         hdu.header["COMMENT"] = image.long_name
         units.append(hdu)
-    with temporary(path) as part:
+    with whole_file(path) as part:
         fits.HDUList(units).writeto(part)
     return [path]
 
@@ -78,7 +78,7 @@ def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
         The files written.
 
     Raises:
-        InputError: the folder cannot be written.
+        StoreError: the folder cannot be written.
     """
     import tifffile
 
@@ -87,7 +87,7 @@ def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
         path = folder / f"{image.name}.tif"
         values = image.values.astype(np.float32) if image.values.dtype.kind == "f" else image.values
         words = {"name": image.name, "unit": image.unit, "long_name": image.long_name}
-        with temporary(path) as part:
+        with whole_file(path) as part:
             tifffile.imwrite(part, values, description=json.dumps(words), photometric="minisblack")
         written.append(path)
     return written
@@ -104,9 +104,9 @@ def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
         The file written.
 
     Raises:
-        InputError: the folder cannot be written.
+        StoreError: the folder cannot be written.
     """
     arrays: dict[str, Any] = {image.name: image.values for image in maps}
-    with temporary(path) as part:
+    with whole_file(path) as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     return [path]

@@ -11,10 +11,10 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["NpyReader", "write_frames"]
 
@@ -73,7 +73,7 @@ def write_frames(
 ) -> list[Path]:
     """Write frames as one npy array; the format has no place for times and bit depth."""
     header = {"descr": npy_format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-    with temporary(path) as part, part.open("wb") as stream:
+    with whole_file(path) as part, part.open("wb") as stream:
         npy_format.write_array_header_1_0(stream, header)
         for block in blocks:
             stream.write(np.ascontiguousarray(block, dtype).data)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["ZarrReader", "write_frames"]
 
@@ -135,7 +135,7 @@ def write_frames(
     if bit_depth is not None:
         attributes["bit_depth"] = bit_depth
     depth = min(256, n)
-    with temporary(path) as part:
+    with whole_file(path) as part:
         array = zarr.create_array(
             part,
             shape=shape,

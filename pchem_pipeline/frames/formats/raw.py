@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["RawReader", "find_sidecar", "write_frames"]
 
@@ -150,7 +150,7 @@ def write_frames(
 ) -> list[Path]:
     """Write frames as bytes, with a sidecar ``<path>.json``; see `frames.writing.write_frames`."""
     little = dtype.newbyteorder("<")
-    with temporary(path) as part, part.open("wb") as stream:
+    with whole_file(path) as part, part.open("wb") as stream:
         for block in blocks:
             stream.write(np.ascontiguousarray(block, little).data)
     record: dict[str, Any] = {
@@ -163,6 +163,6 @@ def write_frames(
         record["integration_time"] = integration_time
     if bit_depth is not None:
         record["bit_depth"] = bit_depth
-    with temporary(path.with_name(path.name + ".json")) as part:
+    with whole_file(path.with_name(path.name + ".json")) as part:
         part.write_text(json.dumps(record) + "\n", encoding="utf-8")
     return [path]

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["SerReader", "write_frames"]
 
@@ -95,7 +95,7 @@ def write_frames(
             f"{path}: SER stores {depth} bits in other samples than {dtype.name}; choose another format"
         )
     header = _HEADER.pack(_MAGIC, 0, 0, 0, columns, rows, depth, n, b"", b"", b"", 0, 0)
-    with temporary(path) as part, part.open("wb") as stream:
+    with whole_file(path) as part, part.open("wb") as stream:
         stream.write(header)
         for block in blocks:
             stream.write(np.ascontiguousarray(block, dtype.newbyteorder("<")).data)

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.atomic import temporary
 from pchem_pipeline.frames.formats.contiguous import (
     ContiguousReader,
     Layout,
@@ -37,6 +36,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
 )
 from pchem_pipeline.frames.reader import check_window
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 __all__ = ["TiffReader", "write_frames"]
 
@@ -305,7 +305,7 @@ def write_frames(
     import tifffile
 
     facts = {"integration_time": integration_time, "bit_depth": bit_depth}
-    with temporary(path) as part:
+    with whole_file(path) as part:
         tifffile.imwrite(
             part,
             (frame for block in blocks for frame in np.ascontiguousarray(block, dtype)),

@@ -17,11 +17,11 @@ from pchem_pipeline.model.ensemble.components import (
     predicted_moments,
 )
 from pchem_pipeline.model.maps.pixels import PixelParameters
-from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.ensemble.curves import components, curves, electron_numbers, error_rates
 from pchem_pipeline.stages.ensemble.tile import EnsembleAxes, EnsembleTotals
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
+from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
@@ -86,7 +86,7 @@ def write_result(
         per_pixel = pixels_of(context.store, "histogram/counts", tiles).sum(axis=1, dtype=np.int64)[mask]
     context.store.set_attributes(
         "ensemble",
-        plain(
+        without_nan(
             facts
             | {
                 "moments": moment_rows(totals, pixels, per_pixel),

@@ -17,9 +17,9 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.joint_maps import LINE_MAPS, SHARED_MAPS, joint_maps
 from pchem_pipeline.model.maps.maps import status_counts, summarise
-from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.joint.samples import Sample, read_samples
+from pchem_pipeline.store.files import without_nan
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -168,6 +168,6 @@ def _summarise(context: StageContext, against: str) -> None:
             outlier_sigmas=settings.outlier_sigmas,
         )
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
-        found[name] = plain(asdict(summary) | {"percentiles": percentiles})
+        found[name] = without_nan(asdict(summary) | {"percentiles": percentiles})
     status = status_counts(store.read("joint/fit_status"))
     store.set_attributes("maps", {"summary": found, "fit_status": status})

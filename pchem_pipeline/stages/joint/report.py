@@ -15,11 +15,11 @@ from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.report.pages.joint_data import JointData, JointSample, middle
 from pchem_pipeline.report.pages.joint_page import JOINT_EXHIBIT_NAMES, render_joint
 from pchem_pipeline.report.style.pictures import DrawAll
-from pchem_pipeline.run.plain import plain
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.joint.samples import read_samples
 from pchem_pipeline.stages.report.drawing import draw_by_workers
+from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -124,7 +124,7 @@ def _numbers(store: RunStore, data: JointData) -> dict[str, Any]:
         rows.append(row)
     attributes = store.attributes("maps")
     content = {"title": data.title, "against": data.against, "samples": rows, "notes": list(data.notes)}
-    found: dict[str, Any] = plain(
+    found: dict[str, Any] = without_nan(
         {**content, "maps": attributes["summary"], "fit_status": attributes["fit_status"]}
     )
     return found

@@ -47,7 +47,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Three looks: at work, further, done."""
     paces = iter([PACE, {**PACE, "done": 16, "remaining": 24.0}, None])
     states = iter([[DONE, PART], [DONE, PART], [DONE, StageState("fit", "complete")]])
-    monkeypatch.setattr(watch_module, "read_beacon", lambda store: next(paces))
+    monkeypatch.setattr(watch_module, "read_progress", lambda store: next(paces))
     monkeypatch.setattr(watch_module, "run_status", lambda target: next(states))
     return []
 

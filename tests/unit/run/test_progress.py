@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pchem_pipeline.run.progress import Reporter, paced
-from pchem_pipeline.store.progress_file import Beacon, read_beacon
+from pchem_pipeline.store.progress_file import ProgressFile, read_progress
 
 
 def test_rate_and_remaining_time_are_means_of_this_run() -> None:
@@ -49,16 +49,16 @@ def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str])
 def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
     store = tmp_path / "run.zarr"
     (store / ".pchem").mkdir(parents=True)
-    assert read_beacon(store) is None
-    reporter = Reporter("off", quiet=True, beacon=Beacon(store))
+    assert read_progress(store) is None
+    reporter = Reporter("off", quiet=True, progress_file=ProgressFile(store))
     with reporter.progress("fit", 2) as advance:
         advance()
         advance()
-        seen = read_beacon(store)
+        seen = read_progress(store)
         assert seen is not None
         assert (seen["stage"], seen["done"], seen["total"], seen["pid"]) == ("fit", 2, 2, os.getpid())
-    Beacon(store).remove()  # not its own file
-    assert read_beacon(store) is not None
+    ProgressFile(store).remove()  # not its own file
+    assert read_progress(store) is not None
     reporter.close()
     assert list((store / ".pchem").iterdir()) == []
 
@@ -69,14 +69,15 @@ def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
     child = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
     dead = {"stage": "fit", "pid": int(child.stdout), "host": socket.gethostname()}
     place.write_text(json.dumps(dead))
-    assert read_beacon(tmp_path) is None
+    assert read_progress(tmp_path) is None
     place.write_text(json.dumps({**dead, "host": "another machine"}))
-    assert read_beacon(tmp_path) is not None
+    assert read_progress(tmp_path) is not None
     for text in ("", "[1]", "{", json.dumps({"host": socket.gethostname(), "pid": "x"})):
         place.write_text(text)
-        assert read_beacon(tmp_path) is None
+        assert read_progress(tmp_path) is None
 
 
 def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
-    Beacon(tmp_path / "nowhere").show({"stage": "fit"})
-    Beacon(tmp_path / "nowhere").remove()
+    (tmp_path / "file").touch()
+    ProgressFile(tmp_path / "file").show({"stage": "fit"})
+    ProgressFile(tmp_path / "file").remove()

@@ -1,0 +1,96 @@
+"""Files of the package appear whole or not at all, whatever fails, and all of them by one function."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+from pathlib import Path
+
+import pytest
+
+import pchem_pipeline
+from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.store.files import whole_file, without_nan, write_atomic
+
+
+def _fail(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("name", ["write_bytes", "replace"])
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, name):
+    write_atomic(tmp_path / "a.json", b"old")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, name, _fail)
+        with pytest.raises(StoreError, match=r"a\.json: No space left on device; the disk is full"):
+            write_atomic(tmp_path / "a.json", b"new")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"old")]
+
+
+def test_what_is_not_on_the_disk_does_not_take_the_place(tmp_path, monkeypatch):
+    write_atomic(tmp_path / "a.json", b"old")
+    monkeypatch.setattr(os, "fsync", _fail)
+    with pytest.raises(StoreError, match="disk is full"):
+        write_atomic(tmp_path / "a.json", b"new")
+    assert (tmp_path / "a.json").read_bytes() == b"old"
+    write_atomic(tmp_path / "a.json", b"progress", sync=False)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"progress")]
+
+
+def test_files_follow_the_umask_and_folders_are_made(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_atomic(tmp_path / "a" / "b.json", b"x")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a" / "b.json").stat().st_mode) == 0o640
+
+
+def test_a_folder_takes_the_place_of_an_older_one(tmp_path):
+    for content in ("old", "new"):
+        with whole_file(tmp_path / "a.zarr") as part:
+            part.mkdir()
+            (part / content).touch()
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["a.zarr", "a.zarr/new"]
+    (tmp_path / ".partial-a.zarr").mkdir()  # left by a kill
+    with whole_file(tmp_path / "a.zarr") as part:
+        part.touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
+
+
+def test_no_other_module_puts_files_in_their_place():
+    """Writers of camera formats write to the path that `whole_file` gives; the log is appended to."""
+    root = Path(pchem_pipeline.__file__).parent
+    writes = re.compile(
+        r"\.write_(text|bytes)\(|open\(\s*\"[wax]|\.rename\(|os\.replace|np\.savez?\w*\(|mkstemp"
+    )
+    allowed = {
+        "store/files.py": None,
+        "store/remote_path.py": None,
+        "run/progress.py": 1,
+        "base/kernel_cache.py": None,  # compiled kernels, which may be lost
+        # into memory
+        "stages/fit/start.py": 1,
+        "stages/simulate.py": 1,
+        "commands/demo/hidden.py": 1,
+    }
+    found: dict[str, int] = {}
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root).as_posix()
+        text = path.read_text(encoding="utf-8")
+        if name.startswith("frames/formats/"):
+            assert not writes.search(text) or "whole_file(" in text, name
+        elif number := len(writes.findall(text)):
+            found[name] = number
+    for name, number in found.items():
+        assert name in allowed, name
+        assert allowed[name] in (None, number), name
+
+
+def test_json_has_no_nan():
+    assert without_nan({"a": [1, float("nan"), (2.5, float("inf"))], "b": "x"}) == {
+        "a": [1, None, [2.5, None]],
+        "b": "x",
+    }
