@@ -146,7 +146,7 @@ def _discrepancy() -> list[Variable]:
         ("code_dn", ("code",), "int32", "DN", "digital number of the code axis"),
         ("code_observed", ("code",), "float64", "1", "samples at each DN, all usable pixels"),
         ("code_expected", ("code",), "float64", "1", "samples expected at each DN from the fitted PCDs"),
-        ("code_grown", ("code",), "float64", "1", "samples expected at each DN from the grown model"),
+        ("code_extended", ("code",), "float64", "1", "samples expected at each DN with effects"),
         ("added_exposure", ("added_level", *_MAP), "float64", "e-", "exposure that effects add to pixels"),
         ("added_weight", ("added_level", *_MAP), "float64", "1", "part of the frames at each added exposure"),
         ("frame_number", ("frame",), "int64", "1", "frame number in the run"),
@@ -156,7 +156,7 @@ def _discrepancy() -> list[Variable]:
         ("frame_charge_model", ("frame",), "float64", "1", "path of frame_charge under the named effects"),
         ("frame_readout_model", ("frame",), "float64", "DN", "path of frame_readout under the named effects"),
         ("z_before", ("statistic",), "float64", "1", "statistics against the plain model"),
-        ("z_after", ("statistic",), "float64", "1", "statistics against the grown model"),
+        ("z_after", ("statistic",), "float64", "1", "statistics against the model with effects"),
     ]  # fmt: skip
     for line, axis in rows.items():
         words = f"means of the {line}s over their standard deviation by chance"

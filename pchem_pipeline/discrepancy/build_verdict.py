@@ -1,26 +1,47 @@
-"""From effects that were added, with their gaps, to the steps of a verdict."""
+"""From what a search measured to its verdict: the state, one sentence, and a step for each added effect."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.verdict import (
     Candidate,
+    Change,
+    Discrepancy,
+    Examined,
     Families,
     GapChange,
     Moved,
+    Place,
     Pull,
     Rival,
     State,
     Step,
+    Verdict,
     parameters_of,
 )
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["Addition", "gap_change", "step_of"]
+__all__ = ["LARGEST_REST", "Added", "Addition", "Findings", "Fitted", "build_verdict", "largest_pulls"]
+
+FloatArray = NDArray[np.float64]
+
+#: Share of the gap that effects may leave, where it is above its floor, and still explain it.
+LARGEST_REST = 0.2
+_MOST_PULLS = 12
+_MOST_UNEXPLAINED = 8
+_MOST_RESIDUALS_TOLD = 3
+_MICRO = 1e-3  # nats: smaller gaps are told in millionths
 
 
 @dataclass(frozen=True)
@@ -57,33 +78,181 @@ class Addition:
         """Whether the verdict names it."""
         return self.alone and self.fits
 
+    def step(self) -> Step:
+        """Return it as ``discrepancy.json`` holds it."""
+        rivals = {c.effect for c in self.candidates}
+        separate = dict(type(self.effect).separate)
+        return Step(
+            effect=self.effect.tag if self.named else None,
+            verdict="unexplained" if not self.fits else "named" if self.alone else "ambiguous",
+            candidates=self.candidates,
+            parameters=parameters_of(self.effect, self.strength_stderr),
+            gap_before=self.before.value,
+            gap_after=self.after.value,
+            gap_floor=self.after.floor,
+            gap_interval_after=self.after.interval,
+            families=Families(before=dict(self.before.families), after=dict(self.after.families)),
+            runner_up=self.runner_up,
+            placebo=self.placebo,
+            moved={name: Moved(**change) for name, change in self.moved.items()},
+            separate={tag: text for tag, text in separate.items() if tag in rivals or self.named},
+            pulls=self.pulls,
+        )
 
-def step_of(added: Addition) -> Step:
-    """Return an addition as ``discrepancy.json`` holds it."""
-    state: State = "unexplained" if not added.fits else "named" if added.alone else "ambiguous"
-    rivals = {c.effect for c in added.candidates}
-    separate = dict(type(added.effect).separate)
-    return Step(
-        effect=added.effect.tag if added.named else None,
-        verdict=state,
-        candidates=added.candidates,
-        parameters=parameters_of(added.effect, added.strength_stderr),
-        gap_before=added.before.value,
-        gap_after=added.after.value,
-        gap_floor=added.after.floor,
-        gap_interval_after=added.after.interval,
-        families=Families(before=added.before.families, after=added.after.families),
-        runner_up=added.runner_up,
-        placebo=added.placebo,
-        moved={name: Moved(**change) for name, change in added.moved.items()},
-        separate={tag: text for tag, text in separate.items() if tag in rivals or added.named},
-        pulls=added.pulls,
+
+@dataclass(frozen=True)
+class Added:
+    """All that was added to the model, and what is left.
+
+    Attributes:
+        additions: the effects, the weightiest of a round first.
+        after: gap on the final samples with all of them.
+        unfinished: whether too much of the gap is left to call the model complete.
+        nearest: tags of effects that come nearest where none explains the data.
+        stand_ins: tags of effects that describe a part, but not on all codes alike.
+        residuals: codes that the final model does not account for.
+        set_aside: codes that its fit leaves out, by their place on a pixel's comb: intervals, e-.
+    """
+
+    additions: tuple[Addition, ...]
+    after: Gap
+    unfinished: bool = False
+    nearest: tuple[str, ...] = ()
+    stand_ins: tuple[str, ...] = ()
+    residuals: tuple[Place, ...] = ()
+    set_aside: tuple[tuple[float | None, float | None], ...] = ()
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The pixels under the final model; see :class:`~pchem_pipeline.discrepancy.verdict.Discrepancy`."""
+
+    maps: PixelMaps
+    code_extended: FloatArray | None = None
+    added: AddedExposure | None = None
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a search measured.
+
+    Attributes:
+        samples: what the data are ("frames", "histograms").
+        z: statistics of the data.
+        first, last: replicates of the model before and after.
+        before: gap on the final samples with no new effect.
+        places: where the data disagree with the model as it was.
+        still: whether they disagree with the final model.
+        added: effects, and what is left.
+    """
+
+    samples: str
+    z: Measured
+    first: NullModel
+    last: NullModel
+    before: Gap
+    places: Sequence[Place]
+    still: bool
+    added: Added
+
+    @property
+    def state(self) -> State:
+        """The verdict in a word."""
+        additions = self.added.additions
+        if not additions:
+            return "unexplained" if self.still else "consistent"
+        if self.added.unfinished or any(not each.fits for each in additions):
+            return "unexplained"
+        return "ambiguous" if any(not each.named for each in additions) else "named"
+
+    @property
+    def named(self) -> tuple[Effect, ...]:
+        """The named effects, the weightiest first."""
+        return tuple(each.effect for each in self.added.additions if each.named)
+
+    def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Return the model without the effects that were added but are not named.
+
+        Args:
+            present: effects that it had before the search.
+            extended: the same, and all that were added.
+        """
+        tags = {effect.tag for effect in (*present, *self.named)}
+        return tuple(effect for effect in extended if effect.tag in tags)
+
+
+def build_verdict(
+    found: Findings,
+    model: tuple[Effect, ...],
+    fitted: Fitted,
+    looked_at: tuple[Evidence, Examined],
+    *,
+    untestable: Mapping[str, str],
+    left_out: Mapping[str, str],
+    n_replicates: int,
+) -> Discrepancy:
+    """Put the verdict together.
+
+    Args:
+        found: what was measured.
+        model: effects that the model has now.
+        fitted: the pixels under it.
+        looked_at: evidence of the train samples, and what was examined.
+        untestable: effects that such data cannot show, and why.
+        left_out: candidates that failed, and why.
+        n_replicates: drawn in all.
+    """
+    both = found.z.both
+    pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
+    rest = sorted(zip(found.last.names, pulls[1].tolist(), strict=True), key=lambda item: -abs(item[1]))
+    left = tuple(Place.of(name, z=z) for name, z in rest[:_MOST_UNEXPLAINED]) if found.still else ()
+    return Discrepancy(
+        verdict=Verdict(
+            verdict=found.state,
+            sentence=_sentence(found),
+            effects=tuple(effect.tag for effect in found.named),
+            model_effects=tuple(effect.model_dump(mode="json") for effect in model),
+            steps=tuple(each.step() for each in found.added.additions),
+            gap=_gap_change(found.before, found.added),
+            where=tuple(found.places),
+            unexplained=(*found.added.residuals, *left),
+            set_aside=found.added.set_aside if found.named else (),
+            untestable=dict(untestable),
+            left_out=dict(left_out),
+            examined=looked_at[1],
+            p_global=Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
+            replicates=n_replicates,
+            versions={"statistics": VERSION},
+        ),
+        model=model,
+        maps=fitted.maps,
+        evidence=looked_at[0],
+        statistics=(found.first.names, pulls[0], pulls[1]),
+        code_extended=fitted.code_extended,
+        added=fitted.added,
     )
 
 
-def gap_change(before: Gap, after: Gap, *, grown: bool) -> GapChange:
-    """Return the gap before and after, and the fraction of it that was closed (0 where nothing was added)."""
-    closed = 1.0 - max(after.value, 0.0) / before.value if grown and before.value > 0.0 else 0.0
+def largest_pulls(
+    names: Sequence[str], weight: FloatArray, before: FloatArray, after: FloatArray
+) -> tuple[Pull, ...]:
+    """Return the statistics of largest weight with their pulls, shape (m,) each."""
+    return tuple(
+        Pull(
+            statistic=names[i],
+            sentence=STATISTICS[names[i]].sentence,
+            before=float(before[i]),
+            after=float(after[i]),
+        )
+        for i in np.argsort(-np.abs(weight))[:_MOST_PULLS]
+    )
+
+
+def _gap_change(before: Gap, added: Added) -> GapChange:
+    after = added.after
+    closed = 0.0
+    if added.additions and before.value > 0.0:
+        closed = 1.0 - max(after.value, 0.0) / before.value
     return GapChange(
         before=before.value,
         after=after.value,
@@ -92,3 +261,67 @@ def gap_change(before: Gap, after: Gap, *, grown: bool) -> GapChange:
         interval_before=before.interval,
         interval_after=after.interval,
     )
+
+
+def _sentence(found: Findings) -> str:
+    """Return the verdict in one sentence."""
+    state, data, added = found.state, found.samples, found.added
+    titles = [type(effect).title or effect.tag for effect in found.named]
+    if state == "consistent":
+        return f"The {data} agree with the model in every statistic tested."
+    if state == "unexplained":
+        return f"The {data} disagree with the model{_unexplained(found, titles)}{_left(added)}."
+    if state == "ambiguous":
+        sets = [" or ".join(c.effect for c in each.candidates) for each in added.additions if not each.named]
+        also = f"{_and(titles)} is missing, and " if titles else ""
+        lacks = f"{also}{_and(sets)}{_rest(found)}{_left(added)}"
+        return f"The model lacks something that these {data} cannot tell apart: {lacks}."
+    if found.before.at_floor:
+        limit = f"{1e6 * found.before.floor:.2g} micronats per sample"
+        return f"The model was missing {_and(titles)}; on the final {data} alone its gap is below {limit}."
+    them = "them" if len(titles) > 1 else "it"
+    closed = f"{_gaps(found)}{_rest(found)}{_left(added)}"
+    return f"The model was missing {_and(titles)}; with {them} the gap on unseen {data} went {closed}."
+
+
+def _unexplained(found: Findings, titles: Sequence[str]) -> str:
+    """Return what is known of a disagreement that no known effect explains."""
+    lead = f" (largest in {found.places[0].statistic})" if found.places else ""
+    doubtful = [each.candidates[0].effect for each in found.added.additions if not each.fits]
+    nearest = doubtful or found.added.nearest
+    return (
+        f"{lead}, and no known effect explains it"
+        + (f" besides {_and(titles)}" if titles else "")
+        + (f"; nearest known: {_and(nearest)}" if nearest else "")
+    )
+
+
+def _gaps(found: Findings) -> str:
+    """Return the gap before and after, and its floor, in words."""
+    after = found.added.after
+    values = [found.before.value, max(after.value, 0.0), after.floor]
+    unit, scale = ("micronats", 1e6) if found.before.value < _MICRO else ("nats", 1.0)
+    before, left, floor = (scale * value for value in values)
+    return f"{before:.3g} -> {left:.3g} {unit} per sample (floor {floor:.2g})"
+
+
+def _rest(found: Findings) -> str:
+    """Return how much of the gap is left above its floor, in words; nothing where it is at it."""
+    after = found.added.after
+    if after.at_floor or found.before.value <= 0.0:
+        return ""
+    return f"; {max(after.value, 0.0) / found.before.value:.0%} of the gap is left unexplained"
+
+
+def _left(added: Added) -> str:
+    """Return in words which codes are not accounted for, and what stands in for it."""
+    told = "; ".join(place.sentence for place in added.residuals[:_MOST_RESIDUALS_TOLD])
+    words = f"; what is left: {told}" if told else ""
+    if added.stand_ins:
+        names = ", ".join(added.stand_ins)
+        words += f"; {names} would describe a part of it, but not on all codes alike, and is not named"
+    return words
+
+
+def _and(items: Sequence[str]) -> str:
+    return ", ".join(items[:-1]) + (" and " if len(items) > 1 else "") + items[-1] if items else ""

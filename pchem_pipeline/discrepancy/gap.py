@@ -1,25 +1,23 @@
 """The gap between data and model in nats per sample, its floor, and its interval.
 
-``gap = sum_f (D_f - E_f) / (2 N)``: D_f is the squared distance of the statistics of a family from what the
-model gives, in its covariance, E_f the distance that replicates of the model itself have, N the number of
-samples. It estimates the Kullback-Leibler divergence per sample between the laws of the statistics, so it
-does not grow with the data; more data only lowers the floor, the 95 % quantile of what the model has against
-itself. One covariance, that of the model before anything was added, measures all models of a comparison:
-otherwise an effect that makes the statistics scatter would shrink the gap by widening the noise.
+A gap is a distance of the final samples from the model, less what replicates of the model have of it by
+chance, over the number of samples: an estimate of a Kullback-Leibler divergence per sample. It does not grow
+with the data; more data only lowers the floor, the 95 % quantile of what the model has against itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pchem_pipeline.discrepancy.by_simulation.null import NullModel, moments
+from pchem_pipeline.discrepancy.null import NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 
-__all__ = ["Gap", "GapMetric"]
+__all__ = ["Gap", "StatisticsGap"]
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +31,7 @@ class Gap:
 
     Attributes:
         value: the gap; negative values are chance.
-        floor: what a right model stays below in 19 of 20 stacks.
+        floor: what a right model stays below in 19 of 20 data sets.
         interval: 95 % interval.
         families: the contribution of each family of statistics.
     """
@@ -41,17 +39,51 @@ class Gap:
     value: float
     floor: float
     interval: tuple[float, float]
-    families: dict[str, float]
+    families: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls,
+        distance: float,
+        chance: FloatArray,
+        n_samples: float,
+        *,
+        variance: float,
+        carried: float = 0.0,
+        families: Mapping[str, float] | None = None,
+    ) -> Gap:
+        """Return the gap of a distance.
+
+        Args:
+            distance: of the data from the model, nats.
+            chance: distances that replicates of the model have, nats, shape (b,).
+            n_samples: behind the distance.
+            variance: of the distance beyond that by chance, nats^2.
+            carried: part of the gap that the distance does not hold, nats.
+            families: contributions, nats per sample; None: all is of the shape of the histograms.
+        """
+        expected = float(chance.mean())
+        spread = float(np.sqrt(chance.var(ddof=1) + variance))
+        total = distance - expected + carried
+        value = total / n_samples
+        ends = (total - _INTERVAL * spread) / n_samples, (total + _INTERVAL * spread) / n_samples
+        floor = float(np.quantile(chance, _FLOOR_QUANTILE) - expected) / n_samples
+        return cls(value, floor, ends, {"shape": value} if families is None else families)
 
     @property
     def at_floor(self) -> bool:
-        """Whether nothing more can be seen in these frames."""
+        """Whether nothing more can be seen in these samples."""
         return self.value <= self.floor
 
 
 @dataclass(frozen=True)
-class GapMetric:
-    """Measures gaps in the covariance of one null model.
+class StatisticsGap:
+    """Measures gaps by statistics: ``sum_f (D_f - E_f) / (2 N)`` over their families.
+
+    D_f is the squared distance of the statistics of a family from what the model gives, in their covariance,
+    E_f the distance that replicates of the model itself have. One covariance, that of the model before
+    anything was added, measures all models of a comparison: otherwise an effect that makes the statistics
+    scatter would shrink the gap by widening the noise.
 
     Attributes:
         null: of the model before anything was added.
@@ -73,19 +105,14 @@ class GapMetric:
         total, families = 0.0, {}
         own = self._own_distances(replicates)
         for family, index in self._members().items():
-            distance = _distances((z - mean)[None, index], self.null.covariance[np.ix_(index, index)])[0]
-            families[family] = (float(distance) - float(own[family].mean())) / (2.0 * self.n_samples)
-            total += float(distance)
-        chance = np.sum(list(own.values()), axis=0)
-        scale = 2.0 * self.n_samples
-        excess = total - float(chance.mean())
-        spread = float(np.sqrt(chance.var(ddof=1) + 4.0 * max(excess, 0.0)))
-        return Gap(
-            value=excess / scale,
-            floor=float(np.quantile(chance, _FLOOR_QUANTILE) - chance.mean()) / scale,
-            interval=((excess - _INTERVAL * spread) / scale, (excess + _INTERVAL * spread) / scale),
-            families=families,
-        )
+            squared = _squared_distances((z - mean)[None, index], self.null.covariance[np.ix_(index, index)])
+            distance = 0.5 * float(squared[0])
+            families[family] = (distance - float(own[family].mean())) / self.n_samples
+            total += distance
+        chance = np.asarray(np.sum(list(own.values()), axis=0), np.float64)
+        # of a noncentral chi-square: Var(D / 2) beyond chance is the excess of D
+        variance = 2.0 * max(total - float(chance.mean()), 0.0)
+        return Gap.of(total, chance, self.n_samples, variance=variance, families=families)
 
     def _members(self) -> dict[str, list[int]]:
         """Return the places of the statistics of each family that has any."""
@@ -94,30 +121,30 @@ class GapMetric:
         return {family: index for family, index in found.items() if index}
 
     def _own_distances(self, replicates: FloatArray) -> dict[str, FloatArray]:
-        """Return for each family the distances that data of the model itself would have, shape (b,) each.
+        """Return for each family half the squared distances that data of the model would have, (b,) each.
 
         Each replicate is measured against the others, as the data are against all: in the covariance too,
         where that was estimated from it.
         """
         if id(replicates) in self._known:
             return self._known[id(replicates)]
-        b = replicates.shape[0]
         known = replicates is self.null.replicates
         own: dict[str, list[float]] = {family: [] for family in self._members()}
-        for i in range(b):
+        for i in range(replicates.shape[0]):
             others = np.delete(replicates, i, axis=0)
             mean, _, covariance = (
                 moments(others) if known else (others.mean(axis=0), None, self.null.covariance)
             )
             for family, index in self._members().items():
                 apart = (replicates[i] - mean)[None, index]
-                own[family].append(float(_distances(apart, covariance[np.ix_(index, index)])[0]))
+                squared = _squared_distances(apart, covariance[np.ix_(index, index)])
+                own[family].append(0.5 * float(squared[0]))
         found = {family: np.array(values) for family, values in own.items()}
         self._known[id(replicates)] = found
         return found
 
 
-def _distances(residuals: FloatArray, covariance: FloatArray) -> FloatArray:
+def _squared_distances(residuals: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the squared Mahalanobis distances of residuals, shape (n, m)."""
     white = linalg.solve_triangular(linalg.cholesky(covariance, lower=True), residuals.T, lower=True)
     return np.asarray(np.sum(white**2, axis=0))

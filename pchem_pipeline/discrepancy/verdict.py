@@ -424,7 +424,7 @@ class Discrepancy:
         maps: parameters of the pixels examined, under the final model.
         evidence: of the train samples.
         statistics: names, and deviations before and after, for pictures.
-        code_grown: samples expected at each code of ``evidence.code`` from the final model; None where
+        code_extended: samples expected at each code of ``evidence.code`` from the final model; None where
             nothing was added or the model gives no law.
         added: exposure that the effects add to single pixels beside the H of ``maps``; None: nothing.
     """
@@ -434,5 +434,5 @@ class Discrepancy:
     maps: PixelMaps
     evidence: Evidence
     statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
-    code_grown: NDArray[np.float64] | None = None
+    code_extended: NDArray[np.float64] | None = None
     added: AddedExposure | None = None

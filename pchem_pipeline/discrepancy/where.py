@@ -1,4 +1,4 @@
-"""Where data and model disagree: the telling statistics, with the pixels, DN and frames that carry them."""
+"""Where data and model disagree: statistics that deviate, and the pixels, DN and frames that carry them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.by_simulation.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 

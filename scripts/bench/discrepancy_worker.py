@@ -54,7 +54,7 @@ def make(
 
 
 def _look(case: Case, frames: NDArray[np.uint16], options: dict[str, Any]) -> dict[str, Any]:
-    from pchem_pipeline.discrepancy.by_simulation.workflow import find_discrepancies
+    from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
     from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 
     settings = DiscrepancySettings(exclude=case.exclude, **options)

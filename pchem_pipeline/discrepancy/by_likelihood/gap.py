@@ -17,13 +17,10 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import saturated
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent
 
-__all__ = ["Meter", "carried_over"]
+__all__ = ["LikelihoodGap", "carried_over"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-_QUANTILE = 0.95
-_INTERVAL = 1.96
 
 
 def carried_over(log_masses: FloatArray, counts: IntArray, kept: NDArray[np.bool_]) -> float:
@@ -47,8 +44,8 @@ def carried_over(log_masses: FloatArray, counts: IntArray, kept: NDArray[np.bool
 
 
 @dataclass(frozen=True)
-class Meter:
-    """Measures gaps on one part of the samples.
+class LikelihoodGap:
+    """Measures gaps by likelihood on one part of the samples.
 
     Attributes:
         counts: that part, shape (n, B).
@@ -79,17 +76,9 @@ class Meter:
         judged = self._judged(problem)
         log_masses = judged.log_masses(fit.theta, fit.shared)
         distance = self._distance(log_masses, self.counts)
-        own = self.by_chance(problem, fit)
-        excess = distance - float(own.mean())
-        spread = float(np.sqrt(own.var(ddof=1) + self._variance(log_masses)))
-        n = self.n_samples
-        value = (excess + self.carried) / n
-        return Gap(
-            value=value,
-            floor=float(np.quantile(own, _QUANTILE) - own.mean()) / n,
-            interval=(value - _INTERVAL * spread / n, value + _INTERVAL * spread / n),
-            families={"shape": value},
-        )
+        chance = self.by_chance(problem, fit)
+        variance = self._variance(log_masses)
+        return Gap.of(distance, chance, self.n_samples, variance=variance, carried=self.carried)
 
     def value(self, problem: SharedProblem, fit: SharedFit, chance: float) -> float:
         """Return a gap given what chance contributes to it, nats per sample."""

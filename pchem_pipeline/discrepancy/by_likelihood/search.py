@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_likelihood.gap import Meter
+from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST
+from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import (
     SWAPPED,
-    Arena,
-    Contest,
+    Choice,
     FittedSet,
+    SetComparison,
     compare_sets,
     find_rivals,
     of_best_kind,
@@ -32,8 +33,7 @@ __all__ = ["Explanation", "Named", "combs_coincide", "explain"]
 FloatArray = NDArray[np.float64]
 
 _SIGMAS = 3.0
-#: a set must leave less of the gap than this
-LARGEST_REST = 0.2
+
 _PAYS = 0.5  # of the gap: more must go with a peak that is set aside
 _PEAKS_TRIED = 3
 _COINCIDE = 0.3  # e-
@@ -66,7 +66,7 @@ class Explanation:
     """What the search came to.
 
     Attributes:
-        arena: with the codes on which effects were compared.
+        sets: fitted and scored on the codes on which effects were compared.
         kept: codes that the gap compares, shape (n, B): all but a peak set aside.
         set_aside: codes that the fit leaves out.
         plain: the fit without effects to all codes.
@@ -75,10 +75,10 @@ class Explanation:
         named: its effects, the weightiest first.
         unsteady: effects that fit in one view and not in another: stand-ins of something unknown.
         nearest: tags of the best single effects on all codes.
-        rest: share of the gap that the judged set leaves among the codes of the arena.
+        rest: share of the gap that the judged set leaves among the codes of the sets.
     """
 
-    arena: Arena
+    sets: SetComparison
     kept: NDArray[np.bool_]
     set_aside: tuple[Interval, ...]
     plain: FittedSet
@@ -96,43 +96,46 @@ class Explanation:
 
 
 def explain(
-    arena: Arena, candidates: Sequence[Member], replicates: int, rng: np.random.Generator
+    sets: SetComparison, candidates: Sequence[Member], replicates: int, rng: np.random.Generator
 ) -> Explanation:
     """Find the effects that explain histograms.
 
     Args:
-        arena: with all codes.
+        sets: with all codes.
         candidates: effects at their starts.
         replicates: behind what chance leaves.
         rng: their random numbers.
     """
-    contest = compare_sets(arena, candidates)
-    nearest = tuple(m.tag for s in contest.fitted[:3] for m in s.members)
-    left, floor = _left(arena, contest.best, replicates, rng)
-    if left > floor and any(m.tabulated for m in contest.best.members):
+    choice = compare_sets(sets, candidates)
+    nearest = tuple(m.tag for s in choice.fitted[:3] for m in s.members)
+    left, floor = _left(sets, choice.best, replicates, rng)
+    if left > floor and any(m.tabulated for m in choice.best.members):
         candidates = [c for c in candidates if not c.tabulated]
-        contest = compare_sets(arena, candidates)
-        left, floor = _left(arena, contest.best, replicates, rng)
-    at_first = max(arena.gap(contest.plain), 1e-12)
-    if contest.best.members and left <= max(floor, LARGEST_REST * at_first):
-        named = [_named(arena, contest.best, m, candidates) for m in contest.best.members]
+        choice = compare_sets(sets, candidates)
+        left, floor = _left(sets, choice.best, replicates, rng)
+    at_first = max(sets.gap(choice.plain), 1e-12)
+    if choice.best.members and left <= max(floor, LARGEST_REST * at_first):
+        named = [_named(sets, choice.best, m, candidates) for m in choice.best.members]
         return Explanation(
-            arena, arena.kept, (), contest.plain, contest.best, contest.best, _sorted(named), (), nearest,
+            sets, sets.kept, (), choice.plain, choice.best, choice.best, _sorted(named), (), nearest,
             left / at_first,
         )  # fmt: skip
-    fixed_in_dn = combs_coincide(contest.plain.fit.parameters)
+    fixed_in_dn = combs_coincide(choice.plain.fit.parameters)
     pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.bends_codes))]
-    return _narrowed(arena, pool, contest, nearest)
+    return _narrowed(sets, pool, choice, nearest)
 
 
-def _left(arena: Arena, best: FittedSet, replicates: int, rng: np.random.Generator) -> tuple[float, float]:
+def _left(
+    sets: SetComparison, best: FittedSet, replicates: int, rng: np.random.Generator
+) -> tuple[float, float]:
     """Return the gap that a set leaves on the scored part, and its floor, nats per sample."""
-    gap = Meter(arena.test, arena.kept, 0.0, replicates, rng).gap(arena.problem(best.members), best.fit)
+    gaps = LikelihoodGap(sets.test, sets.kept, 0.0, replicates, rng)
+    gap = gaps.gap(sets.problem(best.members), best.fit)
     return gap.value, gap.floor
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
-    """Tell whether the peaks of all pixels lie at the same DN, so that nothing tells codes from electrons.
+    """Tell whether the peaks of all pixels lie at the same DN: codes cannot be told from electrons then.
 
     Args:
         parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
@@ -142,42 +145,42 @@ def combs_coincide(parameters: FloatArray) -> bool:
 
 
 def _narrowed(
-    arena: Arena, candidates: Sequence[Member], whole: Contest, nearest: tuple[str, ...]
+    sets: SetComparison, candidates: Sequence[Member], whole: Choice, nearest: tuple[str, ...]
 ) -> Explanation:
     """Compare on the codes that are understood, and keep what holds on more of them."""
     plain = whole.plain
     parameters = plain.fit.parameters
-    electrons = electrons_of(arena.origin, arena.train.shape[1], parameters)
-    peak = _cut_peak(arena, electrons, candidates, whole)
-    between = valleys(arena, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
-    wide = _narrow(arena, ~inside(peak, electrons), parameters)
-    view = _narrow(arena, ~inside(peak + between, electrons), parameters)
-    contest = compare_sets(view, candidates, coarse=True)
-    steady, unsteady = _steady(wide, contest.best, candidates)
-    rest = view.gap(contest.best) / max(view.gap(contest.plain), 1e-12)
+    electrons = electrons_of(sets.origin, sets.train.shape[1], parameters)
+    peak = _cut_peak(sets, electrons, candidates, whole)
+    between = valleys(sets, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
+    wide = _narrow(sets, ~inside(peak, electrons), parameters)
+    view = _narrow(sets, ~inside(peak + between, electrons), parameters)
+    choice = compare_sets(view, candidates, coarse=True)
+    steady, unsteady = _steady(wide, choice.best, candidates)
+    rest = view.gap(choice.best) / max(view.gap(choice.plain), 1e-12)
     named: list[Named] = []
     best = wide.fit((), parameters)
     if steady:
-        start = contest.best.fit.parameters
+        start = choice.best.fit.parameters
         fitted = wide.attempt(steady, start)
         best = best if fitted is None else of_best_kind(wide, fitted, candidates)
         there = view.attempt(best.members, start)
         for member in best.members:
-            found = _named(view, contest.best, _member(contest.best, member.tag), candidates)
+            found = _named(view, choice.best, _member(choice.best, member.tag), candidates)
             apart = 0.0 if there is None else _apart(member, _member(there, member.tag))
             named.append(replace(found, member=member, apart=apart))
     return Explanation(
-        view, wide.kept, peak, plain, best, contest.best, _sorted(named), tuple(unsteady), nearest, rest
+        view, wide.kept, peak, plain, best, choice.best, _sorted(named), tuple(unsteady), nearest, rest
     )
 
 
 def _cut_peak(
-    arena: Arena, electrons: FloatArray, candidates: Sequence[Member], whole: Contest
+    sets: SetComparison, electrons: FloatArray, candidates: Sequence[Member], whole: Choice
 ) -> tuple[Interval, ...]:
     """Return the peak without which known effects explain far more, if there is one."""
-    best, found = _PAYS * arena.gap(whole.best) * arena.n_test, None
-    for interval in doubtful_peaks(arena, electrons)[:_PEAKS_TRIED]:
-        view = _narrow(arena, ~interval.holds(electrons), whole.plain.fit.parameters)
+    best, found = _PAYS * sets.gap(whole.best) * sets.n_test, None
+    for interval in doubtful_peaks(sets, electrons)[:_PEAKS_TRIED]:
+        view = _narrow(sets, ~interval.holds(electrons), whole.plain.fit.parameters)
         left = view.gap(compare_sets(view, candidates, largest=2, coarse=True).best) * view.n_test
         if left < best:
             best, found = left, interval
@@ -194,11 +197,13 @@ def _apart(member: Member, there: Member) -> float:
     return abs(float(getattr(member.effect, name)) - float(getattr(there.effect, name))) if name else 0.0
 
 
-def _narrow(arena: Arena, kept: NDArray[np.bool_], start: FloatArray) -> Arena:
-    return Arena(arena.train, arena.test, arena.origin, kept, arena.present, start, dict(arena.failed))
+def _narrow(sets: SetComparison, kept: NDArray[np.bool_], start: FloatArray) -> SetComparison:
+    return SetComparison(sets.train, sets.test, sets.origin, kept, sets.present, start, dict(sets.failed))
 
 
-def _steady(wide: Arena, best: FittedSet, candidates: Sequence[Member]) -> tuple[list[Member], list[Member]]:
+def _steady(
+    wide: SetComparison, best: FittedSet, candidates: Sequence[Member]
+) -> tuple[list[Member], list[Member]]:
     """Split a set into members that hold on more codes, as fitted there, and those that do not.
 
     On more codes each member may be exchanged for another effect; those for which one does better, and those
@@ -221,7 +226,7 @@ def _steady(wide: Arena, best: FittedSet, candidates: Sequence[Member]) -> tuple
     return steady, unsteady
 
 
-def _exchanged(wide: Arena, fitted: FittedSet, candidates: Sequence[Member]) -> FittedSet:
+def _exchanged(wide: SetComparison, fitted: FittedSet, candidates: Sequence[Member]) -> FittedSet:
     """Exchange one member of a set for another effect while that is better."""
     plain = wide.fit((), fitted.fit.parameters)
     for _ in fitted.members:
@@ -248,15 +253,15 @@ def _alike(one: Member, other: Member) -> bool:
     return a * b > 0 and max(abs(a), abs(b)) < _STEADY * min(abs(a), abs(b))
 
 
-def _named(arena: Arena, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
+def _named(sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
     """Compare a member of a set with what could stand in its place."""
-    without, rivals = find_rivals(arena, best, member, candidates)
+    without, rivals = find_rivals(sets, best, member, candidates)
     equals = []
     for rival in rivals:
-        rise, error = arena.difference(best, rival)
+        rise, error = sets.difference(best, rival)
         if rise < _SIGMAS * error:
             equals += [tag for tag in rival.tags - best.tags if tag not in equals]
-    weight = arena.difference(best, without)[0] if without else 0.0
+    weight = sets.difference(best, without)[0] if without else 0.0
     return Named(member, 0.0, tuple(rivals), without, tuple(equals), weight)
 
 

@@ -1,6 +1,6 @@
 """Sets of effects compared by likelihood on histograms: fitted on one part, scored on another.
 
-The samples of every pixel are dealt at random to three parts. A set of effects is fitted on the first
+The samples of every pixel are split at random into three parts. A set of effects is fitted on the first
 together with the pixels' own four parameters and scored by its log-likelihood on the second; the standard
 error of a difference of scores is that of a mean of independent samples (Vuong 1989).
 """
@@ -23,14 +23,14 @@ from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = [
     "SWAPPED",
-    "Arena",
-    "Contest",
+    "Choice",
     "FittedSet",
+    "SetComparison",
     "compare_sets",
-    "deal",
     "find_rivals",
     "of_best_kind",
     "saturated",
+    "split_samples",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -50,8 +50,8 @@ _HARDLY = 0.03  # of what the set closes: a member that closes less is not one o
 SWAPPED = 0.2  # of what the set closes: members that close more are not exchanged
 
 
-def deal(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) -> tuple[IntArray, ...]:
-    """Deal the samples of histograms (n, B) to equal parts at random, without replacement."""
+def split_samples(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) -> tuple[IntArray, ...]:
+    """Split the samples of histograms (n, B) into equal parts at random, without replacement."""
     left = counts.astype(np.int64)
     found = []
     for remaining in range(parts, 1, -1):
@@ -130,8 +130,8 @@ class FittedSet:
 
 
 @dataclass
-class Arena:
-    """Where sets are fitted and scored.
+class SetComparison:
+    """Fits sets of effects to one part of the samples and scores them on another.
 
     Attributes:
         train, test: histograms, shape (n, B).
@@ -295,7 +295,7 @@ def _placed(member: Member, length: float) -> Member:
 
 
 @dataclass(frozen=True)
-class Contest:
+class Choice:
     """What the comparison of the sets came to.
 
     Attributes:
@@ -310,100 +310,102 @@ class Contest:
 
 
 def compare_sets(
-    arena: Arena, candidates: Sequence[Member], *, largest: int = _LARGEST_SET, coarse: bool = False
-) -> Contest:
+    sets: SetComparison, candidates: Sequence[Member], *, largest: int = _LARGEST_SET, coarse: bool = False
+) -> Choice:
     """Grow the set of effects greedily, with swaps, while the score improves by more than chance.
 
     Effects that leave most of the gap are not what is missing: nothing is put on top of them.
 
     Args:
-        arena: where to fit and score.
+        sets: fits and scores them.
         candidates: starts; several may be of one effect.
         largest: size of the set.
         coarse: end where little of the gap is left, since the rest is no matter of known effects.
     """
-    plain = best = arena.fit(())
-    at_first = arena.gap(plain)
+    plain = best = sets.fit(())
+    at_first = sets.gap(plain)
     first: list[FittedSet] = []
-    while len(best.members) < largest and not (coarse and arena.gap(best) < _HARDLY * at_first):
-        grown = _additions(arena, best, candidates)
+    while len(best.members) < largest and not (coarse and sets.gap(best) < _HARDLY * at_first):
+        grown = _additions(sets, best, candidates)
         if best is plain:
             first = grown
-        if not grown or not _better(arena, grown[0], best):
+        if not grown or not _better(sets, grown[0], best):
             break
-        best = _swapped(arena, grown[0], plain, candidates)
-        if arena.gap(best) > _HOPELESS[len(best.members)] * at_first:
+        best = _swapped(sets, grown[0], plain, candidates)
+        if sets.gap(best) > _HOPELESS[len(best.members)] * at_first:
             break
-    return Contest(plain, of_best_kind(arena, _pruned(arena, best, plain), candidates), first)
+    return Choice(plain, of_best_kind(sets, _pruned(sets, best, plain), candidates), first)
 
 
 def _additions(
-    arena: Arena, base: FittedSet, candidates: Sequence[Member], most: int = _FITTED
+    sets: SetComparison, base: FittedSet, candidates: Sequence[Member], most: int = _FITTED
 ) -> list[FittedSet]:
-    """Fit the set with the most promising candidates beside it, the best start of each, the best first."""
+    """Fit the set with each of the most promising candidates, the best start of each, the best first."""
     found: dict[str, FittedSet] = {}
-    for member in arena.promising(base, candidates):
+    for member in sets.promising(base, candidates):
         if len(found) == most:
             break
         if member.tag not in found:
-            fitted = arena.attempt((*base.members, member), base.fit.parameters)
+            fitted = sets.attempt((*base.members, member), base.fit.parameters)
             if fitted is not None:
                 found[member.tag] = fitted
     return sorted(found.values(), key=lambda s: -s.score)
 
 
-def _better(arena: Arena, one: FittedSet, other: FittedSet) -> bool:
-    rise, error = arena.difference(one, other)
+def _better(sets: SetComparison, one: FittedSet, other: FittedSet) -> bool:
+    rise, error = sets.difference(one, other)
     return rise > max(_SIGMAS * error, _PRICE)
 
 
-def _swapped(arena: Arena, best: FittedSet, plain: FittedSet, candidates: Sequence[Member]) -> FittedSet:
+def _swapped(
+    sets: SetComparison, best: FittedSet, plain: FittedSet, candidates: Sequence[Member]
+) -> FittedSet:
     """Exchange earlier members that have come to matter little for others, where that is better."""
-    whole = arena.difference(best, plain)[0]
+    whole = sets.difference(best, plain)[0]
     for member in best.members[:-1]:
-        base = arena.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
-        if base is None or arena.difference(best, base)[0] > SWAPPED * whole:
+        base = sets.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
+        if base is None or sets.difference(best, base)[0] > SWAPPED * whole:
             continue
-        for fitted in _additions(arena, base, candidates, 2)[:1]:
-            if member.tag not in fitted.tags and _better(arena, fitted, best):
+        for fitted in _additions(sets, base, candidates, 2)[:1]:
+            if member.tag not in fitted.tags and _better(sets, fitted, best):
                 return fitted
     return best
 
 
-def of_best_kind(arena: Arena, best: FittedSet, candidates: Sequence[Member]) -> FittedSet:
+def of_best_kind(sets: SetComparison, best: FittedSet, candidates: Sequence[Member]) -> FittedSet:
     """Try other kinds of the effects in a set (a law of growth, a bit)."""
     for member in best.members:
         kinds = {c.kind: c for c in candidates if c.tag == member.tag and c.kind != member.kind}
         for other in list(kinds.values())[:_FITTED]:
             members = tuple(m for m in best.members if m.tag != member.tag)
-            fitted = arena.attempt((*members, other), best.fit.parameters)
+            fitted = sets.attempt((*members, other), best.fit.parameters)
             if fitted is not None and fitted.score > best.score:
                 best = fitted
     return best
 
 
-def _pruned(arena: Arena, best: FittedSet, plain: FittedSet) -> FittedSet:
+def _pruned(sets: SetComparison, best: FittedSet, plain: FittedSet) -> FittedSet:
     """Leave out members that the set does as well without."""
-    whole = arena.difference(best, plain)[0]
+    whole = sets.difference(best, plain)[0]
     for member in reversed(best.members):
         if len(best.members) < 2:
             break
-        without = arena.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
+        without = sets.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
         if without is None:
             continue
-        misfits = arena.gap(best) > _HARDLY * arena.gap(plain)
-        small = misfits and arena.difference(best, without)[0] < _HARDLY * whole
-        if small or not _better(arena, best, without):
+        misfits = sets.gap(best) > _HARDLY * sets.gap(plain)
+        small = misfits and sets.difference(best, without)[0] < _HARDLY * whole
+        if small or not _better(sets, best, without):
             best = without
     return best
 
 
 def find_rivals(
-    arena: Arena, best: FittedSet, member: Member, candidates: Sequence[Member]
+    sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]
 ) -> tuple[FittedSet | None, list[FittedSet]]:
     """Return the set without a member, and sets with another effect in its place, the best first."""
     others = tuple(m for m in best.members if m.tag != member.tag)
-    base = arena.attempt(others, best.fit.parameters)
+    base = sets.attempt(others, best.fit.parameters)
     if base is None:
         return None, []
-    return base, _additions(arena, base, [c for c in candidates if c.tag != member.tag], 2)
+    return base, _additions(sets, base, [c for c in candidates if c.tag != member.tag], 2)

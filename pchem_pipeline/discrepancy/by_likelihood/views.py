@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_likelihood.sets import Arena, saturated
+from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, saturated
 
 __all__ = ["Interval", "doubtful_peaks", "electrons_of", "inside", "valleys"]
 
@@ -56,15 +56,15 @@ def inside(intervals: tuple[Interval, ...], electrons: FloatArray) -> NDArray[np
     return found
 
 
-def doubtful_peaks(arena: Arena, electrons: FloatArray) -> list[Interval]:
+def doubtful_peaks(sets: SetComparison, electrons: FloatArray) -> list[Interval]:
     """Return peaks of few samples, those first without which the plain law fits best.
 
     Args:
-        arena: with all codes.
+        sets: with all codes.
         electrons: place of every code, e-, shape (n, B).
     """
-    total = float(arena.train.sum())
-    cumulative = [float(arena.train[electrons < k + 0.5].sum()) / total for k in range(_last(electrons) + 1)]
+    total = float(sets.train.sum())
+    cumulative = [float(sets.train[electrons < k + 0.5].sum()) / total for k in range(_last(electrons) + 1)]
     ranked: list[tuple[float, Interval]] = []
     for k, below in enumerate(cumulative):
         before = cumulative[k - 1] if k else 0.0
@@ -73,23 +73,23 @@ def doubtful_peaks(arena: Arena, electrons: FloatArray) -> list[Interval]:
             candidates[Interval(k - 0.5, None)] = 1.0 - before
         for interval, share in candidates.items():
             if _LEAST_SHARE < share < _MOST_SHARE:
-                ranked.append((_gap(arena, arena.kept & ~interval.holds(electrons)), interval))
+                ranked.append((_gap(sets, sets.kept & ~interval.holds(electrons)), interval))
     return [interval for _, interval in sorted(ranked, key=lambda pair: pair[0])]
 
 
-def valleys(arena: Arena, electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
+def valleys(sets: SetComparison, electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
     """Return the codes between the peaks; none where peaks are not resolved or little would be left."""
     if sigma_e > _RESOLVED:
         return ()
     found = tuple(Interval(k + _HALF_PEAK, k + 1.0 - _HALF_PEAK) for k in range(-1, _last(electrons) + 1))
-    share = float(arena.train[inside(found, electrons)].sum()) / float(arena.train.sum())
+    share = float(sets.train[inside(found, electrons)].sum()) / float(sets.train.sum())
     return found if share < _MOST_SHARE else ()
 
 
-def _gap(arena: Arena, kept: NDArray[np.bool_]) -> float:
+def _gap(sets: SetComparison, kept: NDArray[np.bool_]) -> float:
     """Return the gap of the plain law among some codes, nats per sample of all."""
-    view = Arena(arena.train, arena.train, arena.origin, kept, arena.present, arena.start)
-    return float(saturated(view.train, kept).sum() - view.fit(()).score) / float(arena.train.sum())
+    view = SetComparison(sets.train, sets.train, sets.origin, kept, sets.present, sets.start)
+    return float(saturated(view.train, kept).sum() - view.fit(()).score) / float(sets.train.sum())
 
 
 def _last(electrons: FloatArray) -> int:

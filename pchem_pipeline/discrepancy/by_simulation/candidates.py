@@ -20,7 +20,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
 
-__all__ = ["REPEATS", "Laboratory", "Mapper", "candidate_classes", "placebo_for", "serial"]
+__all__ = ["REPEATS", "Mapper", "ReplicateSimulator", "candidate_classes", "placebo_for", "serial"]
 
 FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
@@ -89,7 +89,7 @@ def placebo_for(guesses: Sequence[Effect], classes: Mapping[str, type[Effect]]) 
 
 
 @dataclass
-class Laboratory:
+class ReplicateSimulator:
     """Simulates what candidates would do on top of the present model.
 
     Attributes:
@@ -137,7 +137,7 @@ class Laboratory:
         Args:
             effects: with their parameters.
             repeats: simulations of each; what moves a statistic by less than chance does in a single one is
-                lost there, and that is what tells relatives apart.
+                lost there, and that is what separates relatives.
         """
         if not effects:
             return []

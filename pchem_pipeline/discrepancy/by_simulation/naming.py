@@ -2,7 +2,7 @@
 
 Every set of up to three candidates is fitted on one split and scored on the other, both ways round. The
 scores, less a price for every effect, give each set a probability; an effect is named where the sets that
-hold it have nearly all of it, and what could as well stand in its place is named beside it where not.
+hold it have nearly all of it, and what could as well stand in its place is listed with it where not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     tolerance,
 )
 
-__all__ = ["Choice", "Contender", "ScoredSet", "choose", "score_set", "seen_beside"]
+__all__ = ["Choice", "Contender", "ScoredSet", "choose", "score_set", "seen_among"]
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
 _SHORTLIST = 9
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
-_SEEN = 3.5  # standard deviations by which some statistic must ask for an effect beside others
+_SEEN = 3.5  # standard deviations by which some statistic must ask for an effect among others
 _MOVED = 2.0  # standard deviations by which the effect itself must move it
 _BLUR = 2.0  # model errors of the others that are added to chance there
 
@@ -187,7 +187,7 @@ def _rivals(
             if candidate.tag not in new:
                 continue
             if hypothesis.tag in new and candidate.tag != hypothesis.tag:
-                continue  # it comes beside the chosen one, not in its place
+                continue  # it joins the chosen one, it does not replace it
             if candidate.tag in found:
                 old = found[candidate.tag]
                 found[candidate.tag] = Contender(
@@ -204,15 +204,15 @@ def _rivals(
 def _shortlist(
     hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
 ) -> list[Hypothesis]:
-    """Return the hypotheses that do best alone, and those that do best beside the best ones."""
+    """Return the hypotheses that do best alone, and those that do best with the best ones."""
     chosen: list[Hypothesis] = []
 
-    def take(count: int, beside: Sequence[Hypothesis]) -> None:
+    def take(count: int, others: Sequence[Hypothesis]) -> None:
         scored = []
         for hypothesis in hypotheses:
-            if any(hypothesis is h for h in chosen) or hypothesis.tag in {h.tag for h in beside}:
+            if any(hypothesis is h for h in chosen) or hypothesis.tag in {h.tag for h in others}:
                 continue
-            scored.append((score_set([*beside, hypothesis], shifts, noise).score, hypothesis))
+            scored.append((score_set([*others, hypothesis], shifts, noise).score, hypothesis))
         scored.sort(key=lambda pair: pair[0], reverse=True)
         chosen.extend(h for _, h in scored[:count])
 
@@ -231,7 +231,7 @@ def _shortlist(
 
 
 def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:
-    """Tell whether every effect of the set is there by more than its error, and seen beside the others.
+    """Tell whether every effect of the set is there by more than its error, and seen among the others.
 
     Seen means: some statistic deviates, in the direction of the effect, from what the others make of it.
     Where a strong effect moves a statistic, a weak one is not told from the details of the strong one; and
@@ -247,11 +247,11 @@ def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise:
     shift = (shifts[0] + shifts[1]) / 2.0
     both = replace(noise, covariance=noise.covariance / 2.0)
     return len(parts) == 1 or all(
-        seen_beside(part, np.delete(parts, member, axis=0), shift, both) for member, part in enumerate(parts)
+        seen_among(part, np.delete(parts, member, axis=0), shift, both) for member, part in enumerate(parts)
     )
 
 
-def seen_beside(part: FloatArray, others: FloatArray, shift: FloatArray, noise: Noise) -> bool:
+def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: Noise) -> bool:
     """Tell whether a statistic deviates from what other effects make of it, in the direction of an effect.
 
     Args:

@@ -29,7 +29,7 @@ class Acquisition:
         block_frames: frames in a block.
         bit_depth: bits of the ADC.
         integration_time: s.
-        beside: numbers of further frames from which, together with these, the pixels' fits are begun; None:
+        fitted_with: numbers of further frames from which, with these, the pixels' fits are begun; None:
             they are begun at the truth, which is faster, and the same where no pixel's bias can be mistaken.
     """
 
@@ -38,7 +38,7 @@ class Acquisition:
     block_frames: int
     bit_depth: int
     integration_time: float = 1.0
-    beside: NDArray[np.int64] | None = None
+    fitted_with: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class Replicate:
     def evidence(self) -> Evidence:
         """Simulate and observe."""
         taken, start = self.acquisition, self.maps
-        if taken.beside is None:
+        if taken.fitted_with is None:
             frames = simulate_frames(self.maps, self.effects, self.seed, taken)
         else:
-            seen = np.union1d(taken.numbers, taken.beside)
+            seen = np.union1d(taken.numbers, taken.fitted_with)
             frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
             start = fitted_maps(frames, ~self.maps.usable)
             frames = frames[np.isin(seen, taken.numbers)]

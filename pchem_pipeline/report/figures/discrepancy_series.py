@@ -64,7 +64,7 @@ def codes(
     """Draw counts per DN over the sensor and their residuals; even and odd codes differ in colour.
 
     Args:
-        arrays: ``code_dn``, ``code_observed``, ``code_expected``; ``code_grown`` where
+        arrays: ``code_dn``, ``code_observed``, ``code_expected``; ``code_extended`` where
             effects were named.
         marked: places whose interval of DN is shaded.
         width_mm: width of the figure.
@@ -81,8 +81,8 @@ def codes(
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
     top.stairs(observed, edges, fill=True, color=GRAY, label="observed")
     top.stairs(expected, edges, color=BLACK, linewidth=0.9, label="expected from the fitted PCDs")
-    if "code_grown" in arrays:
-        grown = np.asarray(arrays["code_grown"], dtype=np.float64)[first : first + dn.size]
+    if "code_extended" in arrays:
+        grown = np.asarray(arrays["code_extended"], dtype=np.float64)[first : first + dn.size]
         top.stairs(grown, edges, color=VERMILION, linewidth=0.9, label="with the named effects")
     top.set_yscale("log")
     top.set_ylim(0.5, (4.0 if width_mm > 1.5 * COLUMN_MM else 200.0) * max(observed.max(), 1.0))

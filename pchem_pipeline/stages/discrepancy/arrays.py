@@ -39,18 +39,18 @@ def evidence_arrays(
     effects: Sequence[Effect] = (),
     integration_time: float = 1.0,
     bit_depth: int = 16,
-    code_grown: FloatArray | None = None,
+    code_extended: FloatArray | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of group ``discrepancy``, by their names without the group.
 
     Args:
         evidence: what the frames show beyond the PCD.
         before: the statistics standardised by replicates of the plain model; None for ``evidence.z``.
-        after: the same for the grown model; None where nothing was added.
+        after: the same for the model with effects; None where nothing was added.
         effects: the named effects; those whose path does not depend on chance are drawn over the frames.
         integration_time: s, as the effects are given it.
         bit_depth: bits of the ADC, as the effects are given it.
-        code_grown: samples expected at each code from the grown model; None where nothing was added.
+        code_extended: samples expected at each code with the added effects; None where nothing was added.
 
     Returns:
         Ready for ``RunStore.write_array(f"discrepancy/{name}", ...)``; what the evidence lacks (everything
@@ -67,8 +67,8 @@ def evidence_arrays(
     }
     if all(name in evidence.scores for name in SCORES):
         found["score"] = np.stack([_single(evidence.scores[name]) for name in SCORES])
-    if code_grown is not None:
-        found["code_grown"] = np.asarray(code_grown, dtype=np.float64)
+    if code_extended is not None:
+        found["code_extended"] = np.asarray(code_extended, dtype=np.float64)
     if after is not None:
         found["z_after"] = _vector(after)
     if evidence.time is not None:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.config.grow import with_model_effects
 from pchem_pipeline.config.load import dump_config
-from pchem_pipeline.discrepancy.by_likelihood.workflow import find_in_histograms
+from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
+from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
-from pchem_pipeline.discrepancy.by_simulation.workflow import find_discrepancies
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
@@ -205,7 +205,7 @@ def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) 
         [e for e in found.model if e.tag in found.verdict.effects],
         context.integration_time or 1.0,
         context.config.input.bit_depth or context.sensor.bit_depth or 16,
-        found.code_grown,
+        found.code_extended,
     )
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)

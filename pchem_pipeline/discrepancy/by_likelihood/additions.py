@@ -1,0 +1,228 @@
+"""The effects that the likelihood of histograms added: each with its gap and its rivals, and what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_over
+from pchem_pipeline.discrepancy.by_likelihood.members import Member
+from pchem_pipeline.discrepancy.by_likelihood.residuals import find_residuals, set_aside_residual
+from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_likelihood.views import electrons_of
+from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
+
+__all__ = ["AddedSets"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
+
+
+@dataclass
+class AddedSets:
+    """Fits the models of the steps to train and test together, and measures their gaps on the final part.
+
+    Attributes:
+        parts: train, test and final histograms, shape (n, B) each.
+        found: what the search came to.
+        plain: the fit without effects to train and test.
+        replicates: behind expectation and floor of a gap.
+        rng: their random numbers.
+    """
+
+    parts: tuple[IntArray, ...]
+    found: Explanation
+    plain: FittedSet
+    replicates: int
+    rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        """Prepare the gap: codes that are set aside keep what they have under the plain model."""
+        kept = self.found.kept
+        carried = 0.0 if kept.all() else carried_over(self.plain.log_masses, self.parts[2], kept)
+        old = self.found.sets
+        self.both = self.parts[0] + self.parts[1]
+        self.sets = SetComparison(self.both, old.test, old.origin, kept, old.present, old.start)
+        self.gaps = LikelihoodGap(self.parts[2], kept, carried, self.replicates, self.rng)
+
+    def close(
+        self, before: Gap, nulls: tuple[NullModel, NullModel], z: FloatArray, still: bool
+    ) -> tuple[Added, FittedSet]:
+        """Return the added effects and what is left, and the fit with all of them.
+
+        Args:
+            before: gap without effects.
+            nulls: of the model without and with all effects.
+            z: statistics of the final part.
+            still: whether the data disagree with the final model.
+        """
+        pulls = [null.pulls(z) for null in nulls]
+        told = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
+        gap, fitted = before, self.plain
+        additions: list[Addition] = []
+        members: tuple[Member, ...] = ()
+        for named in self.found.named:
+            members = (*members, named.member)
+            extended = self._refit(members)
+            after = self.gaps.gap(self.sets.problem(members), extended.fit)
+            addition = self._addition(named, members, (gap, after), (fitted, extended))
+            additions.append(replace(addition, pulls=told))
+            gap, fitted = after, extended
+        fits = self.found.rest <= LARGEST_REST or gap.at_floor
+        added = Added(
+            additions=tuple(replace(each, fits=fits) for each in additions),
+            after=gap,
+            nearest=self.found.nearest,
+            stand_ins=tuple(m.tag for m in self.found.unsteady),
+            residuals=self.residuals(fitted) if still or not gap.at_floor else (),
+            set_aside=tuple((i.low, i.high) for i in self.found.set_aside),
+        )
+        return added, fitted
+
+    def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
+        """Return the codes that the model does not account for, a peak that was set aside first."""
+        counts, kept = self.both.astype(np.float64), self.found.kept
+        expected = self._expected(fitted)
+        parameters = fitted.fit.parameters
+        electrons = electrons_of(self.sets.origin, counts.shape[1], parameters)
+        found = find_residuals(
+            np.where(kept, counts, 0.0), np.where(kept, expected, 0.0), electrons, parameters
+        )
+        peak = self.found.peak
+        if peak is not None:
+            total = self.gaps.gap(self.sets.problem(fitted.members), fitted.fit).value * self.gaps.n_samples
+            aside = set_aside_residual(
+                peak.low,
+                peak.high,
+                float(np.where(kept, 0.0, counts).sum()),
+                float(np.where(kept, 0.0, expected).sum()),
+                parameters,
+                self.gaps.carried / max(total, 1e-12),
+            )
+            found.insert(0, aside)
+        return tuple(found)
+
+    def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
+        """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
+        code = evidence.code
+        expected, origin = self._expected(fitted), self.sets.origin
+        if evidence.maps.usable.sum() != expected.shape[0]:
+            return None
+        found = np.zeros(code.observed.size)
+        for row, first in zip(expected, origin - code.first, strict=True):
+            at = first + np.arange(row.size)
+            within = (at >= 0) & (at < found.size)
+            np.add.at(found, at[within], row[within])
+        return np.asarray(found * code.observed.sum() / max(float(self.both.sum()), 1.0))
+
+    def _expected(self, fitted: FittedSet) -> FloatArray:
+        """Return the samples of train and test expected at each code given those in codes that are kept."""
+        counts, kept = self.both.astype(np.float64), self.found.kept
+        mass = self.sets.problem(fitted.members).masses(fitted.fit.theta, fitted.fit.shared)
+        inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
+        return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))
+
+    def _refit(self, members: Sequence[Member]) -> FittedSet:
+        return self.sets.fit(members, self.found.best.fit.parameters)
+
+    def _addition(
+        self,
+        named: Named,
+        members: tuple[Member, ...],
+        gaps: tuple[Gap, Gap],
+        fits: tuple[FittedSet, FittedSet],
+    ) -> Addition:
+        """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
+        extended = fits[1]
+        member = next(m for m in extended.members if m.tag == named.member.tag)
+        candidates = self._candidates(named, member.effect)
+        if named.equals:
+            candidates = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
+        chance = self.gaps.chance(self.sets.problem(extended.members), extended.fit)
+        return Addition(
+            effect=member.effect,
+            alone=not named.equals,
+            fits=True,
+            candidates=candidates,
+            strength_stderr=_stderr(extended, member, named.apart),
+            before=gaps[0],
+            after=gaps[1],
+            runner_up=self._in_place(named, members, chance, relatives=True),
+            placebo=self._in_place(named, members, chance, relatives=False),
+            pulls=(),
+            moved=_moved(*fits),
+        )
+
+    def _candidates(self, named: Named, effect: Effect) -> tuple[Candidate, ...]:
+        """Return the effect and what could stand in its place, with held-out scores."""
+        judged = self.found.judged
+        scored = [(effect, 0.0, 0.0)]
+        for rival in named.rivals:
+            rise, error = self.found.sets.difference(rival, judged)
+            other = next((m.effect for m in rival.members if m.tag not in judged.tags), None)
+            if other is not None:
+                scored.append((other, rise, error))
+        weights = np.exp([min(score, 0.0) for _, score, _ in scored])
+        weights /= weights.sum()
+        return tuple(
+            Candidate.of(e, score, error, float(w))
+            for (e, score, error), w in zip(scored, weights, strict=True)
+        )
+
+    def _in_place(
+        self, named: Named, members: tuple[Member, ...], chance: float, *, relatives: bool
+    ) -> Rival | None:
+        """Return a rival (a relative of the effect, or one that has nothing to do with it) and its gap."""
+        kin = set(type(named.member.effect).separate)
+        for rival in named.rivals:
+            other = next((m for m in rival.members if m.tag not in self.found.judged.tags), None)
+            if other is None or (other.tag in kin) != relatives:
+                continue
+            others = tuple(m for m in members if m.tag != named.member.tag)
+            if any(other.excludes(m) for m in others):
+                continue
+            try:
+                fitted = self._refit((*others, other))
+            except ValueError:
+                continue
+            gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
+            return Rival(effect=other.tag, gap_after=gap)
+        return None
+
+
+def _stderr(extended: FittedSet, member: Member, apart: float) -> float:
+    """Return the standard error of a strength: of the fit, and what the choice of the codes makes of it."""
+    if not member.effect.strength:
+        return float("nan")
+    value, error = (float(v[0]) for v in extended.coordinates(member.tag))
+    return float(np.hypot(member.coordinates[0].error(value, error), apart))
+
+
+def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
+    """Return how far the parameters of the pixels moved: median, and in standard errors."""
+    change = after.fit.parameters - before.fit.parameters
+    h, g, _, sigma = after.fit.parameters.T
+    slopes = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(after.fit.theta[:, 3]) / sigma], axis=1)
+    error = np.sqrt(np.maximum(np.einsum("naa->na", after.fit.own_covariance), 0.0)) * np.abs(slopes)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(error > 0, change / error, np.nan)
+    return {
+        name: {
+            "median": float(np.median(change[:, i])),
+            "in_stderr": float(np.nanmedian(ratio[:, i])),
+            "unit": unit,
+        }
+        for i, (name, unit) in enumerate(_UNITS.items())
+    }

@@ -1,0 +1,116 @@
+"""The way of a search for missing effects: split, null, gap, disagree, explain, add, close, verdict.
+
+It is the same for frames and for ready-made histograms; what differs is how effects are told apart. With
+frames, effects are simulated and compared by what they do to many statistics (:mod:`.by_simulation`); with
+histograms they enter the exact likelihood (:mod:`.by_likelihood`). Each way is an :class:`Explainer`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
+from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
+from pchem_pipeline.discrepancy.where import locate
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
+
+__all__ = ["Explainer", "search"]
+
+Explanation = TypeVar("Explanation")
+
+
+class Explainer(Protocol[Explanation]):
+    """A way to tell effects apart in one kind of data; it keeps the model and the rounds of the search.
+
+    Attributes:
+        settings: the section ``discrepancy``.
+        samples: what the data are, for the verdict's sentence ("frames", "histograms").
+        most_rounds: of explaining and adding.
+        model: effects; those that were there before, and those added since.
+        left_out: candidates that failed, and why.
+        untestable: effects that such data cannot show, and why.
+        n_replicates: drawn so far.
+    """
+
+    settings: DiscrepancySettings
+    samples: str
+    most_rounds: int
+    model: tuple[Effect, ...]
+    left_out: dict[str, str]
+    untestable: dict[str, str]
+    n_replicates: int
+
+    def split(self) -> tuple[Evidence, Examined]:
+        """Split the samples into train, test and final part; return the evidence of the train part."""
+        ...
+
+    def null(self) -> tuple[NullModel, Measured]:
+        """Draw replicates of the model; return their statistics, and those of the data."""
+        ...
+
+    def gap(self, null: NullModel, z: Measured) -> Gap:
+        """Measure the gap of the model on the final part."""
+        ...
+
+    def suspects(self, null: NullModel, z: Measured) -> bool:
+        """Tell whether candidates are worth asking although no statistic deviates beyond chance."""
+        ...
+
+    def explain(self, null: NullModel, z: Measured, disagrees: bool) -> Explanation | None:
+        """Compare the candidates on train and test part; None where none explains anything."""
+        ...
+
+    def add(self, explanation: Explanation, null: NullModel, z: Measured) -> NullModel | None:
+        """Put effects into the model and draw replicates of it; None where no effect is established."""
+        ...
+
+    def tolerance(self) -> NDArray[np.float64] | float:
+        """Return the deviations that are not held against the added effects, shape (m,)."""
+        ...
+
+    def close(self, before: Gap, null: NullModel, z: Measured, disagrees: bool) -> Added:
+        """Measure the gap on the final part with each added effect, and with rivals in its place."""
+        ...
+
+    def fitted(self, model: tuple[Effect, ...]) -> Fitted:
+        """Return the parameters of the pixels under the model that the verdict leaves."""
+        ...
+
+
+def search(by: Explainer[Explanation]) -> Discrepancy:
+    """Find where data disagree with the fitted model, name the effects, and add them to the model."""
+    significance = by.settings.significance
+    present = by.model
+    evidence, examined = by.split()
+    first, z = by.null()
+    before = by.gap(first, z)
+    places = locate(evidence, first, z.both, significance)
+    null, rounds = first, 0
+    still = disagrees(null, z, significance)
+    wanted = still or by.suspects(null, z)
+    while wanted and rounds < by.most_rounds:
+        explanation = by.explain(null, z, still)
+        extended = None if explanation is None else by.add(explanation, null, z)
+        if extended is None:
+            break
+        null, rounds = extended, rounds + 1
+        wanted = still = disagrees(null, z, significance, by.tolerance())
+    added = by.close(before, null, z, still)
+    found = Findings(by.samples, z, first, null, before, places, still, added)
+    model = found.model(present, by.model)
+    return build_verdict(
+        found,
+        model,
+        by.fitted(model),
+        (evidence, examined),
+        untestable=by.untestable,
+        left_out=by.left_out,
+        n_replicates=by.n_replicates,
+    )
