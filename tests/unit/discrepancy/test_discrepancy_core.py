@@ -7,12 +7,11 @@ import pytest
 from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_simulation.disagreement import contradicted
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
 from pchem_pipeline.discrepancy.by_simulation.naming import choose, score_set
-from pchem_pipeline.discrepancy.by_simulation.null import NullModel, look_elsewhere
-from pchem_pipeline.discrepancy.by_simulation.refit import expected_codes
-from pchem_pipeline.discrepancy.gap import GapMetric
+from pchem_pipeline.discrepancy.gap import StatisticsGap
+from pchem_pipeline.discrepancy.null import NullModel, contradicted, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -191,7 +190,7 @@ def test_gap_is_the_divergence_and_does_not_grow_with_the_samples() -> None:
         null = _null(rng, b=200)
         shift = np.zeros(40)
         shift[:3] = 0.05 * np.sqrt(n)
-        metric = GapMetric(null, n)
+        metric = StatisticsGap(null, n)
         gaps = [
             metric.gap(0.3 + shift + rng.normal(size=40), null.mean, null.replicates).value for _ in range(60)
         ]
@@ -206,7 +205,7 @@ def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
     below = []
     for _ in range(100):
         null = _null(rng)
-        gap = GapMetric(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
+        gap = StatisticsGap(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
         below.append(gap.at_floor)
     assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
 

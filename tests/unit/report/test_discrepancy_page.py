@@ -239,7 +239,7 @@ def test_the_arrays_are_those_of_the_registry() -> None:
     seen = evidence()
     z_after = dict.fromkeys(seen.z, 0.0)
     drift = effect_class("exposure_drift")(drift=0.02)
-    arrays = evidence_arrays(seen, after=z_after, effects=[drift], code_grown=seen.code.expected)
+    arrays = evidence_arrays(seen, after=z_after, effects=[drift], code_extended=seen.code.expected)
     # what is added to single pixels is not in the evidence
     known = {v.name: v for v in variables_of("discrepancy") if not v.name.startswith("added_")}
     assert set(arrays) == set(known)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.equivalent_sensor import likely_truth
+from pchem_pipeline.discrepancy.by_simulation.maps import equivalent_sensor
 from pchem_pipeline.discrepancy.by_simulation.replicate import (
     Acquisition,
     Replicate,
@@ -50,7 +50,7 @@ def test_scatter_is_that_of_the_truth(size):
     spread = np.array([0.3, 0.02, 0.5, 0.03])
     _, truth = sensor(rng, spread)
     maps, covariance = fitted(rng, truth, size)
-    drawn = likely_truth(maps, covariance)
+    drawn = equivalent_sensor(maps, covariance)
     before, after = np.cov(logs(maps)), np.cov(logs(drawn))
     # the variance of C = T + E scatters by sqrt(2/n) of itself, and E is taken off
     limit = 5 * np.sqrt(2 / N) * np.diag(before)
@@ -70,12 +70,12 @@ def test_sharp_maps_outliers_and_unknown_errors_stay():
     rng = np.random.default_rng(4)
     _, truth = sensor(rng, np.array([0.3, 0.02, 0.5, 0.03]))
     maps, covariance = fitted(rng, truth, 0.01)
-    drawn = likely_truth(maps, covariance)
+    drawn = equivalent_sensor(maps, covariance)
     assert np.abs(logs(drawn) - logs(maps)).max() < 1e-3
     maps, covariance = fitted(rng, truth, 1.0)
     maps.quanta_exposure[0, 0] = 80.0
     covariance[1, 1] = np.nan
-    drawn = likely_truth(maps, covariance)
+    drawn = equivalent_sensor(maps, covariance)
     for place in ((0, 0), (1, 1)):
         assert drawn.bias[place] == pytest.approx(maps.bias[place], rel=1e-12)
         assert drawn.quanta_exposure[place] == pytest.approx(maps.quanta_exposure[place], rel=1e-12)
@@ -85,7 +85,7 @@ def test_sharp_maps_outliers_and_unknown_errors_stay():
             for n in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "usable")
         )
     )
-    assert likely_truth(few, covariance[:5, :5]) is few
+    assert equivalent_sensor(few, covariance[:5, :5]) is few
 
 
 def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
@@ -96,7 +96,7 @@ def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
     maps = PixelMaps(2.7 * ones, ones / 11, 100 + rng.standard_normal(shape), 0.41 * 11 * ones, ones > 0)
     numbers = np.arange(600)
     known = Acquisition(numbers, 1200, 50, 12)
-    anew = Acquisition(numbers, 1200, 50, 12, beside=np.arange(600, 1200))
+    anew = Acquisition(numbers, 1200, 50, 12, fitted_with=np.arange(600, 1200))
     truth = truth_of(maps).bias
 
     def mistaken(taken, seed):
@@ -108,6 +108,6 @@ def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
     assert first > 0.03
     # two binomial shares
     assert abs(first - second) < 5 * np.sqrt(2 * first * (1 - first) / maps.usable.sum())
-    # the frames of a split do not depend on what is simulated beside them
+    # the frames of a split do not depend on what else is simulated
     both = simulate_frames(maps, (), 1, Acquisition(np.arange(1200), 1200, 50, 12))
     assert (simulate_frames(maps, (), 1, known) == both[:600]).all()
