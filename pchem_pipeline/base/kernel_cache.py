@@ -17,6 +17,7 @@ import pickle
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from filelock import FileLock
 
-__all__ = ["KernelCache", "cache_folder", "source_state", "values_of_closure"]
+__all__ = ["KernelCache", "cache_folder", "listening", "source_state", "values_of_closure"]
+
+#: Called with the name of a kernel that is missing and None, then with the seconds that it took to have it.
+Listener = Callable[[str, float | None], None]
+_listeners: list[Listener] = []
+
 
 _PATIENCE = 300  # seconds that another process may take for one kernel
 _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.MULTILINE)
@@ -87,6 +93,16 @@ def _imports(name: str, source: str) -> Iterator[str]:
         yield from (f"{base}.{word}" for word in re.findall(r"\w+", names))
 
 
+@contextlib.contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Tell somebody of each kernel that has to be compiled, here or by another process."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
 def values_of_closure(function: Callable[..., Any]) -> tuple[str, ...]:
     """Return in words what a function made by another function was given: numbers, text, kernels."""
     values = [cell.cell_contents for cell in function.__closure__ or ()]
@@ -106,6 +122,7 @@ class KernelCache:
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
         self._locks: dict[Path, FileLock] = {}
+        self._begun = 0.0
 
     @property
     def cache_path(self) -> str:
@@ -120,11 +137,20 @@ class KernelCache:
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         found = self._read(path, target_context)
-        if found is None and self._lock(path):
+        if found is not None:
+            return found
+        self._begun = time.monotonic()
+        self._tell(None)
+        if self._lock(path):
             found = self._read(path, target_context)
             if found is not None:
                 self._unlock(path)
+                self._tell(time.monotonic() - self._begun)
         return found
+
+    def _tell(self, seconds: float | None) -> None:
+        for listener in _listeners:
+            listener(self._function.__name__, seconds)
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep what was compiled, whole or not at all, and let others have it."""
@@ -139,6 +165,7 @@ class KernelCache:
                 _write(path, dumps(result._reduce()))
         finally:
             self._unlock(path)
+            self._tell(time.monotonic() - self._begun)
 
     def _path(self, signature: Any, codegen: Any) -> Path:
         import llvmlite

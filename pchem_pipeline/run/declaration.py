@@ -62,6 +62,8 @@ class Stage:
         plan: ``"module:function"`` that takes (configuration, folder, stages to be done) and returns lines
             which say what the stage will take.
         status_words: array of status words that it writes; too many failed pixels end a command in an error.
+        compiled_ahead: compile its kernels in a second process while the stages before it run; it works on
+            ready-made histograms.
     """
 
     name: str
@@ -79,3 +81,4 @@ class Stage:
     single_pass: SinglePass | None = None
     plan: str | None = None
     status_words: str | None = None
+    compiled_ahead: bool = False

@@ -11,6 +11,7 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.run.compilation import announced, compiled_ahead
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.progress import ProgressMode, Reporter
@@ -86,7 +87,8 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     """
     if command.options.dry_run:
         return _dry_run(target, stages, command)
-    with working_run(target, command) as context:
+    ahead = [name for name in stages if STAGES[name].compiled_ahead]
+    with working_run(target, command) as context, compiled_ahead(context.config, ahead):
         states = [_execute(name, context, stages) for name in stages]
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
@@ -100,9 +102,10 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
 def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageState:
     """Bring a stage up to date; with those after it, where one pass does the work of all."""
     single_pass = STAGES[name].single_pass
-    if single_pass is not None and set(single_pass.stages) <= set(stages):
-        imported(single_pass.run)(context)
-    return execute(name, context)
+    with announced(context.reporter, name):
+        if single_pass is not None and set(single_pass.stages) <= set(stages):
+            imported(single_pass.run)(context)
+        return execute(name, context)
 
 
 @contextlib.contextmanager

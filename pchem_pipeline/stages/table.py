@@ -95,6 +95,7 @@ _ALL = (
         run=f"{_HERE}.fit.fit:run",
         identity=f"{_HERE}.identities:fit_inputs",
         summary="Fit H, g, mu and sigma of every pixel by PCH-EM.",
+        compiled_ahead=True,
         status_words="fit/fit_status",
     ),
     Stage(
@@ -117,6 +118,7 @@ _ALL = (
         writes=("ensemble", "ensemble_tiles"),
         run=f"{_HERE}.ensemble.ensemble:run",
         summary="Predict the ensemble from the maps; compare with the data.",
+        compiled_ahead=True,
     ),
     Stage(
         "report",

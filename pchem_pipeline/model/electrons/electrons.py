@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.electrons import electrons_numba
+from pchem_pipeline.model.fit.start import kernel_counts
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters, usable_pixels
 
 __all__ = [
@@ -146,7 +147,7 @@ def electron_counts(
     """
     out = np.zeros(n_k, dtype=np.int64)
     beyond = electrons_numba.tally_electrons(
-        counts, np.asarray(origin, dtype=np.int64), *pixels.columns(), out
+        kernel_counts(counts), np.asarray(origin, dtype=np.int64), *pixels.columns(), out
     )
     return out, int(beyond)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.errors import information_numba
+from pchem_pipeline.model.fit.start import kernel_counts
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
 __all__ = [
@@ -240,7 +241,7 @@ def tally(
     bins = np.zeros(nuced.size, dtype=np.int64)
     sums = np.zeros((len(pixels), 2))
     outside, nuced_outside = ensemble_numba.tally_counts(
-        counts,
+        kernel_counts(counts),
         np.asarray(origin, dtype=np.int64),
         pixels.conversion_gain,
         pixels.bias,

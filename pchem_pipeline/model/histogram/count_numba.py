@@ -46,14 +46,17 @@ def update_extremes(frames: _Array, low: _Array, high: _Array) -> None:
     moved = np.empty(nx, frames.dtype)
     for t in range(n_frames):
         for y in range(ny):
-            moved[:] = frames[t, y]
+            row = frames[t, y]
+            for x in range(nx):
+                moved[x] = row[x]
             for j in range(low.shape[0]):
                 kept = low[j, y]
                 for x in range(nx):
                     smaller, larger = min(kept[x], moved[x]), max(kept[x], moved[x])
                     kept[x] = smaller
                     moved[x] = larger
-            moved[:] = frames[t, y]
+            for x in range(nx):
+                moved[x] = row[x]
             for j in range(high.shape[0]):
                 kept = high[j, y]
                 for x in range(nx):
@@ -89,11 +92,13 @@ def shift_counts(counts: _Array, shift: int) -> None:
     if shift > 0:
         for k in range(bins - shift):
             counts[k] = counts[k + shift]
-        counts[max(0, bins - shift) :] = 0
+        for k in range(max(0, bins - shift), bins):
+            counts[k] = 0
     elif shift < 0:
         for k in range(bins - 1, -shift - 1, -1):
             counts[k] = counts[k + shift]
-        counts[: min(bins, -shift)] = 0
+        for k in range(min(bins, -shift)):
+            counts[k] = 0
 
 
 @kernel
@@ -103,9 +108,28 @@ def _centred(low: int, high: int, bins: int) -> int:
 
 
 @kernel
+def _sort(values: _Array) -> None:
+    """Sort values in place, by Shell's method: numpy's sort takes a second to compile."""
+    gap = 1
+    while gap < values.size // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, values.size):
+            value, j = values[i], i
+            while j >= gap and values[j - gap] > value:
+                values[j] = values[j - gap]
+                j -= gap
+            values[j] = value
+        gap //= 3
+
+
+@kernel
 def densest_origin(values: _Array, bins: int) -> int:
     """Return the origin of a window of ``bins`` DN that holds most of the values, these in its middle."""
-    ordered = np.sort(values)
+    ordered = np.empty(values.size, values.dtype)
+    for i in range(values.size):
+        ordered[i] = values[i]
+    _sort(ordered)
     best, best_start, best_end = 0, 0, 0
     end = 0
     for start in range(ordered.size):

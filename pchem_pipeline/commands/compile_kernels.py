@@ -1,0 +1,75 @@
+"""Compile the kernels that a run will need: the same stages on a few invented pixels, in a folder of its own.
+
+:mod:`pchem_pipeline.run.compilation` starts this in a process of its own, with the configuration on its
+standard input. What is compiled is what the stages call: there is no list of kernels to keep up to date.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.config.load import make_config
+from pchem_pipeline.run.compilation import mark_path
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.stages.table import STAGES
+
+__all__ = ["compile_kernels"]
+
+
+def compile_kernels(content: Mapping[str, Any], stages: Sequence[str]) -> None:
+    """Run stages, and those that they need, on invented histograms; then mark their kernels as compiled.
+
+    Args:
+        content: the configuration of a run, whose input, store and workers are not used.
+        stages: names of stages that work on ready-made histograms.
+    """
+    config = make_config(content, "the run")
+    with tempfile.TemporaryDirectory(prefix="pchem-kernels-") as place:
+        folder = Path(place)
+        np.savez(folder / "invented.npz", **_histograms(config.input.bit_depth or 16))
+        small = make_config(
+            {
+                **content,
+                "simulate": None,
+                "run": {"store": str(folder / "run.zarr")},
+                "input": {"files": ["invented.npz"], "bit_depth": config.input.bit_depth},
+                "compute": {"backend": "serial", "workers": 1},
+            },
+            "the invented run",
+        )
+        target = Target(small, folder, folder / "run.zarr")
+        run_stages(target, _with_upstream(stages), Command(progress="off", quiet=True))
+    mark_path(config, stages).touch()
+
+
+def _with_upstream(stages: Sequence[str]) -> list[str]:
+    """Return stages and all that they need, in order."""
+    wanted = set(stages)
+    for name in reversed(STAGES):
+        if name in wanted:
+            wanted |= set(STAGES[name].upstream)
+    return [name for name in STAGES if name in wanted]
+
+
+def _histograms(bit_depth: int) -> dict[str, Any]:
+    """Draw histograms of pixels of many exposures and read noises: ``dn`` (bin,), ``counts`` (pixel, bin)."""
+    rng = np.random.default_rng(1)
+    exposure, noise = np.meshgrid([0.3, 2.0, 6.0], [0.2, 0.3, 0.6])
+    dn_per_electron = min(8.0, 2.0**bit_depth / 64)
+    electrons = rng.poisson(exposure.ravel(), (1000, 9)) + noise.ravel() * rng.standard_normal((1000, 9))
+    dn = np.clip(np.rint(dn_per_electron * (electrons + 4)).astype(int), 0, 2**bit_depth - 1)
+    counts = np.array([np.bincount(pixel, minlength=dn.max() + 1) for pixel in dn.T])
+    return {"dn": np.arange(counts.shape[1]), "counts": counts}
+
+
+if __name__ == "__main__":
+    given = json.load(sys.stdin)
+    compile_kernels(given["config"], given["stages"])

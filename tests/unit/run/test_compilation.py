@@ -1,0 +1,118 @@
+"""The second process that compiles kernels: when it is started, that it ends, and that it misses nothing."""
+
+import gc
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.base import kernel_cache
+from pchem_pipeline.base.kernel import _Kernel
+from pchem_pipeline.commands.compile_kernels import compile_kernels
+from pchem_pipeline.config.load import make_config
+from pchem_pipeline.run import compilation
+from pchem_pipeline.run.compilation import announced, compiled_ahead, mark_path
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import Target
+
+CONFIG = {"input": {"files": ["frames.npy"], "bit_depth": 14}, "compute": {"workers": 2}}
+
+
+@pytest.fixture
+def sleeper(tmp_path, monkeypatch):
+    """A module that takes the place of the one that compiles: it says that it began, and sleeps."""
+    (tmp_path / "sleeper.py").write_text(
+        "import json, pathlib, sys, time\n"
+        "pathlib.Path(__file__).with_name('begun').write_text(json.load(sys.stdin)['stages'][0])\n"
+        "time.sleep(200)\n"
+    )
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr(compilation, "_MODULE", "sleeper")
+    monkeypatch.setattr(compilation, "available_workers", lambda: 2)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    kernel_cache.cache_folder.cache_clear()
+    yield tmp_path / "begun"
+    kernel_cache.cache_folder.cache_clear()
+
+
+def started(monkeypatch, config, stages):
+    """Enter and leave the block; return the processes that were started, all of which have ended."""
+    processes = []
+    start = compilation._start
+    monkeypatch.setattr(
+        compilation, "_start", lambda request: processes.append(start(request)) or processes[-1]
+    )
+    with compiled_ahead(config, stages):
+        assert all(process.poll() is None for process in processes)
+    assert all(process.poll() is not None for process in processes)
+    return processes
+
+
+def test_a_process_compiles_while_the_block_runs_and_ends_with_it(sleeper, monkeypatch):
+    config = make_config(CONFIG, "test")
+    with compiled_ahead(config, ["fit"]):
+        for _ in range(600):
+            if sleeper.exists() and sleeper.read_text() == "fit":
+                break
+            time.sleep(0.05)
+        assert sleeper.read_text() == "fit"
+    assert len(started(monkeypatch, config, ["fit"])) == 1
+
+
+def test_nothing_is_started_where_it_would_not_help(sleeper, monkeypatch):
+    config = make_config(CONFIG, "test")
+    assert started(monkeypatch, config, []) == []
+    assert started(monkeypatch, make_config({**CONFIG, "compute": {"workers": 1}}, "test"), ["fit"]) == []
+    mark = mark_path(config, ["fit"])
+    other = make_config({**CONFIG, "fit": {"likelihood": "exact"}}, "test")
+    assert len({mark, mark_path(config, ["ensemble"]), mark_path(other, ["fit"])}) == 3
+    assert mark_path(make_config({**CONFIG, "run": {"tile": 8}}, "test"), ["fit"]) == mark
+    mark.parent.mkdir()
+    mark.touch()
+    assert started(monkeypatch, config, ["fit"]) == []
+
+
+def test_a_process_that_cannot_be_started_stops_nothing(sleeper, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    with compiled_ahead(make_config(CONFIG, "test"), ["fit"]):
+        pass
+
+
+def test_the_terminal_says_what_is_compiled(capsys):
+    with announced(Reporter("off"), "fit"):
+        pass
+    assert capsys.readouterr().err == ""
+    with announced(Reporter("off"), "fit"):
+        for listener in kernel_cache._listeners:
+            for kernel, seconds in (("one", None), ("one", 1.5), ("two", None), ("two", 2.5)):
+                listener(kernel, seconds)
+    assert capsys.readouterr().err.splitlines() == [
+        "fit: compiling kernels, once after an installation or a change of them",
+        "fit: 2 kernels compiled in 4 s",
+    ]
+
+
+def variants():
+    """Return the name and the types of every compiled variant of a kernel that Python calls."""
+    kernels = [each for each in gc.get_objects() if isinstance(each, _Kernel)]
+    return {(each.py_func.__module__, each.__name__, key) for each in kernels for key in each.overloads}
+
+
+def test_what_is_compiled_ahead_is_what_a_run_calls(tmp_path):
+    rng = np.random.default_rng(2)
+    frames = np.rint(100 + 12 * (rng.poisson(2.0, (700, 12, 9)) + 0.25 * rng.standard_normal((700, 12, 9))))
+    np.save(tmp_path / "frames.npy", frames.astype(np.uint16))
+    config = make_config({**CONFIG, "compute": {"backend": "serial", "workers": 1}}, "test")
+    stages = ["fit", "ensemble"]
+    compile_kernels(config.model_dump(mode="json", by_alias=True), stages)
+    assert mark_path(config, stages).exists()
+    ahead = variants()
+    target = Target(config, tmp_path, tmp_path / "run.zarr")
+    everything = ["ingest", "histogram", "fit", "maps", "ensemble"]
+    run_stages(target, everything, Command(progress="off", quiet=True))
+    missed = {(module, name) for module, name, _ in variants() - ahead}
+    assert {module.rpartition(".")[2] for module, _ in missed} <= {"count_numba", "summaries_numba"}
+    assert Path(tmp_path / "run.zarr").exists()
