@@ -10,13 +10,9 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.compute.executor import Outcome
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.discrepancy_exhibits import discrepancy_exhibits
-from pchem_pipeline.report.figures.exhibits import Exhibit, exhibits
-from pchem_pipeline.report.figures.figure_data import figure_tables
-from pchem_pipeline.report.figures.method_exhibits import method_exhibits
+from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
-from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import run_status
@@ -26,7 +22,7 @@ from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Wanted", "exhibits_of", "figures_of_run", "gather_run", "millimetres", "warn_if_old"]
+__all__ = ["Wanted", "figures_of_run", "gather_run", "millimetres", "warn_if_old"]
 
 #: Narrowest and widest figure, mm.
 _WIDTHS = (40.0, 400.0)
@@ -84,12 +80,6 @@ def gather_run(target: Target) -> ReportData:
     return gather(store, target.config, time, [])
 
 
-def exhibits_of(data: ReportData, settings: ReportSettings) -> list[Exhibit]:
-    """Return the figures of the report and of the discrepancy page."""
-    others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
-    return [*exhibits(data, settings), *method_exhibits(data), *plan_exhibits(data), *others]
-
-
 def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
     """Write the figures of a run and their numbers.
 
@@ -118,19 +108,19 @@ def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
     settings = target.config.report
     kinds = tuple(dict.fromkeys(wanted.formats))
     jobs = [
-        PaperFigure(each, figure_tables(each, data, settings), kinds, width, wanted.dpi, sheet)
-        for each in _chosen(exhibits_of(data, settings), wanted.only)
+        PaperFigure(each, kinds, width, wanted.dpi, sheet)
+        for each in _chosen(run_figures(data, settings), wanted.only)
     ]
     workers = drawing_workers(wanted.workers, target.config.compute)
     return _drawn(jobs, folder, workers, Reporter(wanted.progress))
 
 
-def _chosen(found: list[Exhibit], only: Sequence[str]) -> list[Exhibit]:
-    names = [exhibit.name for exhibit in found]
+def _chosen(found: list[Figure], only: Sequence[str]) -> list[Figure]:
+    names = [figure.name for figure in found]
     unknown = [name for name in only if name not in names]
     if unknown:
         raise ConfigError(f"--only: this run has no figure {unknown[0]}; it has {', '.join(names)}")
-    return [exhibit for exhibit in found if not only or exhibit.name in only]
+    return [figure for figure in found if not only or figure.name in only]
 
 
 def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Reporter) -> list[Path]:
@@ -148,7 +138,7 @@ def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Report
             if outcome.error is not None:
                 errors.append(outcome.error)
                 return
-            written[job.exhibit.name] = [folder / name for name in outcome.value]
+            written[job.figure.name] = [folder / name for name in outcome.value]
             for name, content in outcome.value.items():
                 write_atomic(folder / name, content)
 
@@ -156,7 +146,7 @@ def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Report
         executor.map(draw_paper_figure, jobs, on_result)
     if errors:
         raise errors[0]
-    return [path for job in jobs for path in written[job.exhibit.name]]
+    return [path for job in jobs for path in written[job.figure.name]]
 
 
 def warn_if_old(target: Target, stages: Sequence[str], words: str) -> None:

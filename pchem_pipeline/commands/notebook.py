@@ -25,8 +25,8 @@ from pchem_pipeline.commands.notebook_plots import Plots, width_of
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
 from pchem_pipeline.report.data import PixelFit, ReportData
-from pchem_pipeline.report.figures.pixel_figures import cluster_edges, has_fit, pixel_fits
-from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.report.figures.pixels import cell_tables, draw_cells, draw_pixels, has_fit
+from pchem_pipeline.report.style.style import COLUMN_MM, Look
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import run_status
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.report.style.style import Figure
+    from pchem_pipeline.report.style.style import Drawing
 
 __all__ = ["Pixel", "Run", "open_run"]
 
@@ -293,17 +293,15 @@ class Pixel:
             attrs={"units": "1", "long_name": words},
         )
 
-    def plot(self, width: float | str = COLUMN_MM) -> Figure:
+    def plot(self, width: float | str = COLUMN_MM) -> Drawing:
         """Draw the histogram with its fit and the residuals, as the report does.
 
         Args:
             width: of the figure, mm, or a text such as ``"3.5in"``.
         """
-        return pixel_fits([self.found], width_mm=width_of(width))
+        return draw_pixels(Look(width_of(width)), pixels=[self.found])
 
-    def plot_cells(self, width: float | str = COLUMN_MM) -> Figure:
+    def plot_cells(self, width: float | str = COLUMN_MM) -> Drawing:
         """Draw the density with the edges between electron numbers, as the report does."""
         found = self.found
-        return cluster_edges(
-            found.parameters, counts=found.counts, origin=found.origin, width_mm=width_of(width)
-        )
+        return draw_cells(Look(width_of(width)), tables=cell_tables(found.parameters, found))

@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.commands.figures import exhibits_of, millimetres
-from pchem_pipeline.report.figures.map_figures import map_and_histogram
+from pchem_pipeline.commands.figures import millimetres
+from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.maps import draw_map, map_tables
 from pchem_pipeline.report.figures.paper import FORMATS
-from pchem_pipeline.report.style.style import COLUMN_MM, figure_bytes
+from pchem_pipeline.report.style.style import COLUMN_MM, Look, drawing_bytes
 from pchem_pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
     from pchem_pipeline.report.data import ReportData
     from pchem_pipeline.report.settings import ReportSettings
-    from pchem_pipeline.report.style.style import Figure
+    from pchem_pipeline.report.style.style import Drawing
 
 __all__ = ["Figures", "Plots", "width_of"]
 
@@ -34,13 +35,13 @@ def width_of(width: float | str) -> float:
     return millimetres(width if isinstance(width, str) else f"{width:f}".rstrip("0"))
 
 
-class Figures(Mapping[str, "Figure"]):
+class Figures(Mapping[str, "Drawing"]):
     """Several figures by name; a notebook shows them one after the other."""
 
-    def __init__(self, figures: Mapping[str, Figure]) -> None:
+    def __init__(self, figures: Mapping[str, Drawing]) -> None:
         self._figures = dict(figures)
 
-    def __getitem__(self, name: str) -> Figure:
+    def __getitem__(self, name: str) -> Drawing:
         return self._figures[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -56,7 +57,7 @@ class Figures(Mapping[str, "Figure"]):
         """Return the figures as a notebook shows them."""
         return "".join(
             f'<img alt="{name}" style="display: inline-block; background: white" src="data:image/png;base64,'
-            f'{base64.b64encode(figure_bytes(figure, "png", dpi=110)).decode("ascii")}">'
+            f'{base64.b64encode(drawing_bytes(figure, "png", dpi=110)).decode("ascii")}">'
             for name, figure in self._figures.items()
         )
 
@@ -82,7 +83,7 @@ class Figures(Mapping[str, "Figure"]):
         for name, figure in self._figures.items():
             for kind in formats:
                 written.append(Path(folder) / f"{name}.{kind}")
-                write_atomic(written[-1], figure_bytes(figure, kind, dpi=dpi, title=name))
+                write_atomic(written[-1], drawing_bytes(figure, kind, dpi=dpi, title=name))
         return written
 
 
@@ -96,9 +97,9 @@ class Plots:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all figures of the run, for :meth:`figure`."""
-        return tuple(exhibit.name for exhibit in exhibits_of(self._data(), self._settings))
+        return tuple(figure.name for figure in run_figures(self._data(), self._settings))
 
-    def figure(self, name: str, width: float | str | None = None) -> Figure:
+    def figure(self, name: str, width: float | str | None = None) -> Drawing:
         """Draw a figure of the report or of the discrepancy page.
 
         Args:
@@ -108,15 +109,15 @@ class Plots:
         Raises:
             ConfigError: the run has no such figure.
         """
-        found = {exhibit.name: exhibit for exhibit in exhibits_of(self._data(), self._settings)}
+        found = {figure.name: figure for figure in run_figures(self._data(), self._settings)}
         if name not in found:
             raise ConfigError(f"this run has no figure {name}; it has {', '.join(found)}")
-        exhibit = found[name]
-        return exhibit.draw(exhibit.width_mm if width is None else width_of(width))
+        figure = found[name]
+        return figure.draw(Look(figure.width_mm if width is None else width_of(width)))
 
     def map(
         self, name: str, width: float | str = COLUMN_MM, *, stretch: Literal["beta", "linear"] | None = None
-    ) -> Figure:
+    ) -> Drawing:
         """Draw a map below its histogram.
 
         Args:
@@ -131,40 +132,39 @@ class Plots:
         if name not in maps or name.endswith("_stderr"):
             known = ", ".join(each for each in maps if not each.endswith("_stderr"))
             raise StoreError(f"this run has no map {name}; it has {known}")
-        return map_and_histogram(
-            maps[name],
-            name,
-            stderr=maps.get(f"{name}_stderr"),
+        bins = self._settings.histogram_bins
+        return draw_map(
+            Look(width_of(width)),
+            tables=map_tables(maps[name], name, maps.get(f"{name}_stderr"), bins),
+            name=name,
             stretch=stretch or self._settings.map_stretch,
-            bins=self._settings.histogram_bins,
-            width_mm=width_of(width),
         )
 
     def maps(self, *names: str, width: float | str = COLUMN_MM) -> Figures:
         """Draw several maps; without names the four parameters."""
         return Figures({name: self.map(name, width) for name in names or _MAPS})
 
-    def pixels(self, width: float | str | None = None) -> Figure:
+    def pixels(self, width: float | str | None = None) -> Drawing:
         """Draw the histograms of the pixels of the report with their fits."""
         return self.figure("pixel_fits", width)
 
-    def read_noise(self, width: float | str | None = None) -> Figure:
+    def read_noise(self, width: float | str | None = None) -> Drawing:
         """Draw the histogram of the read noise."""
         return self.figure("read_noise_histogram", width)
 
-    def ensemble(self, width: float | str | None = None) -> Figure:
+    def ensemble(self, width: float | str | None = None) -> Drawing:
         """Draw the ensemble histograms with their predictions."""
         return self.figure("ensemble", width)
 
-    def electrons(self, width: float | str | None = None) -> Figure:
+    def electrons(self, width: float | str | None = None) -> Drawing:
         """Draw the estimated electron numbers against the prediction."""
         return self.figure("electron_numbers", width)
 
-    def components(self, width: float | str | None = None) -> Figure:
+    def components(self, width: float | str | None = None) -> Drawing:
         """Draw the widths of the components of the ensemble."""
         return self.figure("component_widths", width)
 
-    def status(self, width: float | str | None = None) -> Figure:
+    def status(self, width: float | str | None = None) -> Drawing:
         """Draw where fits failed or deserve caution."""
         return self.figure("fit_status", width)
 

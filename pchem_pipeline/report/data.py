@@ -1,6 +1,6 @@
 """What the report is made of: plain arrays and dictionaries, no store.
 
-The stage ``report`` fills a :class:`ReportData`; everything in ``render`` draws from it. A part that a run
+The stage ``report`` fills a :class:`ReportData`; figures and pages are made from it. A part that a run
 does not have is empty here, and ``missing`` says why in words for the reader.
 """
 
@@ -13,11 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
-from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
 
-__all__ = ["FEW_CHANNELS", "MAP_NAMES", "PARTS", "PixelFit", "ReportData"]
+__all__ = [
+    "CHANNELS",
+    "FEW_CHANNELS",
+    "LINE_MAPS",
+    "MAP_NAMES",
+    "PARTS",
+    "DiscrepancyData",
+    "PixelFit",
+    "ReportData",
+    "Sample",
+    "Samples",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +37,12 @@ FEW_CHANNELS = 32
 
 #: The maps of Appendix C, in the order of the paper.
 MAP_NAMES = ("dark_current", "conversion_gain", "bias", "read_noise_e")
+
+#: Maps of the line through several exposures, beside the dark current.
+LINE_MAPS = ("charge_per_level", "spurious_charge")
+
+#: Order of the axis ``channel`` of the arrays of a verdict.
+CHANNELS = ("charge", "readout")
 
 #: The parts of a report that a run may lack; the keys of ``ReportData.missing``.
 PARTS = ("pixels", "maps", "dark_current", "ensemble", "nuced", "electrons", "components", "truth", "methods")
@@ -68,6 +85,67 @@ class PixelFit:
 
 
 @dataclass(frozen=True)
+class DiscrepancyData:
+    """A verdict on what the model is missing, with the arrays that show it.
+
+    Attributes:
+        found: the verdict.
+        arrays: arrays of group ``discrepancy`` by name; any may lack.
+        statistics: name of each statistic, in the order of ``z_before``, to its channel and sentence.
+        titles: tag of an effect to its name in the literature.
+        sources: tag of an effect to where it is described.
+    """
+
+    found: Verdict
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    statistics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    titles: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+    def title(self, tag: str) -> str:
+        """Return the name of an effect in the literature, or its tag."""
+        return self.titles.get(tag) or tag.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One exposure of the sensor.
+
+    Attributes:
+        name: of the sample.
+        kind: ``exposed``, or ``bias`` for frames without electrons.
+        x: integration time or light level; None where it is not on the line.
+        n_frames: frames of a pixel.
+    """
+
+    name: str
+    kind: str
+    x: float | None
+    n_frames: int
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Several exposures of the same pixels that were fitted together.
+
+    Attributes:
+        samples: in their order.
+        against: what their exposures are drawn against: integration_time, light_level or none.
+        arrays: ``quanta_exposure``, ``mean``, ``variance``, ``linearity_residual``, (sample, y, x);
+            ``linearity_p`` (y, x); any may lack.
+    """
+
+    samples: tuple[Sample, ...]
+    against: str
+    arrays: Mapping[str, NDArray[Any]]
+
+    @property
+    def on_line(self) -> list[int]:
+        """Samples that the line goes through."""
+        return [i for i, sample in enumerate(self.samples) if sample.x is not None]
+
+
+@dataclass(frozen=True)
 class ReportData:
     """All that a report shows.
 
@@ -106,6 +184,7 @@ class ReportData:
         inspector: maps and pixels to look at in the browser, or None.
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
+        samples: the exposures of a run whose input is several samples, or None.
     """
 
     title: str
@@ -139,6 +218,7 @@ class ReportData:
     inspector: InspectorData | None = None
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None
+    samples: Samples | None = None
 
     @property
     def noun(self) -> str:

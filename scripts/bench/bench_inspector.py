@@ -26,10 +26,9 @@ prepare_environment()
 from pchem_pipeline.report.data import ReportData  # noqa: E402
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample  # noqa: E402
 from pchem_pipeline.report.inspector.packing import choose_scale, pack_map  # noqa: E402
-from pchem_pipeline.report.pages import report as report_module  # noqa: E402
+from pchem_pipeline.report.pages.pictures import Drawn  # noqa: E402
 from pchem_pipeline.report.pages.report import render_report  # noqa: E402
 from pchem_pipeline.report.settings import ReportSettings  # noqa: E402
-from pchem_pipeline.report.style.pictures import Picture  # noqa: E402
 
 #: Median, spread between pixels and standard error of one pixel: as of the paper's sensor.
 MAPS = {
@@ -88,8 +87,9 @@ def make_page(size: int) -> str:
         maps=maps,
         inspector=InspectorData(tuple(entries), sample, "a quarter", "pchem view"),
     )
-    report_module.draw_picture = lambda exhibit, *_: Picture(exhibit, DOT, "", 9, 9)
-    return render_report(data, ReportSettings(figure_formats=())).html
+    dot = Drawn(DOT, "", 9, 9)
+    settings = ReportSettings(figure_formats=())
+    return render_report(data, settings, lambda figures, _: {each.name: dot for each in figures}).html
 
 
 def measure(page: Page, path: Path) -> dict[str, float]:

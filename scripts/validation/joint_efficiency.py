@@ -28,7 +28,7 @@ from pchem_pipeline.model.errors.fisher import cramer_rao  # noqa: E402
 from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao  # noqa: E402
 from pchem_pipeline.model.fit.pchem import fit_histograms  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
-from pchem_pipeline.report.style.style import BLUE, GRAY, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
+from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
 
 NOISES = (0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 1.0)
 EXPOSURES = (0.5, 3.0, 12.0)
@@ -99,19 +99,21 @@ def row(noise, n_pixels, n_frames):
 
 
 @styled
-def figure(rows):
+def figure(look, rows):
     """Draw the relative error of g against the read noise."""
-    drawn = new_figure(120.0, 75.0)
+    drawn, colours = look.empty(75.0), look.palette
     axes = drawn.add_subplot()
     noise = [each.noise for each in rows]
-    axes.plot(noise, [100 * each.single_bound for each in rows], color=VERMILION, label="one sample: bound")
+    axes.plot(
+        noise, [100 * each.single_bound for each in rows], color=colours.vermilion, label="one sample: bound"
+    )
     single = [100 * each.single_error for each in rows]
-    axes.plot(noise, single, "x", color=VERMILION, label="one sample: fitted (where it has a value)")
-    axes.plot(noise, [100 * each.bound for each in rows], color=BLUE, label="jointly: bound")
+    axes.plot(noise, single, "x", color=colours.vermilion, label="one sample: fitted (where it has a value)")
+    axes.plot(noise, [100 * each.bound for each in rows], color=colours.blue, label="jointly: bound")
     for which, marker, words in (("of_all", "+", "all pixels"), ("of_good", "o", "good pixels")):
         joint = [100 * each.bound * getattr(each, which)[0] for each in rows]
-        axes.plot(noise, joint, marker, color=BLUE, markersize=3.5, label=f"jointly: fitted, {words}")
-    axes.axvline(0.5, color=GRAY, linewidth=0.8, linestyle=":")
+        axes.plot(noise, joint, marker, color=colours.blue, markersize=3.5, label=f"jointly: fitted, {words}")
+    axes.axvline(0.5, color=colours.bars, linewidth=0.8, linestyle=":")
     axes.set(yscale="log", xlabel="read noise (e⁻)", ylabel="error of the conversion gain (%)")
     axes.legend(loc="lower right")
     return drawn
@@ -145,7 +147,7 @@ def main(arguments=None):
         )
         sys.stdout.flush()
     if options.figure is not None:
-        options.figure.write_bytes(figure_bytes(figure(rows), "png", dpi=150))
+        options.figure.write_bytes(drawing_bytes(figure(Look(120.0), rows), "png", dpi=150))
         write(f"{options.figure}\n")
 
 

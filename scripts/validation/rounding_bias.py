@@ -24,7 +24,7 @@ from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, ref
 from pchem_pipeline.model.fit.pchem import fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
-from pchem_pipeline.report.style.style import BLUE, GRAY, GREEN, VERMILION, figure_bytes, new_figure, styled  # noqa: E402
+from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
 
 STEPS = (0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
@@ -77,19 +77,28 @@ def row(step, exposure, noise, n_pixels, n_frames):
 
 
 @styled
-def figure(rows, n_pixels):
+def figure(look, rows, n_pixels):
     """Draw the biases against 1/g."""
-    drawn = new_figure(120.0, 75.0)
+    drawn, colour = look.empty(75.0), look.palette
     axes = drawn.add_subplot()
     step = [each.step for each in rows]
     axes.plot(
-        step, [each.predicted for each in rows], color=VERMILION, label="density, predicted (typical bias)"
+        step,
+        [each.predicted for each in rows],
+        color=colour.vermilion,
+        label="density, predicted (typical bias)",
     )
-    axes.plot(step, [each.density for each in rows], "x", color=VERMILION, label="density, fitted")
-    axes.plot(step, [each.exact for each in rows], "o", color=BLUE, markersize=3.5, label="exact, fitted")
-    axes.axhline(LARGEST_BIAS, color=GREEN, linewidth=0.9, linestyle=":", label=f"limit {LARGEST_BIAS:g}")
+    axes.plot(step, [each.density for each in rows], "x", color=colour.vermilion, label="density, fitted")
+    axes.plot(
+        step, [each.exact for each in rows], "o", color=colour.blue, markersize=3.5, label="exact, fitted"
+    )
+    axes.axhline(
+        LARGEST_BIAS, color=colour.green, linewidth=0.9, linestyle=":", label=f"limit {LARGEST_BIAS:g}"
+    )
     # the largest of four medians of pure noise
-    axes.axhspan(1e-5, 2.2 * 1.2533 / np.sqrt(n_pixels), color=GRAY, alpha=0.3, linewidth=0, label="noise")
+    axes.axhspan(
+        1e-5, 2.2 * 1.2533 / np.sqrt(n_pixels), color=colour.bars, alpha=0.3, linewidth=0, label="noise"
+    )
     axes.set(xscale="log", yscale="log", ylim=(1e-4, 100.0))
     axes.set(xlabel="1/g (DN per electron)", ylabel="largest bias (standard errors)")
     axes.set_xticks([0.7, 1, 2, 5, 10, 20], labels=["0.7", "1", "2", "5", "10", "20"])
@@ -124,7 +133,7 @@ def main(arguments=None):
         )
         sys.stdout.flush()
     if options.figure is not None:
-        options.figure.write_bytes(figure_bytes(figure(rows, options.pixels), "png", dpi=150))
+        options.figure.write_bytes(drawing_bytes(figure(Look(120.0), rows, options.pixels), "png", dpi=150))
         write(f"{options.figure}\n")
 
 

@@ -15,7 +15,7 @@ from helpers.places import ROOT
 
 import pchem_pipeline
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
-from pchem_pipeline.report.style.style import figure_bytes
+from pchem_pipeline.report.style.style import drawing_bytes
 from pchem_pipeline.store.run_store import RunStore
 
 TUTORIAL = ROOT / "notebooks" / "tutorial.ipynb"
@@ -88,7 +88,7 @@ def test_figures_are_those_of_the_report(run, finished, tmp_path):
     assert set(run.plot.names) == {path.stem for path in (finished / "figures").glob("*.svg")}
     assert len(run.plot.names) > 10
     [report] = (path.read_bytes() for path in (finished / "figures").glob("electron_numbers.svg"))
-    drawn = figure_bytes(run.plot.electrons(), "svg", title="Estimated electron numbers")
+    drawn = drawing_bytes(run.plot.electrons(), "svg", title="Estimated electron numbers")
     assert drawn == report
     maps = run.plot.maps("bias", "analog_read_noise_e", width=60)
     assert list(maps) == ["bias", "analog_read_noise_e"]

@@ -9,7 +9,7 @@ import numpy as np
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
-from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
+from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 
 VERDICTS = ("named", "ambiguous", "unexplained", "consistent")

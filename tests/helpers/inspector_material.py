@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,10 @@ from helpers.report_material import draw_dn, report_data
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.exhibits import Exhibit
-from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import Picture
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report.inspector import gather_inspector
 from pchem_pipeline.store.run_store import RunStore
@@ -57,15 +57,11 @@ def inspected(store: RunStore, data: ReportData) -> ReportData:
 def page_without_pictures(data: ReportData) -> str:
     """Return the page with a dot for every figure: fast."""
 
-    def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> Picture:
-        return Picture(exhibit, "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", "", 10, 10)
+    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
+        dot = Drawn("data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", "", 10, 10)
+        return {figure.name: dot for figure in figures}
 
-    before = report_module.draw_picture
-    report_module.draw_picture = dot  # type: ignore[assignment]
-    try:
-        return render_report(data, ReportSettings(figure_formats=())).html
-    finally:
-        report_module.draw_picture = before
+    return render_report(data, ReportSettings(figure_formats=()), dots).html
 
 
 def make_run(

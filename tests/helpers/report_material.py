@@ -8,7 +8,7 @@ import numpy as np
 
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.report.data import PixelFit, ReportData
-from pchem_pipeline.report.pages.captions import case_name
+from pchem_pipeline.report.figures.ensemble import case_name
 
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.model.checks.run_differences import BlockDifference, compare_blocks
-from pchem_pipeline.report.pages.compare_data import ArrayRow
+from pchem_pipeline.report.comparison import ArrayRow
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.run_store import RunStore
 

@@ -16,8 +16,8 @@ from pchem_pipeline.commands.compare.settings import settings_that_differ, versi
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import LIMIT, compare_maps, reasons_of_change
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
-from pchem_pipeline.report.pages.compare_data import ArrayRow, Comparison, Pair, RunFacts
-from pchem_pipeline.report.pages.compare_page import (
+from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts
+from pchem_pipeline.report.pages.compare import (
     COMPARE_JSON,
     COMPARE_PAGE,
     render_comparison,

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.report.pages.compare_data import Setting
+from pchem_pipeline.report.comparison import Setting
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 

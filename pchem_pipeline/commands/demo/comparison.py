@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.variables import VARIABLES
-from pchem_pipeline.report.pages.discrepancy_text import parameter_texts
+from pchem_pipeline.report.pages.discrepancy import parameter_texts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.verdict import Place
-from pchem_pipeline.report.style.style import (
-    BLACK,
-    BLUE,
-    COLUMN_MM,
-    GRAY,
-    ORANGE,
-    PAGE_MM,
-    SKY,
-    VERMILION,
-    new_figure,
-    note,
-    styled,
-)
-
-__all__ = ["code_residuals", "codes", "frame_strip", "parity_difference", "trends"]
+from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, styled
+from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
 
@@ -35,18 +25,101 @@ FloatArray = NDArray[np.float64]
 _LINEAR = 8.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
-#: Colour of what the verdict points to.
-_MARK = "#F0E442"
+#: Factor and unit in which the means of the frames are shown, by channel.
+_SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN")}
+
+_CODES_CAPTION = (
+    "All usable pixels together. Top: samples at each DN (gray) and those that the fitted PCDs lead to "
+    "expect (black; with the named effects: orange). Below: the difference from the plain model in "
+    "standard deviations, even and odd DN in two colours; the gray band is two standard deviations. A "
+    "single tall line is a pile-up, alternating colours are a comb of the ADC, a slow wave is its "
+    "nonlinearity. Yellow: what the verdict points to."
+)
+_FRAMES_CAPTION = (
+    "Dots: means of the frames over all usable pixels. Blue: means over stretches of the run; the gray "
+    "band is two standard deviations of these by chance. Dashed: path of the named effects, if it does "
+    "not depend on chance. Yellow: frames that the verdict points to."
+)
 
 
-def code_residuals(arrays: Mapping[str, NDArray[Any]]) -> tuple[FloatArray, FloatArray]:
-    """Return the codes with counts and their residuals, (observed - expected) / sqrt(expected).
+def code_figures(data: DiscrepancyData) -> list[Figure]:
+    """Return the counts of each DN and their residuals."""
+    if not _has(data, "code_dn", "code_observed", "code_expected"):
+        return []
+    table = code_table(data.arrays)
+    dn, residual = table["dn"], table["residual"]
+    if dn.size == 0:
+        return []
+    order = np.argsort(-np.abs(residual))[:3]
+    largest = ", ".join(f"{residual[i]:+.1f} at {dn[i]:.0f} DN" for i in order).replace("-", "−")
+    even = dn % 2 == 0
+    comb = "not known"
+    if even.any() and (~even).any():
+        comb = f"{residual[even].mean():+.2f} on even and {residual[~even].mean():+.2f} on odd DN"
+    alt = (
+        f"Counts from {dn[0]:.0f} to {dn[-1]:.0f} DN and their residuals in standard deviations: root mean "
+        f"square {np.sqrt(np.mean(residual**2)):.2f} (by chance below 1); largest {largest}; mean "
+        f"{comb.replace('-', '−')}."
+    )
+    return [
+        Figure(
+            "discrepancy_codes",
+            "where",
+            "Along the digital numbers",
+            _CODES_CAPTION,
+            alt,
+            (table,),
+            partial(draw_codes, table=table, marked=data.found.where),
+            PAGE_MM,
+        )
+    ]
+
+
+def frame_figures(data: DiscrepancyData) -> list[Figure]:
+    """Return the means of the frames along the run."""
+    if not _has(data, "frame_number", "frame_charge", "frame_readout"):
+        return []
+    frames, stretches = frame_tables(data.arrays)
+    sds = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
+    words = []
+    for channel, sd in zip(CHANNELS, sds, strict=True):
+        (scale, unit), values = _SCALES[channel], frames[channel]
+        centre, mean = stretches["frame"], stretches[channel]
+        drift = float(np.polyfit(centre, mean, 1)[0] * np.ptp(centre)) if centre.size > 2 else math.nan
+        chance = f" (by chance {short(scale * float(sd))})" if np.isfinite(sd) else ""
+        words.append(
+            f"{channel}: standard deviation {short(float(values.std()))} {unit}{chance}, change "
+            f"along the run {short(drift)} {unit}"
+        )
+    path = "; the path of the named effects is drawn over them" if _model("readout") in frames else ""
+    return [
+        Figure(
+            "discrepancy_frames",
+            "where",
+            "Along time",
+            _FRAMES_CAPTION,
+            f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
+            (frames, stretches),
+            partial(
+                draw_frames, frames=frames, stretches=stretches, sds=sds.tolist(), marked=data.found.where
+            ),
+            PAGE_MM,
+        )
+    ]
+
+
+def _has(data: DiscrepancyData, *names: str) -> bool:
+    return all(name in data.arrays and data.arrays[name].size for name in names)
+
+
+def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
+    """Return the counts of the codes and their residuals, (observed - expected) / sqrt(expected).
 
     Args:
-        arrays: ``code_dn``, ``code_observed``, ``code_expected``.
+        arrays: ``code_dn``, ``code_observed``, ``code_expected``; ``code_extended`` where effects were named.
 
     Returns:
-        DN and residuals of the codes where a count is seen or expected; both empty where there is none.
+        The codes where a count is seen or expected; none where there is no such code.
     """
     dn, observed, expected = (
         np.asarray(arrays[f"code_{name}"], dtype=np.float64) for name in ("dn", "observed", "expected")
@@ -54,45 +127,67 @@ def code_residuals(arrays: Mapping[str, NDArray[Any]]) -> tuple[FloatArray, Floa
     residual = (observed - expected) / np.sqrt(np.maximum(expected, 1.0))
     seen = np.flatnonzero((observed > 0) | (expected >= 1.0))
     kept = slice(int(seen[0]), int(seen[-1]) + 1) if seen.size else slice(0, 0)
-    return dn[kept], residual[kept]
+    columns = {"dn": dn, "observed": observed, "expected": expected, "residual": residual}
+    if "code_extended" in arrays:
+        columns[_NAMED] = np.asarray(arrays["code_extended"], dtype=np.float64)
+    units = {"dn": "DN", "residual": "standard deviations"}
+    return DataTable({name: values[kept] for name, values in columns.items()}, units)
+
+
+_NAMED = "expected with the named effects"
+
+
+def frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
+    """Return the means of the frames in both channels, and their means over stretches of the run.
+
+    Args:
+        arrays: ``frame_number``, ``frame_charge``, ``frame_readout`` and, where there is a path of the named
+            effects, ``frame_charge_model`` and ``frame_readout_model``.
+    """
+    number = np.asarray(arrays["frame_number"], dtype=np.float64)
+    columns, means = {"frame": number}, dict[str, FloatArray]()
+    units: dict[str, str] = {}
+    for channel, (scale, unit) in _SCALES.items():
+        columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
+        centre, means[channel], n = trends(number, columns[channel])
+        path = arrays.get(f"frame_{channel}_model")
+        if path is not None and path.size:
+            columns[_model(channel)] = scale * np.asarray(path, dtype=np.float64)
+        units |= dict.fromkeys((channel, _model(channel)), unit)
+    return DataTable(columns, units), DataTable({"frame": centre, "frames": n, **means}, units, "stretches")
+
+
+def _model(channel: str) -> str:
+    return f"{channel}, named effects"
 
 
 @styled
-def codes(
-    arrays: Mapping[str, NDArray[Any]], *, marked: Sequence[Place] = (), width_mm: float = PAGE_MM
-) -> Figure:
+def draw_codes(look: Look, *, table: DataTable, marked: Sequence[Place] = ()) -> Drawing:
     """Draw counts per DN over the sensor and their residuals; even and odd codes differ in colour.
 
     Args:
-        arrays: ``code_dn``, ``code_observed``, ``code_expected``; ``code_extended`` where
-            effects were named.
+        look: width and colours.
+        table: of :func:`code_table`.
         marked: places whose interval of DN is shaded.
-        width_mm: width of the figure.
     """
-    dn, residual = code_residuals(arrays)
-    figure = new_figure(width_mm, 84.0 if width_mm > 1.5 * COLUMN_MM else 92.0)
+    figure, colours = look.empty(84.0 if look.wide else 92.0), look.palette
     top, bottom = figure.subplots(2, 1, height_ratios=(1.0, 1.25), sharex=True)
-    if dn.size == 0:
-        note(top, "no counts")
-        return figure
-    first = int(dn[0] - float(arrays["code_dn"][0]))
-    observed = np.asarray(arrays["code_observed"], dtype=np.float64)[first : first + dn.size]
-    expected = np.asarray(arrays["code_expected"], dtype=np.float64)[first : first + dn.size]
+    dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
-    top.stairs(observed, edges, fill=True, color=GRAY, label="observed")
-    top.stairs(expected, edges, color=BLACK, linewidth=0.9, label="expected from the fitted PCDs")
-    if "code_extended" in arrays:
-        grown = np.asarray(arrays["code_extended"], dtype=np.float64)[first : first + dn.size]
-        top.stairs(grown, edges, color=VERMILION, linewidth=0.9, label="with the named effects")
+    top.stairs(observed, edges, fill=True, color=colours.bars, label="observed")
+    top.stairs(expected, edges, color=colours.ink, linewidth=0.9, label="expected from the fitted PCDs")
+    if _NAMED in table:
+        label = "with the named effects"
+        top.stairs(table[_NAMED], edges, color=colours.vermilion, linewidth=0.9, label=label)
     top.set_yscale("log")
-    top.set_ylim(0.5, (4.0 if width_mm > 1.5 * COLUMN_MM else 200.0) * max(observed.max(), 1.0))
+    top.set_ylim(0.5, (4.0 if look.wide else 200.0) * max(observed.max(), 1.0))
     top.set_ylabel("samples per DN")
     top.legend(loc="upper right")
     even = dn % 2 == 0
-    bottom.axhspan(-2, 2, color=GRAY, alpha=0.45, linewidth=0, zorder=0)
-    for where, colour, label in ((even, BLUE, "even DN"), (~even, VERMILION, "odd DN")):
+    bottom.axhspan(-2, 2, color=colours.band, linewidth=0, zorder=0)
+    for where, colour, label in ((even, colours.blue, "even DN"), (~even, colours.vermilion, "odd DN")):
         bottom.vlines(
-            dn[where], 0.0, residual[where], color=colour, linewidth=_bar(dn.size, width_mm), label=label
+            dn[where], 0.0, residual[where], color=colour, linewidth=_bar(dn.size, look.width_mm), label=label
         )
     largest = int(np.argmax(np.abs(residual)))
     if abs(residual[largest]) > _LINEAR:
@@ -114,7 +209,7 @@ def codes(
         if place.dn is not None and place.dn[1] - place.dn[0] < 0.8 * dn.size:
             for axes in (top, bottom):
                 axes.axvspan(
-                    place.dn[0] - 0.5, place.dn[1] + 0.5, color=_MARK, alpha=0.5, linewidth=0, zorder=0
+                    place.dn[0] - 0.5, place.dn[1] + 0.5, color=colours.mark, alpha=0.5, linewidth=0, zorder=0
                 )
     return figure
 
@@ -158,62 +253,65 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
 
 
 @styled
-def frame_strip(
-    arrays: Mapping[str, NDArray[Any]], *, marked: Sequence[Place] = (), width_mm: float = PAGE_MM
-) -> Figure:
+def draw_frames(
+    look: Look,
+    *,
+    frames: DataTable,
+    stretches: DataTable,
+    sds: Sequence[float],
+    marked: Sequence[Place] = (),
+) -> Drawing:
     """Draw the means of the frames in both channels over the run, with the path of the named effects.
 
     Args:
-        arrays: ``frame_number``, ``frame_charge``, ``frame_readout``, ``frame_sd`` and, where there is a
-            path, ``frame_charge_model`` and ``frame_readout_model``.
+        look: width and colours.
+        frames: of :func:`frame_tables`.
+        stretches: likewise.
+        sds: standard deviation of a frame's mean by chance, in the stored unit, by channel.
         marked: places whose frames are shaded.
-        width_mm: width of the figure.
     """
-    figure = new_figure(width_mm, 96.0)
+    figure = look.empty(96.0)
     both = figure.subplots(2, 1, sharex=True)
-    number = np.asarray(arrays["frame_number"], dtype=np.float64)
-    sds = np.asarray(arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
-    rows = (
-        ("frame_charge", 100.0, "charge: exposure (%)"),
-        ("frame_readout", 1.0, "readout: mean residual (DN)"),
-    )
-    for axes, sd, (name, scale, label) in zip(both, sds, rows, strict=True):
-        values = scale * np.asarray(arrays[name], dtype=np.float64)
-        path = arrays.get(f"{name}_model")
-        _strip(axes, number, values, scale * float(sd), None if path is None else scale * np.asarray(path))
+    labels = {"charge": "charge: exposure (%)", "readout": "readout: mean residual (DN)"}
+    for axes, sd, (channel, label) in zip(both, sds, labels.items(), strict=True):
+        _strip(axes, frames, stretches, channel, _SCALES[channel][0] * sd)
         axes.set_ylabel(label)
-        channel = name.removeprefix("frame_")
         for place in marked:
-            if place.channel in (channel, "cross", "") or not place.channel:
-                _mark_frames(axes, place.frames, number)
+            if place.channel in (channel, "cross", ""):
+                _mark_frames(axes, place.frames, frames["frame"])
     both[1].set_xlabel("frame")
     handles, labels = both[0].get_legend_handles_labels()
-    columns = 5 if width_mm > 1.5 * COLUMN_MM else 2
+    columns = 5 if look.wide else 2
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, markerscale=2.0)
     return figure
 
 
-def _strip(axes: Axes, number: FloatArray, values: FloatArray, sd: float, path: NDArray[Any] | None) -> None:
+def _strip(axes: Axes, frames: DataTable, stretches: DataTable, channel: str, sd: float) -> None:
+    colours = colours_of(axes)
+    number, values = frames["frame"], frames[channel]
+    path = frames.get(_model(channel))
     even = number % 2 == 0
     alternates = abs(parity_difference(number, values, sd)) > 4.0
-    groups = ((even, SKY, "even frames"), (~even, ORANGE, "odd frames"))
-    for where, colour, label in groups if alternates else ((np.ones(even.size, bool), GRAY, "frames"),):
+    groups = ((even, colours.sky, "even frames"), (~even, colours.orange, "odd frames"))
+    for where, colour, label in (
+        groups if alternates else ((np.ones(even.size, bool), colours.bars, "frames"),)
+    ):
         axes.plot(
             number[where], values[where], ".", markersize=1.6, color=colour, rasterized=True, label=label
         )
-    centre, mean, n = trends(number, values)
+    centre, mean, n = (stretches[name] for name in ("frame", channel, "frames"))
     if np.isfinite(sd):
         half = 2.0 * sd / np.sqrt(n)
         axes.fill_between(
-            centre, -half, half, color="#333333", alpha=0.18, linewidth=0, label="±2 sd of chance"
+            centre, -half, half, color=colours.edge, alpha=0.18, linewidth=0, label="±2 sd of chance"
         )
     # no line across frames that are not there
     steps = np.diff(centre)
     apart = np.flatnonzero(steps > 2.0 * np.median(steps)) + 1 if steps.size else np.empty(0, np.int64)
     line = [np.insert(v, apart, np.nan) for v in (centre, mean)]
-    axes.plot(*line, color=BLUE, linewidth=1.2, marker="o", markersize=1.8, label="mean of a stretch")
+    axes.plot(*line, color=colours.blue, linewidth=1.2, marker="o", markersize=1.8, label="mean of a stretch")
     if path is not None:
-        axes.plot(number, path, color=VERMILION, linewidth=1.4, linestyle="--", label="named effects")
+        axes.plot(number, path, color=colours.vermilion, linewidth=1.4, linestyle="--", label="named effects")
     low, high = np.quantile(values, [0.001, 0.999]) if values.size else (-1.0, 1.0)
     extremes = [
         low,
@@ -231,9 +329,12 @@ def _strip(axes: Axes, number: FloatArray, values: FloatArray, sd: float, path: 
 
 def _mark_frames(axes: Axes, frames: Sequence[int], number: FloatArray) -> None:
     """Shade the frames, successive ones together, unless they are most of the run."""
+    colours = colours_of(axes)
     if not frames or len(frames) > 0.8 * number.size:
         return
     ordered = np.unique(np.asarray(frames))
     width = max(float(number[-1] - number[0]) / 400.0, 1.0)
     for run in np.split(ordered, np.flatnonzero(np.diff(ordered) > width) + 1)[:50]:
-        axes.axvspan(run[0] - width / 2, run[-1] + width / 2, color=_MARK, alpha=0.6, linewidth=0, zorder=0)
+        axes.axvspan(
+            run[0] - width / 2, run[-1] + width / 2, color=colours.mark, alpha=0.6, linewidth=0, zorder=0
+        )

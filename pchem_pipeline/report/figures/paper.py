@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,8 @@ import matplotlib as mpl
 from matplotlib.style import library
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.report.figures.drawn_data import drawn_tables
-from pchem_pipeline.report.figures.exhibits import Exhibit
-from pchem_pipeline.report.figures.figure_data import DataTable, csv_text
-from pchem_pipeline.report.style.style import figure_bytes, style_sheet
-
-__all__ = ["FORMATS", "PaperFigure", "draw_paper_figure", "read_style_sheet"]
+from pchem_pipeline.report.figures.figure import Figure, csv_text
+from pchem_pipeline.report.style.style import Look, drawing_bytes
 
 #: File formats of figures for papers.
 FORMATS = ("pdf", "svg", "png")
@@ -40,16 +36,14 @@ class PaperFigure:
     """A figure and how it is wanted.
 
     Attributes:
-        exhibit: the figure.
-        tables: its numbers; None: as they are drawn.
+        figure: the figure.
         formats: any of ``FORMATS``.
         width_mm: width; None: the figure's own.
         dpi: resolution of PNG, and of maps inside the other formats, dots per inch.
         sheet: matplotlib parameters that prevail over the style of this package.
     """
 
-    exhibit: Exhibit
-    tables: Sequence[DataTable] | None
+    figure: Figure
     formats: tuple[str, ...]
     width_mm: float | None = None
     dpi: int = 600
@@ -57,17 +51,15 @@ class PaperFigure:
 
 
 def draw_paper_figure(wanted: PaperFigure) -> dict[str, bytes]:
-    """Draw a figure and return its files by name; pure."""
-    exhibit = wanted.exhibit
-    with style_sheet(wanted.sheet):
-        figure = exhibit.draw(wanted.width_mm or exhibit.width_mm)
-        files = {
-            f"{exhibit.name}.{kind}": figure_bytes(figure, kind, dpi=wanted.dpi, title=exhibit.title)
-            for kind in wanted.formats
-        }
-    for table in drawn_tables(figure) if wanted.tables is None else wanted.tables:
+    """Draw a figure and return its files and those of its tables by name; pure."""
+    figure, files = wanted.figure, {}
+    drawing = figure.draw(Look.of_sheet(wanted.width_mm or figure.width_mm, wanted.sheet))
+    for kind in wanted.formats:
+        content = drawing_bytes(drawing, kind, dpi=wanted.dpi, title=figure.title)
+        files[f"{figure.name}.{kind}"] = content
+    for table in figure.tables:
         part = f"_{table.part}" if table.part else ""
-        files[f"{exhibit.name}{part}.csv"] = csv_text(table).encode()
+        files[f"{figure.name}{part}.csv"] = csv_text(table).encode()
     return files
 
 

@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import pack_counts
-from pchem_pipeline.report.style.style import MAP_COLOURS
+from pchem_pipeline.report.style.palette import MAP_COLOURS
 from pchem_pipeline.report.style.wording import unit_text
 
 __all__ = ["PANEL_MAPS", "Embedded", "content_policy", "embedded", "map_facts", "script", "served_page"]

@@ -8,19 +8,15 @@ from dataclasses import dataclass, field
 import jinja2
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.discrepancy_exhibits import discrepancy_exhibits
-from pchem_pipeline.report.figures.exhibits import Exhibit, exhibits
-from pchem_pipeline.report.figures.method_exhibits import method_exhibits, method_tables
-from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits, plan_tables
+from pchem_pipeline.report.figures.catalogue import report_figures, run_figures
 from pchem_pipeline.report.inspector.inspector import content_policy, embedded, script
-from pchem_pipeline.report.pages.discrepancy_page import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
+from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
+from pchem_pipeline.report.pages.methods import method_tables
+from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here, longest_first
 from pchem_pipeline.report.pages.report_json import report_json
 from pchem_pipeline.report.pages.sections import Material, page_sections
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import DrawAll, Picture, draw_picture, longest_first, ready_picture
-
-__all__ = ["RenderedReport", "render_report", "template"]
 
 _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
@@ -54,21 +50,11 @@ def render_report(
         draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
     settings = settings or ReportSettings()
-    figures: dict[str, bytes] = {}
-    shown = [*exhibits(data, settings), *method_exhibits(data), *plan_exhibits(data)]
-    others = [] if data.discrepancy is None else discrepancy_exhibits(data.discrepancy)
-    drawn = {} if draw is None else draw(longest_first([*shown, *others]), settings)
-
-    def picture(exhibit: Exhibit) -> Picture:
-        if exhibit.name in drawn:
-            return ready_picture(exhibit, drawn[exhibit.name], figures)
-        return draw_picture(exhibit, settings, figures)
-
-    pictures = [picture(exhibit) for exhibit in shown]
-    tables = [*result_tables(data), *method_tables(data), *plan_tables(data)]
-    view: DiscrepancyView[Picture] | None = None
-    if data.discrepancy is not None:
-        view = discrepancy_view(data.discrepancy, picture)
+    drawn = (draw or draw_here)(longest_first(run_figures(data, settings)), settings)
+    figures = {name: content for each in drawn.values() for name, content in each.files.items()}
+    pictures = [Picture(figure, drawn[figure.name]) for figure in report_figures(data, settings)]
+    view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, drawn)
+    tables = [*result_tables(data), *method_tables(data)]
     inspector = embedded(data)
     page = template("report.html.j2").render(
         title=data.title,
@@ -83,7 +69,7 @@ def render_report(
     return RenderedReport(page, report_json(data), figures, pages)
 
 
-def _discrepancy_page(data: ReportData, view: DiscrepancyView[Picture]) -> str:
+def _discrepancy_page(data: ReportData, view: DiscrepancyView) -> str:
     about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
     if data.n_frames:
         about += f"{', ' if about else ''}{data.n_frames:,} frames"

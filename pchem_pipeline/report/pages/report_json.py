@@ -12,7 +12,7 @@ import numpy as np
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import status_counts
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.pages.verdict import flags, pixel_counts, sentence, summaries
+from pchem_pipeline.report.pages.summary import flags, pixel_counts, sentence, summaries
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import stored_unit
 

@@ -1,8 +1,8 @@
 """The sections of the report's page, from top to bottom, in one list.
 
-A further section of figures and tables is a row in ``captions.SECTIONS``; exhibits and tables name its id.
-One of another kind is a maker in :data:`PAGE` and a template ``section_<kind>.html.j2``. The table of
-contents follows the list.
+A further section of figures and tables is a row in :data:`SECTIONS`; figures and tables name its id. One of
+another kind is a maker in :data:`PAGE` and a template ``section_<kind>.html.j2``. The table of contents
+follows the list.
 """
 
 from __future__ import annotations
@@ -13,15 +13,139 @@ from functools import partial
 from typing import Any
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.pages.answers import answers
-from pchem_pipeline.report.pages.captions import MAP_READING, SECTIONS
-from pchem_pipeline.report.pages.discrepancy_page import DiscrepancyView
+from pchem_pipeline.report.figures.samples import AXES
+from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
+from pchem_pipeline.report.pages.pictures import Picture
+from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import Table, provenance_tables
-from pchem_pipeline.report.pages.verdict import flags, key_numbers, sentence
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import Picture
 
-__all__ = ["PAGE", "Material", "Section", "page_sections"]
+#: (id, heading, introduction, parts that may be missing) of the sections that show figures.
+SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    (
+        "pixels",
+        "Single pixels",
+        "Each pixel is described by the photon counting distribution (PCD): a Poisson number of electrons"
+        " with mean H, converted with gain g, on top of the bias μ, with Gaussian read noise σ.",
+        ("pixels",),
+    ),
+    (
+        "goodness",
+        "Does the model describe each pixel?",
+        "The histogram of each pixel is tested against its fitted density by a chi-square of merged bins, "
+        "whose p-values are uniform by chance. Of many thousand tests some look significant: pixels are "
+        "called misfits only as far as the rate of false discoveries allows. Single samples that the model "
+        "does not expect at all (cosmic rays, glitches) are left out of the fit and counted.",
+        (),
+    ),
+    (
+        "exposures",
+        "Exposures",
+        "Each exposure has its own H; what grows with {against} is the {noun}, and what does not is "
+        "spurious charge (or a bias stack that holds electrons). The exposures of a pixel share the errors "
+        "of its gain and bias, which the line takes into account.",
+        ("samples",),
+    ),
+    (
+        "photon-transfer",
+        "Photon transfer",
+        "The same data as moments: where the points leave the curve, the sensor is not linear or the samples "
+        "are not of one gain.",
+        ("samples",),
+    ),
+    (
+        "cells",
+        "From signal to electron number",
+        "The peaks of the PCD are whole electrons. Each signal belongs to the electron number that "
+        "explains it best; the edges between these cells are not half-way between the peaks, since small "
+        "and large numbers are not equally likely.",
+        (),
+    ),
+    (
+        "read-noise",
+        "Read noise",
+        "Read noise in electrons, quantisation included, of every pixel with a fit.",
+        ("maps",),
+    ),
+    (
+        "maps",
+        "Parameter maps",
+        "Histogram and map of each parameter. Structure in a map points to the architecture of the sensor.",
+        (
+            "maps",
+            "dark_current",
+        ),
+    ),
+    (
+        "ensemble",
+        "The sensor as a whole",
+        "If the model holds, the parameters of the pixels predict the distribution of all raw data taken "
+        "together.",
+        (
+            "ensemble",
+            "nuced",
+        ),
+    ),
+    (
+        "electrons",
+        "Electron numbers",
+        "Each raw value of the ensemble frames was turned into a number of electrons.",
+        ("electrons",),
+    ),
+    (
+        "components",
+        "Why the peaks of the ensemble fade",
+        "The ensemble is a sum of components, one for each electron number. Where pixels differ in gain, "
+        "the components become wider with the electron number.",
+        ("components",),
+    ),
+    (
+        "uncertainty",
+        "How sure are the numbers?",
+        "Standard errors follow from the curvature of each pixel's likelihood, those of derived "
+        "quantities from the whole covariance of the four parameters.",
+        (),
+    ),
+    (
+        "methods",
+        "Other methods beside PCH-EM",
+        "The same pixels characterised by the methods of the literature, with the smallest errors that any "
+        "method could have.",
+        ("methods",),
+    ),
+    (
+        "plan",
+        "How many frames are enough?",
+        "The information of one frame tells how many of them a precision needs, before they are taken.",
+        (),
+    ),
+    (
+        "status",
+        "Fit status",
+        "Pixels that could not be fitted, or whose values deserve caution, and why.",
+        (),
+    ),
+)
+
+#: How to read the figures of the section ``maps``, by how they are drawn.
+MAP_READING: dict[str, str] = {
+    "beta": (
+        "Colours follow the rank of a pixel (Beta(2,2) stretch), so that a few outliers do not hide the "
+        "structure: the five labels of the colour bar are the minimum, the 15.6, 50 and 84.4 % quantiles "
+        "and the maximum. The blue line in a histogram is the median."
+    ),
+    "linear": (
+        "Colours are linear between the 1st and the 99th percentile; values beyond have the end colours. "
+        "The blue line in a histogram is the median."
+    ),
+    "channels": (
+        "Each point is a channel with its standard error; crosses at the bottom are channels without a value."
+    ),
+}
+
+#: Sections that only a run of several samples has.
+_OF_SAMPLES = ("exposures", "photon-transfer")
+_NO_LINE = "The samples share g, μ and σ; no line was asked for (joint.against: none)."
 
 
 @dataclass(frozen=True)
@@ -40,7 +164,7 @@ class Material:
     settings: ReportSettings
     pictures: list[Picture]
     tables: list[Table]
-    view: DiscrepancyView[Picture] | None = None
+    view: DiscrepancyView | None = None
 
 
 @dataclass(frozen=True)
@@ -88,20 +212,27 @@ def _inspector(material: Material) -> Section:
     return Section("inspector", "Look at pixels", "inspector", content)
 
 
-def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> Section:
+def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> Section | None:
     """Put figures and tables into their section; one without any says why."""
     id_, title, intro, parts = row
     data = material.data
-    shown = [picture for picture in material.pictures if picture.exhibit.section == id_]
+    if data.samples is None and id_ in _OF_SAMPLES:
+        return None
+    shown = [picture for picture in material.pictures if picture.figure.section == id_]
     tables = [table for table in material.tables if table.section == id_]
     missing = [data.missing[part] for part in parts if part in data.missing]
     if id_ == "read-noise" and data.few_channels and not shown:
         missing.append("few channels have no histogram; their values are with the parameter maps")
     if not shown and not tables and not missing:
+        if data.samples is not None:
+            return None  # a joint fit has less to show
         missing = ["this run has no data for it."]
     if id_ == "maps":
         reading = "channels" if min(data.shape) < 2 else material.settings.map_stretch
         intro = f"{intro} {MAP_READING[reading]}"
+    if id_ == "exposures" and data.samples is not None:
+        words = AXES.get(data.samples.against)
+        intro = intro.format(against=words[0], noun=words[2]) if words else _NO_LINE
     content = {"intro": intro, "missing": missing, "pictures": shown, "tables": tables}
     return Section(id_, title, "figures", content)
 

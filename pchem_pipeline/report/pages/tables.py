@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.map_figures import status_counts
-from pchem_pipeline.report.figures.trust_figures import noise_shares
-from pchem_pipeline.report.pages.verdict import summaries
+from pchem_pipeline.report.figures.maps import status_counts
+from pchem_pipeline.report.figures.plan import frames_text, target_text
+from pchem_pipeline.report.figures.samples import AXES, middle
+from pchem_pipeline.report.figures.trust import noise_shares
+from pchem_pipeline.report.pages.summary import summaries
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
@@ -23,8 +25,6 @@ from pchem_pipeline.report.style.wording import (
     symbol,
     unit_text,
 )
-
-__all__ = ["Table", "provenance_tables", "result_tables", "size_words"]
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
     makers = (
         _channels, _parameters, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals, _status,
+        _samples, _plan,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)).rows]
 
@@ -131,6 +132,8 @@ def _channels(data: ReportData) -> Table:
 _ORDER = (
     "quanta_exposure",
     "dark_current",
+    "charge_per_level",
+    "spurious_charge",
     "conversion_gain",
     "bias",
     "read_noise_dn",
@@ -368,6 +371,56 @@ def _status(data: ReportData) -> Table:
         tuple(rows),
         section="status",
     )
+
+
+def _samples(data: ReportData) -> Table:
+    if data.samples is None:
+        return Table("samples", "", "", (), ())
+    found = data.samples
+    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
+    rows = []
+    for i, sample in enumerate(found.samples):
+        centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
+        exposure = "0 (bias)" if sample.kind == "bias" else measured(centre, error)
+        residual = share = "–"
+        if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
+            rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
+            residual = measured(rest, rest_error)
+            if centre > 0:
+                share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
+        x = "–" if sample.x is None else f"{sample.x:g}"
+        rows.append((sample.name, x, f"{sample.n_frames:,}", exposure, residual, share))
+    p = finite(found.arrays.get("linearity_p", np.empty(0)))
+    off = percent(int((p < 0.01).sum()), p.size)
+    remark = f" {off} of the {data.noun}s lie off the line (p < 0.01; 1 % by chance)." if p.size else ""
+    head = f"{words} ({unit})" if unit else words
+    return Table(
+        "samples",
+        "Samples",
+        f"Medians over the {data.noun}s, with their standard errors.{remark}",
+        ("sample", head, "frames", "H (e⁻)", "residual (e⁻)", "residual / H"),
+        tuple(rows),
+        section="exposures",
+    )
+
+
+def _plan(data: ReportData) -> Table:
+    plan = data.plan
+    if plan is None:
+        return Table("plan-table", "", "", (), ())
+    rows = []
+    for row in plan["rows"]:
+        reached = plan["reached"].get(row["name"])
+        unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
+        now = "" if reached is None else f"{short(scale * reached, 2)} {unit}"
+        rows.append((target_text(row["target"]), frames_text(row["frames"]), now))
+    exposure, noise = plan["mark"]
+    caption = (
+        f"For the median pixel, H = {short(exposure)} e⁻ and read noise {short(noise)} e⁻, by the bound. For "
+        "the best exposure, other sensors, several samples, and a check by simulation: pchem plan."
+    )
+    head = ("precision", "frames needed", "this run's")
+    return Table("plan-table", "Frames for a precision", caption, head, tuple(rows), section="plan")
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -1,7 +1,6 @@
-"""One look for all figures: print sizes, colours safe for the colour-blind, files that repeat to the byte.
+"""One look for all figures: print sizes, type, and files that repeat to the byte.
 
 Figures are made with matplotlib's objects alone (no ``pyplot``), so that drawing leaves no state behind.
-Colours of lines are those of Okabe and Ito (2008); maps use ``viridis``, whose lightness rises evenly.
 """
 
 from __future__ import annotations
@@ -12,40 +11,29 @@ import io
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextvars import ContextVar
-from typing import Any, ParamSpec
+from dataclasses import dataclass, field
+from typing import Any, Concatenate, ParamSpec
 
 import matplotlib as mpl
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as MatplotlibFigure
 from PIL import Image
 
-from pchem_pipeline.report.style.recolour import recolour
+from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS, Palette, palette_of
 
 __all__ = [
-    "BLACK",
-    "BLUE",
     "COLUMN_MM",
-    "GRAY",
-    "GREEN",
-    "MAP_COLOURS",
-    "NO_VALUE",
-    "ORANGE",
     "PAGE_MM",
-    "PALETTE",
-    "PURPLE",
-    "SKY",
-    "VERMILION",
-    "Figure",
-    "figure_bytes",
+    "Drawing",
+    "Look",
+    "colours_of",
+    "drawing_bytes",
     "inches",
-    "new_figure",
     "note",
     "plain",
     "small_png",
-    "style_sheet",
     "styled",
 ]
 
@@ -53,34 +41,17 @@ __all__ = [
 COLUMN_MM = 88.0
 PAGE_MM = 180.0
 
-BLACK = "#000000"
-ORANGE = "#E69F00"
-SKY = "#56B4E9"
-GREEN = "#009E73"
-YELLOW = "#F0E442"
-BLUE = "#0072B2"
-VERMILION = "#D55E00"
-PURPLE = "#CC79A7"
-GRAY = "#B8B8B8"
-#: Colour of pixels without a value in maps: outside the range of ``MAP_COLOURS`` in hue and saturation.
-NO_VALUE = "#D9D9D9"
-PALETTE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW, BLACK)
-MAP_COLOURS = "viridis"
-
 _STYLE: Any = {
     "axes.axisbelow": True,
-    "axes.edgecolor": "#333333",
     "axes.grid": False,
     "axes.labelsize": 8.0,
     "axes.linewidth": 0.6,
-    "axes.prop_cycle": cycler(color=PALETTE),
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlelocation": "left",
     "axes.titlesize": 8.0,
     "figure.constrained_layout.h_pad": 0.05,
     "figure.constrained_layout.w_pad": 0.03,
-    "figure.facecolor": "white",
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
     "image.cmap": MAP_COLOURS,
@@ -91,7 +62,6 @@ _STYLE: Any = {
     "mathtext.fontset": "dejavusans",
     "patch.linewidth": 0.5,
     "pdf.fonttype": 42,
-    "savefig.facecolor": "white",
     "svg.fonttype": "path",
     "svg.hashsalt": "pchem",
     "xtick.labelsize": 7.0,
@@ -111,77 +81,98 @@ _COMPRESSION = 4
 
 P = ParamSpec("P")
 
-_SHEET: ContextVar[Mapping[str, Any] | None] = ContextVar("sheet", default=None)
 
+@dataclass(frozen=True)
+class Look:
+    """How a figure is drawn.
 
-@contextlib.contextmanager
-def style_sheet(parameters: Mapping[str, Any] | None) -> Iterator[None]:
-    """Let matplotlib parameters of the user prevail over the style of this package.
-
-    Args:
-        parameters: name to value, as a style sheet has them; None for none.
+    Attributes:
+        width_mm: width; panels stand side by side on a page, one above the other on a column.
+        palette: colours.
+        sheet: parameters of matplotlib that prevail over the style of this package.
     """
-    token = _SHEET.set(parameters)
-    try:
-        yield
-    finally:
-        _SHEET.reset(token)
+
+    width_mm: float = COLUMN_MM
+    palette: Palette = LIGHT
+    sheet: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of_sheet(cls, width_mm: float, sheet: Mapping[str, Any]) -> Look:
+        """Return the look that a user's style sheet asks for."""
+        return cls(width_mm, palette_of(sheet), sheet)
+
+    @property
+    def wide(self) -> bool:
+        """Whether panels have room side by side."""
+        return self.width_mm > 1.5 * COLUMN_MM
+
+    def empty(self, height_mm: float) -> Drawing:
+        """Return an empty drawing of that height with a canvas of its own."""
+        size = (inches(self.width_mm), inches(height_mm))
+        drawing = Drawing(figsize=size, layout="constrained")
+        drawing.look = self
+        FigureCanvasAgg(drawing)
+        return drawing
+
+    def parameters(self) -> Any:
+        """Return the parameters of matplotlib that make this look."""
+        colours = {**self.palette.parameters(), "axes.prop_cycle": cycler(color=self.palette.cycle)}
+        return {**_STYLE, **colours, **self.sheet}
+
+
+class Drawing(MatplotlibFigure):
+    """A drawn figure that is saved in its own look, and that notebooks show."""
+
+    look: Look = Look()
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        """Save the figure, fonts embedded; see :meth:`matplotlib.figure.Figure.savefig`."""
+        with _in(self.look):
+            super().savefig(*args, **kwargs)
+
+    def _repr_png_(self) -> bytes:
+        """Return the figure as a notebook shows it."""
+        return drawing_bytes(self, "png", dpi=150)
 
 
 @contextlib.contextmanager
-def _style() -> Iterator[None]:
-    """Hold the style of this package, whatever the user's settings; characters no font has are boxes."""
+def _in(look: Look) -> Iterator[None]:
+    """Hold a look, whatever the user's settings; characters that no font has are boxes."""
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         mpl.rcdefaults()
-        sheet: Any = _SHEET.get() or {}
-        mpl.rcParams.update({**_STYLE, **sheet})
+        mpl.rcParams.update(look.parameters())
         yield
 
 
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorate a drawing function: it draws in the style of this package and lays out once.
+def styled(draw: Callable[Concatenate[Look, P], Drawing]) -> Callable[Concatenate[Look, P], Drawing]:
+    """Decorate a drawing function, whose first argument is the look: it draws in it and lays out once.
 
     The layout is then fixed, so that saving in several formats does not compute it again.
     """
 
     @functools.wraps(draw)
-    def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with _style():
-            figure = draw(*args, **kwargs)
-            if "axes.prop_cycle" in (_SHEET.get() or {}):
-                recolour(figure, PALETTE, mpl.rcParams["axes.prop_cycle"].by_key().get("color", []))
-            _lay_out(figure)
-            return figure
+    def wrapper(look: Look, /, *args: P.args, **kwargs: P.kwargs) -> Drawing:
+        with _in(look):
+            drawing = draw(look, *args, **kwargs)
+            _lay_out(drawing)
+            return drawing
 
     return wrapper
 
 
-def _lay_out(figure: Figure) -> None:
-    """Let the layout engine place everything, and leave the figure without one.
+def _lay_out(drawing: Drawing) -> None:
+    """Let the layout engine place everything, and leave the drawing without one.
 
     Nothing is drawn for it. Any engine that is left, one that does nothing too, would make each saving draw
     the figure twice.
     """
-    engine = figure.get_layout_engine()
+    engine = drawing.get_layout_engine()
     if engine is None:
         return
-    engine.execute(figure)
+    engine.execute(drawing)
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-        figure.set_layout_engine(None)
-
-
-class StyledFigure(Figure):
-    """A figure that is saved in the style of this package, and that notebooks show."""
-
-    def savefig(self, *args: Any, **kwargs: Any) -> None:
-        """Save the figure, fonts embedded; see :meth:`matplotlib.figure.Figure.savefig`."""
-        with _style():
-            super().savefig(*args, **kwargs)
-
-    def _repr_png_(self) -> bytes:
-        """Return the figure as a notebook shows it."""
-        return figure_bytes(self, "png", dpi=150)
+        drawing.set_layout_engine(None)
 
 
 def plain(text: str) -> str:
@@ -194,15 +185,17 @@ def inches(millimetres: float) -> float:
     return millimetres / 25.4
 
 
-def new_figure(width_mm: float, height_mm: float) -> Figure:
-    """Return an empty figure of that size with a canvas of its own."""
-    figure = StyledFigure(figsize=(inches(width_mm), inches(height_mm)), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+def colours_of(axes: Axes) -> Palette:
+    """Return the palette in which the axes are drawn."""
+    figure = axes.figure
+    while not isinstance(figure, Drawing):
+        figure = figure.figure  # from a part of a figure to the whole
+    return figure.look.palette
 
 
 def note(axes: Axes, text: str, *, where: str = "upper right") -> None:
     """Write a small note into a corner of the axes."""
+    colours = colours_of(axes)
     vertical, horizontal = where.split()
     axes.text(
         0.985 if horizontal == "right" else 0.015,
@@ -212,8 +205,8 @@ def note(axes: Axes, text: str, *, where: str = "upper right") -> None:
         ha="right" if horizontal == "right" else "left",
         va="top" if vertical == "upper" else "bottom",
         fontsize=6.5,
-        color="#444444",
-        bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
+        color=colours.faint,
+        bbox={"facecolor": colours.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
     )
 
 
@@ -224,8 +217,8 @@ _BLANKS = re.compile(rb"(?<=[MLQC]) | ?\n")
 _BETWEEN = re.compile(rb">\s+<")
 
 
-def figure_bytes(figure: Figure, kind: str, *, dpi: int = 300, title: str = "") -> bytes:
-    """Return a figure as a file of kind ``svg``, ``png`` or ``pdf``; the same figure gives the same bytes.
+def drawing_bytes(drawing: Drawing, kind: str, *, dpi: int = 300, title: str = "") -> bytes:
+    """Return a drawing as a file of kind ``svg``, ``png`` or ``pdf``; the same drawing gives the same bytes.
 
     Fonts are embedded: as outlines in SVG, as TrueType in PDF.
     """
@@ -233,9 +226,8 @@ def figure_bytes(figure: Figure, kind: str, *, dpi: int = 300, title: str = "") 
     if title:
         metadata["Title"] = title
     buffer = io.BytesIO()
-    with _style():
-        options: dict[str, Any] = {"pil_kwargs": {"compress_level": _COMPRESSION}} if kind == "png" else {}
-        figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata, **options)
+    options: dict[str, Any] = {"pil_kwargs": {"compress_level": _COMPRESSION}} if kind == "png" else {}
+    drawing.savefig(buffer, format=kind, dpi=dpi, metadata=metadata, **options)
     return _compact(buffer.getvalue()) if kind == "svg" else buffer.getvalue()
 
 

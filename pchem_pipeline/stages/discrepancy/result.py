@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pchem_pipeline.base.variables import variables_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import read_verdict
-from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
+from pchem_pipeline.report.data import DiscrepancyData
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore

@@ -12,9 +12,11 @@ from pchem_pipeline.base.variables import variables_of
 from pchem_pipeline.config.joint import dump_joint, load_joint
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
-from pchem_pipeline.report.pages.joint_data import JointData, JointSample, middle
-from pchem_pipeline.report.pages.joint_page import JOINT_EXHIBIT_NAMES, render_joint
-from pchem_pipeline.report.style.pictures import DrawAll
+from pchem_pipeline.report.data import ReportData, Sample, Samples
+from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
+from pchem_pipeline.report.figures.samples import middle
+from pchem_pipeline.report.pages.pictures import DrawAll
+from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.joint.samples import read_samples
@@ -47,18 +49,18 @@ def _write(
     """Gather, draw and write; files of figures that this fit does not have any more are removed."""
     store = open_store(path)
     data = gather_joint(store, config, config_path)
-    rendered = render_joint(data, config.report, draw)
+    rendered = render_report(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):
-        if old.name not in rendered.figures and old.stem in JOINT_EXHIBIT_NAMES:
+        if old.name not in rendered.figures and old.stem in FIGURE_NAMES:
             old.unlink(missing_ok=True)
     store.write_file("report.json", (json.dumps(_numbers(store, data), indent=2) + "\n").encode())
     store.write_file("report.html", rendered.html.encode())
     return {"figures": len(rendered.figures)}
 
 
-def gather_joint(store: RunStore, config: RunConfig, config_path: Path | None) -> JointData:
+def gather_joint(store: RunStore, config: RunConfig, config_path: Path | None) -> ReportData:
     """Read all that the report of a joint fit shows.
 
     Args:
@@ -81,18 +83,21 @@ def gather_joint(store: RunStore, config: RunConfig, config_path: Path | None) -
         for group in ("joint", "maps")
     }
     groups["maps"].pop("quality", None)
-    return JointData(
+    joint = groups["joint"]
+    names = ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p")
+    found = tuple(Sample(each.name, each.kind, each.x, each.n_frames) for each in samples)
+    notes = () if record is None else record.notes
+    return ReportData(
         title=config.run.title or store.path.name,
         shape=sensor.shape,
         n_frames=sensor.n_frames,
-        samples=tuple(JointSample(each.name, each.kind, each.x, each.n_frames) for each in samples),
-        against=against,
         maps=groups["maps"],
-        joint=groups["joint"],
+        fit={name: joint[name] for name in ("fit_status", "goodness_p") if name in joint},
         status_words={int(bit): text for bit, text in MEANINGS.items()},
         failed_mask=int(FAILED),
-        settings=_settings(config, config_path),
-        notes=() if record is None else record.notes,
+        config_yaml=_settings(config, config_path),
+        stages=[{"stage": "joint", "notes": list(notes)}],
+        samples=Samples(found, against, {name: joint[name] for name in names if name in joint}),
     )
 
 
@@ -106,25 +111,28 @@ def _settings(config: RunConfig, config_path: Path | None) -> str:
         return dump_config(config)
 
 
-def _numbers(store: RunStore, data: JointData) -> dict[str, Any]:
+def _numbers(store: RunStore, data: ReportData) -> dict[str, Any]:
     """Return the numbers of the report for other programs."""
+    found = data.samples
+    assert found is not None
     rows = []
-    for i, sample in enumerate(data.samples):
-        centre, error, _, _ = middle(data.joint["quanta_exposure"][i])
+    for i, sample in enumerate(found.samples):
+        centre, error, _, _ = middle(found.arrays["quanta_exposure"][i])
         row: dict[str, Any] = {
             "name": sample.name,
             "kind": sample.kind,
-            data.against if data.against != "none" else "x": sample.x,
+            found.against if found.against != "none" else "x": sample.x,
             "n_frames": sample.n_frames,
             "quanta_exposure": {"median": centre, "median_stderr": error},
         }
-        if "linearity_residual" in data.joint:
-            rest, rest_error, _, _ = middle(data.joint["linearity_residual"][i])
+        if "linearity_residual" in found.arrays:
+            rest, rest_error, _, _ = middle(found.arrays["linearity_residual"][i])
             row["linearity_residual"] = {"median": rest, "median_stderr": rest_error}
         rows.append(row)
     attributes = store.attributes("maps")
-    content = {"title": data.title, "against": data.against, "samples": rows, "notes": list(data.notes)}
-    found: dict[str, Any] = without_nan(
+    notes = [note for stage in data.stages for note in stage["notes"]]
+    content = {"title": data.title, "against": found.against, "samples": rows, "notes": notes}
+    numbers: dict[str, Any] = without_nan(
         {**content, "maps": attributes["summary"], "fit_status": attributes["fit_status"]}
     )
-    return found
+    return numbers

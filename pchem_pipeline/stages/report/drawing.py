@@ -9,9 +9,9 @@ from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import DrawAll, Drawn, draw_exhibit
 from pchem_pipeline.run.progress import Reporter
 
 __all__ = ["draw_by_workers", "drawing_executor", "drawing_workers"]
@@ -41,20 +41,20 @@ def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
         label: of the bar.
     """
 
-    def draw(exhibits: Sequence[Exhibit], settings: ReportSettings) -> Mapping[str, Drawn]:
+    def draw(figures: Sequence[Figure], settings: ReportSettings) -> Mapping[str, Drawn]:
         drawn: dict[str, Drawn] = {}
         errors: list[BaseException] = []
-        executor = drawing_executor(workers, len(exhibits))
-        with reporter.progress(label, len(exhibits), "figure") as advance:
+        executor = drawing_executor(workers, len(figures))
+        with reporter.progress(label, len(figures), "figure") as advance:
 
-            def on_result(exhibit: Exhibit, outcome: Outcome) -> None:
+            def on_result(figure: Figure, outcome: Outcome) -> None:
                 advance()
                 if outcome.error is None:
-                    drawn[exhibit.name] = outcome.value
+                    drawn[figure.name] = outcome.value
                 else:
                     errors.append(outcome.error)
 
-            executor.map(functools.partial(draw_exhibit, settings=settings), exhibits, on_result)
+            executor.map(functools.partial(draw_figure, settings=settings), figures, on_result)
         if errors:
             raise errors[0]
         return drawn

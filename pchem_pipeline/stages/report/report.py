@@ -17,12 +17,9 @@ from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.grown import marginal_mass
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, describe
 from pchem_pipeline.report.data import PixelFit, ReportData
-from pchem_pipeline.report.figures.discrepancy_exhibits import DISCREPANCY_NAMES
-from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES
-from pchem_pipeline.report.figures.method_exhibits import METHOD_FIGURE
-from pchem_pipeline.report.figures.plan_exhibits import PLAN_FIGURE
-from pchem_pipeline.report.pages.captions import case_name
-from pchem_pipeline.report.pages.discrepancy_page import DISCREPANCY_PAGE
+from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
+from pchem_pipeline.report.figures.ensemble import case_name
+from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import read_discrepancy
@@ -37,8 +34,8 @@ from pchem_pipeline.stages.table import pipeline
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.report.settings import ReportSettings
-    from pchem_pipeline.report.style.pictures import DrawAll
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
     from pchem_pipeline.store.run_store import RunStore
@@ -149,12 +146,7 @@ def _write(
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):
-        if old.name not in rendered.figures and old.stem in (
-            *EXHIBIT_NAMES,
-            *DISCREPANCY_NAMES,
-            METHOD_FIGURE,
-            PLAN_FIGURE,
-        ):
+        if old.name not in rendered.figures and old.stem in FIGURE_NAMES:
             old.unlink(missing_ok=True)
     for name, page in rendered.pages.items():
         store.write_file(name, page.encode())

@@ -16,9 +16,9 @@ from pchem_pipeline.base.errors import IncompleteRunError
 from pchem_pipeline.compute import fresh_processes
 from pchem_pipeline.compute.executor import SerialExecutor, Stop
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
-from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, exhibits
+from pchem_pipeline.report.figures.catalogue import report_figures
+from pchem_pipeline.report.pages.pictures import Drawn, draw_figure, longest_first
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import Drawn, draw_exhibit, longest_first
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_executor
 
@@ -64,9 +64,11 @@ def test_a_stop_ends_the_work() -> None:
 
 def test_figures_are_the_same_whoever_draws_them() -> None:
     shown = [
-        e for e in exhibits(report_data((12, 16)), QUICK) if e.name in ("fit_status", "component_widths")
+        each
+        for each in report_figures(report_data((12, 16)), QUICK)
+        if each.name in ("fit_status", "component_widths")
     ]
-    here = {exhibit.name: draw_exhibit(exhibit, QUICK) for exhibit in shown}
+    here = {figure.name: draw_figure(figure, QUICK) for figure in shown}
     reporter = Reporter("off", quiet=True)
     assert draw_by_workers(2, reporter, "report")(shown, QUICK) == here
     assert all(isinstance(drawn, Drawn) and drawn.files for drawn in here.values())
@@ -75,9 +77,10 @@ def test_figures_are_the_same_whoever_draws_them() -> None:
 def test_one_worker_draws_here_and_wide_figures_come_first() -> None:
     assert isinstance(drawing_executor(1, 9), SerialExecutor)
     assert isinstance(drawing_executor(8, 1), SerialExecutor)
-    order = longest_first(exhibits(report_data((12, 16)), QUICK))
-    assert {exhibit.name for exhibit in order} == set(EXHIBIT_NAMES)
-    assert np.all(np.diff([exhibit.width_mm for exhibit in order]) <= 0)
+    figures = report_figures(report_data((12, 16)), QUICK)
+    order = longest_first(figures)
+    assert {figure.name for figure in order} == {figure.name for figure in figures}
+    assert np.all(np.diff([figure.width_mm for figure in order]) <= 0)
 
 
 def test_a_process_whose_parent_is_gone_ends_without_a_word() -> None:

@@ -18,9 +18,11 @@ from pchem_pipeline.planning.split import best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import verify, verify_samples
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.figure_data import csv_text, figure_tables
-from pchem_pipeline.report.figures.plan_exhibits import plan_exhibits, plan_tables
+from pchem_pipeline.report.figures.figure import csv_text
+from pchem_pipeline.report.figures.plan import plan_figures
+from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.stages.report.plan_section import plan_section
 
 GAIN = 1 / 11
@@ -309,12 +311,13 @@ def test_the_section_of_the_report_is_of_the_median_pixel():
     assert section["rows"][0]["frames"] == frames_needed(ONE_PERCENT, point())
     assert section["reached"]["conversion_gain"] == pytest.approx(0.0028, abs=5e-5)
     data = ReportData(title="a run", shape=(2, 2), plan=section)
-    [exhibit] = plan_exhibits(data)
-    assert exhibit.draw(88.0).axes
-    [table] = plan_tables(data)
+    settings = ReportSettings()
+    [figure] = plan_figures(data, settings)
+    assert figure.draw(Look(88.0)).axes
+    [table] = [table for table in result_tables(data) if table.section == "plan"]
     assert table.rows[0][2] == "0.28 %"
     assert {len(row) for row in table.rows} == {len(table.head)}
-    [numbers] = figure_tables(exhibit, data, ReportSettings())
+    [numbers] = figure.tables
     assert len(csv_text(numbers).splitlines()) == 1 + section["contours"]["exposures"].size ** 2
     assert plan_section({name: np.full((2, 2), np.nan) for name in maps}, 10) is None
-    assert plan_exhibits(ReportData(title="a run", shape=(2, 2))) == []
+    assert plan_figures(ReportData(title="a run", shape=(2, 2)), settings) == []

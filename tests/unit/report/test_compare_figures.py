@@ -7,9 +7,10 @@ import pytest
 
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.model.checks.run_differences import compare_maps
-from pchem_pipeline.report.figures.compare_figures import difference_map, ensembles
-from pchem_pipeline.report.pages.compare_data import RunFacts
+from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
+from pchem_pipeline.report.comparison import RunFacts
+from pchem_pipeline.report.figures.compare import draw_difference, draw_ensembles, ensemble_tables
+from pchem_pipeline.report.style.style import Drawing, Look
 
 
 def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):
@@ -20,10 +21,14 @@ def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):
     return compare_maps((one, error), (other, error), np.ones(shape, bool), same_data=same_data)
 
 
+def drawn(found: MapDifference, *, same_data: bool) -> Drawing:
+    return draw_difference(Look(), z=found.z, n_far=found.n_far, title="bias: B − A", same_data=same_data)
+
+
 @pytest.mark.parametrize("shape", [(12, 16), (1, 9), (40, 4)])
 def test_maps_of_differences_of_all_shapes(shape: tuple[int, int]) -> None:
     found = difference(shape, 1.4)
-    figure = difference_map(found, "bias: B − A", same_data=False)
+    figure = drawn(found, same_data=False)
     top, bottom = figure.axes[:2]
     if min(shape) > 1:
         np.testing.assert_allclose(np.asarray(top.images[0].get_array(), dtype=float), found.z)
@@ -34,12 +39,12 @@ def test_maps_of_differences_of_all_shapes(shape: tuple[int, int]) -> None:
 
 def test_tiny_differences_of_the_same_frames_are_seen() -> None:
     found = difference((12, 16), 3e-9, same_data=True)
-    figure = difference_map(found, "bias: B − A", same_data=True)
+    figure = drawn(found, same_data=True)
     assert figure.axes[1].get_xlabel() == "difference (10⁻⁹ standard errors)"
     assert 1.0 <= figure.axes[0].images[0].get_clim()[1] < 10.0
     assert not figure.axes[1].lines
     nothing = difference((12, 16), 0.0, same_data=True)
-    assert difference_map(nothing, "bias: B − A", same_data=True).axes[0].images[0].get_clim() == (-1.0, 1.0)
+    assert drawn(nothing, same_data=True).axes[0].images[0].get_clim() == (-1.0, 1.0)
 
 
 def run_facts(label: str, mean: float) -> RunFacts:
@@ -51,13 +56,16 @@ def run_facts(label: str, mean: float) -> RunFacts:
 
 
 def test_ensembles_lie_over_each_other() -> None:
-    figure = ensembles([run_facts("A", 100.0), run_facts("B", 104.0)])
+    figure = draw_ensembles(
+        Look(180.0), tables=ensemble_tables([run_facts("A", 100.0), run_facts("B", 104.0)])
+    )
     top, strip = figure.axes
     assert [line.get_label() for line in top.lines] == ["A (A\\$x\\$.zarr)", "B (B\\$x\\$.zarr)"]
     z = np.asarray(strip.lines[0].get_ydata())
     # f(x - 4) - f(x) of N(0, 8^2) is 0.0149 at most, its error sqrt(1050) / 20,000: 9.2, and chance
     assert 7 < np.abs(z).max() < 13
-    assert len(ensembles([RunFacts("A", "a", (8, 8), 1, ""), run_facts("B", 99.0)]).axes) == 1
+    odd = ensemble_tables([RunFacts("A", "a", (8, 8), 1, ""), run_facts("B", 99.0)])
+    assert len(draw_ensembles(Look(), tables=odd).axes) == 1
 
 
 def test_settings_that_differ_name_their_readers() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,26 +19,22 @@ from pchem_pipeline.base.variables import variables_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.registry import effect_class
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.data import DiscrepancyData, ReportData
 from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_series
-from pchem_pipeline.report.figures.discrepancy_exhibits import (
-    DISCREPANCY_NAMES,
-    discrepancy_exhibits,
-    telling_pulls,
-)
-from pchem_pipeline.report.figures.discrepancy_maps import telling_maps
-from pchem_pipeline.report.figures.exhibits import Exhibit
+from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, discrepancy_figures
+from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
+from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
-from pchem_pipeline.report.pages.discrepancy_data import DiscrepancyData
-from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables
-from pchem_pipeline.report.pages.discrepancy_text import remarks
+from pchem_pipeline.report.pages.discrepancy import discrepancy_tables, remarks
+from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
-from pchem_pipeline.report.pages.verdict import flags
+from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import Picture
-from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
 
+DISCREPANCY_NAMES = [name for _, name in DISCREPANCY_FIGURES]
 QUICK = ReportSettings(figure_formats=(), dpi=72)
 HOSTILE = '<script>alert("x")</script>$x^{ \'{{ 7*7 }}'
 
@@ -75,10 +72,10 @@ def base() -> ReportData:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
-    def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> object:
-        return Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
+    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
+        return {figure.name: Drawn("data:image/png;base64,AA==", "", 10, 10) for figure in figures}
 
-    monkeypatch.setattr(report_module, "draw_picture", dot)
+    monkeypatch.setattr(report_module, "draw_here", dots)
 
 
 def rendered(base: ReportData, data: DiscrepancyData | None) -> RenderedReport:
@@ -159,7 +156,7 @@ def test_every_figure_is_drawn_and_described_with_numbers(base: ReportData) -> N
     )
     page = harmless(report.pages["discrepancy.html"])
     shown = [str(a["id"]).removeprefix("figure-") for tag, a in page.tags if tag == "figure"]
-    assert shown == list(DISCREPANCY_NAMES)
+    assert shown == DISCREPANCY_NAMES
     assert {f"{name}.svg" for name in DISCREPANCY_NAMES} <= set(report.figures)
     alts = [str(a["alt"]) for tag, a in page.tags if tag == "img"]
     assert all(re.search(r"\d", alt) and len(alt) > 60 for alt in alts)
@@ -202,19 +199,19 @@ def test_hostile_words_are_shown_not_run(base: ReportData) -> None:
 
 def test_hostile_tags_are_drawn_as_they_are() -> None:
     spoiled = json.loads(json.dumps(result("named")).replace("row_noise", "<script>$x^{"))
-    for exhibit in discrepancy_exhibits(DiscrepancyData(Verdict.model_validate(spoiled))):
-        exhibit.draw(COLUMN_MM)
+    for figure in discrepancy_figures(DiscrepancyData(Verdict.model_validate(spoiled))):
+        figure.draw(Look())
 
 
 def test_each_array_may_be_missing() -> None:
     whole = discrepancy_data("named")
-    names = [exhibit.name for exhibit in discrepancy_exhibits(whole)]
-    assert names == list(DISCREPANCY_NAMES)
+    names = [figure.name for figure in discrepancy_figures(whole)]
+    assert names == DISCREPANCY_NAMES
     for key in whole.arrays:
         arrays = {k: v for k, v in whole.arrays.items() if k != key}
-        for exhibit in discrepancy_exhibits(replace(whole, arrays=arrays)):
-            assert exhibit.alt
-    assert [e.name for e in discrepancy_exhibits(replace(whole, arrays={}))] == [
+        for figure in discrepancy_figures(replace(whole, arrays=arrays)):
+            assert figure.alt
+    assert [e.name for e in discrepancy_figures(replace(whole, arrays={}))] == [
         "discrepancy_gap",
         "discrepancy_pulls",
     ]
@@ -223,13 +220,13 @@ def test_each_array_may_be_missing() -> None:
 @pytest.mark.parametrize("shape", [(1, 6), (3, 3), (2, 90)])
 def test_odd_sensors_are_drawn(shape: tuple[int, int]) -> None:
     arrays = evidence_arrays(evidence(shape, n_frames=40))
-    for exhibit in discrepancy_exhibits(DiscrepancyData(verdict_of("named"), arrays)):
-        exhibit.draw(COLUMN_MM)
+    for figure in discrepancy_figures(DiscrepancyData(verdict_of("named"), arrays)):
+        figure.draw(Look())
 
 
 def test_ready_made_histograms_have_no_pictures_of_time() -> None:
     arrays = evidence_arrays(replace(evidence((1, 5)), time=None))
-    names = [e.name for e in discrepancy_exhibits(DiscrepancyData(verdict_of("consistent"), arrays))]
+    names = [e.name for e in discrepancy_figures(DiscrepancyData(verdict_of("consistent"), arrays))]
     assert "discrepancy_frames" not in names
     assert "discrepancy_lines" not in names
     assert "discrepancy_codes" in names
@@ -279,16 +276,17 @@ def test_the_path_of_a_drift_is_what_the_frames_show() -> None:
     assert path_arrays(replace(seen, time=None), [effect_class("exposure_drift")(drift=0.02)]) == {}
 
 
-def test_the_telling_maps_are_those_with_structure() -> None:
-    words = [each.words for each in telling_maps(discrepancy_data().arrays)]
+def test_the_largest_maps_are_those_with_structure() -> None:
+    words = [each.words for each in largest_maps(discrepancy_data().arrays)]
     assert words[0].startswith("goodness of fit")
     assert words[1] == "readout: heavy tails (He4)"
-    assert telling_maps({}) == []
+    assert largest_maps({}) == []
 
 
 def test_a_comb_a_pile_up_and_an_alternation_are_in_the_numbers() -> None:
     arrays = discrepancy_data().arrays
-    dn, residual = discrepancy_series.code_residuals(arrays)
+    table = discrepancy_series.code_table(arrays)
+    dn, residual = table["dn"], table["residual"]
     assert dn[np.argmax(residual)] == 150
     number = np.arange(400)
     noise = np.random.default_rng(1).standard_normal(400)
@@ -320,9 +318,9 @@ def test_the_gap_has_a_line_for_every_model() -> None:
 
 def test_pulls_come_from_the_steps_or_from_the_vectors() -> None:
     data = discrepancy_data("named")
-    assert [round(p.before, 1) for p in telling_pulls(data)[:2]] == [84.0, -31.2]
+    assert [round(p.before, 1) for p in largest_pulls(data)[:2]] == [84.0, -31.2]
     bare = replace(data, found=verdict_of("consistent"))
-    pulls = telling_pulls(bare)
+    pulls = largest_pulls(bare)
     assert len(pulls) == 12
     assert pulls[0].sentence == STATISTICS[pulls[0].statistic].sentence
     largest = max(np.nanmax(np.abs(data.arrays[name])) for name in ("z_before", "z_after"))

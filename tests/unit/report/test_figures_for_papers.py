@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from helpers.discrepancy_material import discrepancy_data
 from helpers.report_material import report_data
 from matplotlib.colors import to_rgb
 from matplotlib.patches import StepPatch
@@ -18,24 +20,24 @@ from PIL import Image
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.figures import millimetres
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.drawn_data import drawn_tables
-from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
-from pchem_pipeline.report.figures.figure_data import DataTable, csv_text, figure_tables
+from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES, run_figures
+from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
 from pchem_pipeline.report.figures.paper import PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import BLUE, VERMILION, style_sheet
+from pchem_pipeline.report.style.palette import LIGHT
+from pchem_pipeline.report.style.style import Look
 
 SETTINGS = ReportSettings()
 
 
 @pytest.fixture(scope="module")
 def data() -> ReportData:
-    return report_data((12, 16), failed=0.05)
+    return replace(report_data((12, 16), failed=0.05), discrepancy=discrepancy_data("named"))
 
 
 @pytest.fixture(scope="module")
-def found(data: ReportData) -> dict[str, Exhibit]:
-    return {exhibit.name: exhibit for exhibit in exhibits(data, SETTINGS)}
+def found(data: ReportData) -> dict[str, Figure]:
+    return {figure.name: figure for figure in run_figures(data, SETTINGS)}
 
 
 def rows_of(content: bytes) -> list[dict[str, str]]:
@@ -46,30 +48,30 @@ def numbers(rows: list[dict[str, str]], heading: str) -> np.ndarray:
     return np.array([float(row[heading] or "nan") for row in rows])
 
 
-def test_every_figure_of_the_report_has_tables(data: ReportData, found: dict[str, Exhibit]) -> None:
-    own = [name for name, exhibit in found.items() if figure_tables(exhibit, data, SETTINGS)]
-    assert len(own) >= 12
-    assert set(found) <= set(EXHIBIT_NAMES)
-    for exhibit in found.values():
-        # a figure without tables of its own tells what is drawn
-        tables = figure_tables(exhibit, data, SETTINGS) or drawn_tables(exhibit.draw(88.0))
-        assert tables
-        for table in tables:
-            assert len({len(values) for values in table.columns.values()}) == 1
-            assert len(rows_of(csv_text(table).encode())) == len(next(iter(table.columns.values()))) > 0
-        assert len({table.part for table in tables}) == len(tables)
-    assert figure_tables(Exhibit("new", "", "", "", "", lambda width_mm: None), data, SETTINGS) is None
+def test_every_figure_has_tables(found: dict[str, Figure]) -> None:
+    assert len(found) >= 20
+    assert set(found) <= set(FIGURE_NAMES)
+    for figure in found.values():
+        assert figure.tables
+        for table in figure.tables:
+            rows = rows_of(csv_text(table).encode())
+            assert len(rows) == next(iter(table.flat().values())).size > 0
+            assert not any(np.size(row) == 0 for row in rows)
+        assert len({table.part for table in figure.tables}) == len(figure.tables)
 
 
-def test_the_numbers_are_those_drawn(data: ReportData, found: dict[str, Exhibit]) -> None:
-    files = draw_paper_figure(
-        PaperFigure(found["map_bias"], figure_tables(found["map_bias"], data, SETTINGS), ())
-    )
+def test_columns_of_different_lengths_are_refused() -> None:
+    with pytest.raises(ValueError, match="different shapes"):
+        csv_text(DataTable({"a": [1, 2], "b": [1]}))
+
+
+def test_the_numbers_are_those_drawn(data: ReportData, found: dict[str, Figure]) -> None:
+    files = draw_paper_figure(PaperFigure(found["map_bias"], ()))
     rows = rows_of(files["map_bias_histogram.csv"])
-    figure = found["map_bias"].draw(88.0)
+    figure = found["map_bias"].draw(Look(88.0))
     [steps] = [artist for artist in figure.axes[0].patches if isinstance(artist, StepPatch)]
     np.testing.assert_array_equal(numbers(rows, "pixels"), steps.get_data().values)
-    np.testing.assert_array_equal(numbers(rows, "bias (DN) to"), steps.get_data().edges[1:])
+    np.testing.assert_array_equal(numbers(rows, "bias to (DN)"), steps.get_data().edges[1:])
     rows = rows_of(files["map_bias.csv"])
     place = 5 * 16 + 3
     assert (rows[place]["y (pixel)"], rows[place]["x (pixel)"]) == ("5", "3")
@@ -92,12 +94,12 @@ def test_the_numbers_are_those_drawn(data: ReportData, found: dict[str, Exhibit]
     ],
 )  # fmt: skip
 def test_tables_agree_with_the_lines_of_the_figure(
-    data: ReportData, found: dict[str, Exhibit], name: str, part: str, x: str, y: str, label: str
+    found: dict[str, Figure], name: str, part: str, x: str, y: str, label: str
 ) -> None:
-    tables = {table.part: table for table in figure_tables(found[name], data, SETTINGS) or []}
-    columns = (np.asarray(tables[part].columns[each], dtype=float) for each in (x, y))
+    tables = {table.part: table.flat() for table in found[name].tables}
+    columns = (np.asarray(tables[part][each], dtype=float) for each in (x, y))
     known = dict(zip(*columns, strict=True))
-    axes = found[name].draw(180.0).axes[0]
+    axes = found[name].draw(Look(180.0)).axes[0]
     [line] = [each for each in axes.lines if str(each.get_label()).startswith(label)][:1]
     drawn = np.asarray(line.get_data(), dtype=float)
     assert drawn.shape[1] >= 4
@@ -105,34 +107,51 @@ def test_tables_agree_with_the_lines_of_the_figure(
 
 
 def test_residuals_of_pixels_have_the_size_that_chance_gives(
-    data: ReportData, found: dict[str, Exhibit]
+    data: ReportData, found: dict[str, Figure]
 ) -> None:
-    tables = {table.part: table for table in figure_tables(found["pixel_fits"], data, SETTINGS) or []}
-    residual = np.asarray(tables[""].columns["residual (standard deviations)"], dtype=float)
+    residuals, parameters = found["pixel_fits"].tables
+    residual = np.asarray(residuals.flat()["residual (standard deviations)"], dtype=float)
     known = residual[np.isfinite(residual)]
     assert known.size > 100
     # rounding to DN widens peaks a little: a tenth beyond five standard errors of a variance
     assert abs(np.mean(known**2) - 1) < 5 * np.sqrt(2 / known.size) + 0.1
-    assert tables["parameters"].columns["y (pixel)"] == [pixel.y for pixel in data.pixels]
+    assert parameters.flat()["y (pixel)"].tolist() == [pixel.y for pixel in data.pixels]
 
 
-def test_a_figure_without_tables_tells_what_is_drawn(found: dict[str, Exhibit]) -> None:
-    figure = found["electron_numbers"].draw(88.0)
-    [table] = drawn_tables(figure)
+def test_the_place_of_a_map_is_that_on_the_sensor() -> None:
+    table = DataTable({"z": np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])}, origin=(10, 20))
     rows = rows_of(csv_text(table).encode())
-    bars = [row for row in rows if row["series"] == "estimated electron numbers"]
-    heights = [patch.get_height() for patch in figure.axes[0].patches]
-    assert [float(row["y"]) for row in bars] == heights
-    assert {row["x is"] for row in rows} == {"electron number k (e⁻)"}
-    image = drawn_tables(found["fit_status"].draw(88.0))[-1]
-    assert image.part.startswith("image")
-    assert len(image.columns["value"]) == 12 * 16
+    assert [(row["y (pixel)"], row["x (pixel)"], row["z"]) for row in rows[1:4]] == [
+        ("10", "21", "2.0"),
+        ("10", "22", "3.0"),
+        ("11", "20", "4.0"),
+    ]
 
 
-def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Exhibit]) -> None:
-    wanted = PaperFigure(found["read_noise_histogram"], [], ("pdf", "png", "svg"), 120.0, 200)
+def test_what_a_verdict_draws_is_in_its_tables(found: dict[str, Figure]) -> None:
+    axes = found["discrepancy_codes"].draw(Look(180.0)).axes[0]
+    [observed] = [each for each in axes.patches if getattr(each, "get_label", str)() == "observed"]
+    np.testing.assert_array_equal(
+        found["discrepancy_codes"].tables[0]["observed"], observed.get_data().values
+    )
+    axes = found["discrepancy_frames"].draw(Look(180.0)).axes[1]
+    frames, stretches = found["discrepancy_frames"].tables
+    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+    np.testing.assert_array_equal(lines["named effects"], frames["readout, named effects"])
+    drawn = np.asarray(lines["mean of a stretch"], dtype=float)
+    np.testing.assert_array_equal(drawn[np.isfinite(drawn)], stretches["readout"])
+    axes = found["discrepancy_gap"].draw(Look(180.0)).axes[0]
+    gaps = found["discrepancy_gap"].tables[0]
+    floor = float(gaps["floor"][0])
+    assert [line.get_xdata()[0] for line in axes.lines if line.get_linewidth() == 0.9] == [floor]
+    assert "z" not in gaps
+    assert gaps.get("z") is None
+
+
+def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Figure]) -> None:
+    wanted = PaperFigure(found["read_noise_histogram"], ("pdf", "png", "svg"), 120.0, 200)
     files = draw_paper_figure(wanted)
-    assert set(files) == {f"read_noise_histogram.{kind}" for kind in ("pdf", "png", "svg")}
+    assert set(files) == {f"read_noise_histogram.{kind}" for kind in ("pdf", "png", "svg", "csv")}
     box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", files["read_noise_histogram.pdf"])
     assert box is not None
     assert float(box[1]) == pytest.approx(120.0 / 25.4 * 72, abs=0.05)
@@ -144,26 +163,27 @@ def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Exhibi
     assert draw_paper_figure(wanted) == files
 
 
-def test_a_style_sheet_prevails(found: dict[str, Exhibit], tmp_path: Path) -> None:
+def test_a_style_sheet_prevails(found: dict[str, Figure], tmp_path: Path) -> None:
     sheet = tmp_path / "mine.mplstyle"
     sheet.write_text(
         "axes.prop_cycle: cycler('color', ['112233', 'AA5500'])\naxes.linewidth: 2.5\nimage.cmap: cividis\n"
     )
-    with style_sheet(read_style_sheet(str(sheet))):
-        figure = found["map_bias"].draw(88.0)
+    look = Look.of_sheet(88.0, read_style_sheet(str(sheet)))
+    figure = found["map_bias"].draw(look)
     top, bottom = figure.axes[:2]
     assert top.spines["left"].get_linewidth() == 2.5
     assert bottom.images[0].get_cmap().name == "cividis"
     [median] = top.lines
     assert to_rgb(median.get_color()) == to_rgb("#112233")
-    plain = found["map_bias"].draw(88.0)
-    assert to_rgb(plain.axes[0].lines[0].get_color()) == to_rgb(BLUE)
+    plain = found["map_bias"].draw(Look(88.0))
+    assert to_rgb(plain.axes[0].lines[0].get_color()) == to_rgb(LIGHT.blue)
     assert plain.axes[1].images[0].get_cmap().name == "viridis"
     assert mpl.rcParams["axes.linewidth"] == mpl.rcParamsDefault["axes.linewidth"]
-    with style_sheet(read_style_sheet(str(sheet))):
-        status = found["fit_status"].draw(88.0).axes[0].images[0].get_cmap()
+    status = found["fit_status"].draw(look).axes[0].images[0].get_cmap()
     assert to_rgb(status(1)) == to_rgb("#AA5500")  # vermilion is the second colour
-    assert to_rgb(found["fit_status"].draw(88.0).axes[0].images[0].get_cmap()(1)) == to_rgb(VERMILION)
+    assert to_rgb(found["fit_status"].draw(Look(88.0)).axes[0].images[0].get_cmap()(1)) == to_rgb(
+        LIGHT.vermilion
+    )
 
 
 def test_wrong_style_sheets_get_one_line(tmp_path: Path) -> None:
@@ -192,8 +212,8 @@ def test_wrong_widths_show_how(text: str) -> None:
         millimetres(text)
 
 
-def test_a_saved_figure_keeps_the_style(found: dict[str, Exhibit], tmp_path: Path) -> None:
-    figure = found["electron_numbers"].draw(88.0)
+def test_a_saved_figure_keeps_the_style(found: dict[str, Figure], tmp_path: Path) -> None:
+    figure = found["electron_numbers"].draw(Look(88.0))
     figure.savefig(tmp_path / "a.pdf")
     assert b"/FontFile2" in (tmp_path / "a.pdf").read_bytes()
     with Image.open(io.BytesIO(figure._repr_png_())) as image:
@@ -201,5 +221,5 @@ def test_a_saved_figure_keeps_the_style(found: dict[str, Exhibit], tmp_path: Pat
 
 
 def test_headings_and_gaps_in_csv() -> None:
-    table = DataTable("", {"a, b (DN)": np.array([1.5, np.nan]), "n": [1, 2]})
+    table = DataTable({"a, b": np.array([1.5, np.nan]), "n": [1, 2]}, {"a, b": "DN"})
     assert csv_text(table) == '"a, b (DN)",n\n1.5,1\n,2\n'

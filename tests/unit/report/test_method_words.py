@@ -5,16 +5,16 @@ import json
 import pytest
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.figure_data import csv_text, figure_tables
-from pchem_pipeline.report.figures.method_exhibits import METHOD_FIGURE, method_exhibits, method_tables
-from pchem_pipeline.report.pages.method_words import (
+from pchem_pipeline.report.figures.figure import csv_text
+from pchem_pipeline.report.figures.methods import (
     bound_crossing,
+    crossing_words,
     measured_crossing,
-    method_rows,
-    methods_text,
-    verdict_words,
+    method_figures,
 )
+from pchem_pipeline.report.pages.methods import method_rows, method_tables, methods_text
 from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import Look
 
 
 def errors(rmse):
@@ -85,8 +85,8 @@ def test_the_crossing_is_interpolated():
     assert measured_crossing(STUDY) == pytest.approx(0.5 + 0.1 * 0.0953 / (0.0953 + 0.9445), abs=1e-3)
     assert bound_crossing(STUDY) > measured_crossing(STUDY)
     assert measured_crossing(STUDY[:2]) is None
-    assert "do not cross" in verdict_words(STUDY[:1])
-    assert "0.51 e- on the simulated pixels" in verdict_words(STUDY)
+    assert "do not cross" in crossing_words(STUDY[:1])
+    assert "0.51 e- on the simulated pixels" in crossing_words(STUDY)
 
 
 def test_the_text_has_a_row_for_every_method():
@@ -108,17 +108,17 @@ def test_against_a_fit_there_is_no_multiple_of_the_bound():
 
 def test_figure_and_table_of_the_report():
     data = ReportData(title="a run", shape=(8, 8), methods=json.loads(json.dumps(RESULT)))
-    [exhibit] = method_exhibits(data)
+    settings = ReportSettings()
+    [figure] = method_figures(data, settings)
     for width in (88.0, 180.0):
-        assert exhibit.draw(width).axes
+        assert figure.draw(Look(width)).axes
     [table] = method_tables(data)
     assert {len(row) for row in table.rows} == {len(table.head)}
     assert " e-" not in table.caption
     assert "0.51 e⁻" in table.caption
-    simulated, run = figure_tables(exhibit, data, ReportSettings())
-    assert exhibit.name == METHOD_FIGURE
+    simulated, run = figure.tables
     assert csv_text(simulated).splitlines()[1].startswith("0.3,0.005,0.03,0.3")
     assert csv_text(run).splitlines()[1] == "pchem_em,0.001,0.011,0.011,0.01"
-    assert method_exhibits(ReportData(title="a run", shape=(8, 8))) == []
+    assert method_figures(ReportData(title="a run", shape=(8, 8)), settings) == []
     empty = ReportData(title="a run", shape=(8, 8), methods={**RESULT, "study": [], "methods": []})
-    assert method_exhibits(empty)[0].draw(88.0).axes
+    assert method_figures(empty, settings)[0].draw(Look(88.0)).axes

@@ -8,32 +8,48 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from helpers.report_material import CASES, PARAMETERS, pixel_fit, report_data, true_maps
-from matplotlib.figure import Figure
 from PIL import Image
 
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
 from pchem_pipeline.report.data import PixelFit
-from pchem_pipeline.report.figures.ensemble_figures import component_widths, electron_numbers, ensemble
-from pchem_pipeline.report.figures.map_figures import (
-    fit_status_map,
-    map_and_histogram,
-    read_noise_histogram,
+from pchem_pipeline.report.figures.ensemble import (
+    component_table,
+    draw_components,
+    draw_electrons,
+    draw_ensemble,
+    ensemble_tables,
+)
+from pchem_pipeline.report.figures.figure import DataTable
+from pchem_pipeline.report.figures.maps import (
+    draw_map,
+    draw_read_noise,
+    draw_status,
+    histogram_table,
+    map_tables,
     status_counts,
 )
-from pchem_pipeline.report.figures.pixel_figures import PAPER_EXAMPLE, cluster_edges, pixel_fits, shown_bins
-from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, figure_bytes, small_png
+from pchem_pipeline.report.figures.pixels import (
+    PAPER_EXAMPLE,
+    cell_tables,
+    draw_cells,
+    draw_pixels,
+    shown_bins,
+)
+from pchem_pipeline.report.style.palette import DARK, LIGHT, palette_of
+from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, Drawing, Look, drawing_bytes, small_png
 
+LOOK = Look()
 WORDS = {int(bit): text for bit, text in MEANINGS.items()}
 
 
-def drawn(figure: Figure) -> bytes:
+def drawn(figure: Drawing) -> bytes:
     """Draw at low resolution; warnings are errors."""
-    content = figure_bytes(figure, "png", dpi=50)
+    content = drawing_bytes(figure, "png", dpi=50)
     assert content.startswith(b"\x89PNG")
     return content
 
 
-def texts(figure: Figure) -> str:
+def texts(figure: Drawing) -> str:
     found = [text.get_text() for text in figure.findobj(mpl.text.Text)]
     return "\n".join(found)
 
@@ -51,7 +67,7 @@ EMPTY_PIXEL = replace(NAN_PIXEL, counts=np.zeros(4, dtype=np.uint16))
 
 
 def test_cluster_edges_of_the_paper_lie_at_the_optimal_thresholds() -> None:
-    figure = cluster_edges(PAPER_EXAMPLE)
+    figure = draw_cells(LOOK, tables=cell_tables(PAPER_EXAMPLE))
     lines = figure.axes[0].collections[0].get_segments()
     edges = np.array([segment[0, 0] for segment in lines])
     k = np.arange(edges.size)
@@ -71,12 +87,13 @@ def test_cluster_edges_of_the_paper_lie_at_the_optimal_thresholds() -> None:
     ],
 )
 def test_cluster_edges_of_odd_pixels(pixel: PixelFit, change: dict[str, float]) -> None:
-    drawn(cluster_edges({**pixel.parameters, **change}, counts=pixel.counts, origin=pixel.origin))
+    odd = replace(pixel, parameters={**pixel.parameters, **change})
+    drawn(draw_cells(LOOK, tables=cell_tables(odd.parameters, odd)))
 
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_pixel_fits_show_parameters_with_errors_and_the_status(pixel: PixelFit, width: float) -> None:
-    figure = pixel_fits([pixel, NAN_PIXEL, EMPTY_PIXEL], width_mm=width)
+    figure = draw_pixels(Look(width), pixels=[pixel, NAN_PIXEL, EMPTY_PIXEL])
     words = texts(figure)
     assert "± 0.012 e⁻" in words
     assert "fewer than 3 occupied bins" in words
@@ -88,14 +105,14 @@ def test_pixel_fits_show_parameters_with_errors_and_the_status(pixel: PixelFit, 
 
 def test_residuals_beyond_the_strip_are_marked(pixel: PixelFit) -> None:
     wrong = replace(pixel, parameters={**pixel.parameters, "bias": pixel.parameters["bias"] + 5.0})
-    assert "beyond 12 σ" in texts(pixel_fits([wrong]))
+    assert "beyond 12 σ" in texts(draw_pixels(LOOK, pixels=[wrong]))
 
 
 def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
     counts = np.zeros(5000, dtype=np.int64)
     counts[: pixel.counts.size] = pixel.counts
     counts[4999] = 1
-    figure = pixel_fits([replace(pixel, counts=counts)])
+    figure = draw_pixels(LOOK, pixels=[replace(pixel, counts=counts)])
     assert np.ptp(figure.subfigs[0].axes[0].get_xlim()) < 400
     assert "1 outside the axis" in texts(figure)
     drawn(figure)
@@ -139,6 +156,14 @@ def _map(kind: str) -> np.ndarray:
     return values
 
 
+def bias(values: np.ndarray) -> Drawing:
+    return draw_map(LOOK, tables=map_tables(values, "bias", None, 128), name="bias")
+
+
+def read_noise(values: np.ndarray) -> Drawing:
+    return draw_read_noise(LOOK, values=values, bins=histogram_table(values, "read_noise_e", 128))
+
+
 KINDS = (
     *["plain", "hot", "holes", "empty", "constant", "decades", "tiny", "wide", "column", "long", "channels"],
     "one value",
@@ -150,21 +175,22 @@ KINDS = (
 def test_maps_of_all_kinds(kind: str) -> None:
     values = _map(kind)
     for stretch in ("beta", "linear") if kind in ("hot", "empty", "constant") else ("beta",):
-        figure = map_and_histogram(values, "dark_current", stderr=np.abs(values) / 100, stretch=stretch)
+        tables = map_tables(values, "dark_current", np.abs(values) / 100, 128)
+        figure = draw_map(LOOK, tables=tables, name="dark_current", stretch=stretch)
         assert "(e⁻/px/s)" in texts(figure)
         drawn(figure)
-    drawn(read_noise_histogram(values))
+    drawn(read_noise(values))
 
 
 def test_pixels_without_a_value_are_counted_in_the_map() -> None:
     values = _map("holes")
-    assert f"no value: {np.isnan(values).sum()} pixels" in texts(map_and_histogram(values, "bias"))
-    assert "no value:" not in texts(map_and_histogram(_map("plain"), "bias"))
+    assert f"no value: {np.isnan(values).sum()} pixels" in texts(bias(values))
+    assert "no value:" not in texts(bias(_map("plain")))
 
 
 def test_the_median_of_the_read_noise_is_marked() -> None:
     values = _map("plain") * 0.15
-    figure = read_noise_histogram(values)
+    figure = read_noise(values)
     positions = [line.get_xdata()[0] for line in figure.axes[0].lines]
     assert np.median(values) in positions
     assert f"median {np.median(values):.3f} e⁻" in texts(figure)
@@ -175,7 +201,7 @@ def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
     status = np.zeros(shape, dtype=np.uint16)
     status[0, 0] = int(FitStatus.TOO_FEW_BINS)
     status[0, 1] = int(FitStatus.POOR_FIT | FitStatus.BIAS_AMBIGUOUS)
-    figure = fit_status_map(status, WORDS)
+    figure = draw_status(LOOK, status=status, rows=status_counts(status, WORDS))
     words = texts(figure).replace("\n", " ")
     for bit in (FitStatus.TOO_FEW_BINS, FitStatus.POOR_FIT, FitStatus.BIAS_AMBIGUOUS):
         assert f"{MEANINGS[bit]}: 1" in words
@@ -186,7 +212,7 @@ def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
 def test_pixels_that_no_fit_has_reached_are_not_called_good() -> None:
     status, missing = np.zeros((6, 8), dtype=np.uint16), np.zeros((6, 8), dtype=bool)
     missing[:2] = True
-    words = texts(fit_status_map(status, WORDS, unfitted=missing))
+    words = texts(draw_status(LOOK, status=status, rows=status_counts(status, WORDS), unfitted=missing))
     assert "not fitted yet: 16 (33 %)" in words
     assert "good fit: 32 (67 %)" in words
 
@@ -196,7 +222,7 @@ def test_every_status_at_once_and_unknown_bits() -> None:
     rows = status_counts(status, WORDS)
     assert sum(n for _, _, n in rows) == 16
     assert any("status bit 32768" in text for _, text, _ in rows)
-    drawn(fit_status_map(status, WORDS))
+    drawn(draw_status(LOOK, status=status, rows=status_counts(status, WORDS)))
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +235,7 @@ RMSE = {"epcd_exact": 1.3e-4, "noise_floor": 1.2e-4, "nuced_exact": 2e-4}
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_ensemble_shows_both_halves_with_rmse(arrays: dict[str, np.ndarray], width: float) -> None:
-    figure = ensemble(arrays, RMSE, n_frames=250, width_mm=width)
+    figure = draw_ensemble(Look(width), tables=ensemble_tables(arrays), rmse=RMSE, n_frames=250)
     words = texts(figure)
     assert "exact mean over pixels, RMSE 1.3×10⁻⁴" in words
     assert "sampling noise alone, RMSE 1.2×10⁻⁴" in words
@@ -234,65 +260,58 @@ def _half(arrays: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
 def test_ensemble_with_parts_missing(
     arrays: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
 ) -> None:
-    drawn(ensemble(change(arrays), {}))
+    drawn(draw_ensemble(LOOK, tables=ensemble_tables(change(arrays)), rmse={}))
 
 
 def test_electron_numbers(arrays: dict[str, np.ndarray]) -> None:
-    k, mass, pmf = (arrays[name] for name in ("k", "electron_mass", "electron_pmf"))
-    drawn(
-        electron_numbers(k, mass, pmf, pmf_map=arrays["electron_pmf_map"], counts=arrays["electron_counts"])
-    )
-    drawn(electron_numbers(k[:1], np.ones(1), np.ones(1)))
-    drawn(electron_numbers(k, np.zeros(k.size), np.zeros(k.size), counts=np.zeros(k.size)))
+    names = ("k", "electron_mass", "electron_pmf", "electron_pmf_map", "electron_counts")
+    k = arrays["k"]
+    drawn(draw_electrons(LOOK, table=DataTable({name: arrays[name] for name in names})))
+    one = {"k": k[:1], "electron_mass": np.ones(1), "electron_pmf": np.ones(1)}
+    drawn(draw_electrons(LOOK, table=DataTable(one)))
+    none = {name: np.zeros(k.size) for name in names if name != "electron_pmf_map"} | {"k": k}
+    drawn(draw_electrons(LOOK, table=DataTable(none)))
 
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_component_widths(arrays: dict[str, np.ndarray], width: float) -> None:
     variance = arrays["component_variance"]
-    k = np.arange(variance.shape[1])
-    figure = component_widths(
-        k,
-        variance,
-        CASES,
-        nuced_variance=arrays["nuced_component_variance"],
-        highlight=("none", "H, g"),
-        width_mm=width,
-    )
+    table = component_table(variance, CASES, arrays["nuced_component_variance"])
+    figure = draw_components(Look(width), table=table, highlight=("none", "H, g"))
     assert "constant: H, g" in texts(figure)
     drawn(figure)
-    drawn(component_widths(k[:1], variance[:1, :1], CASES[:1]))
-    drawn(component_widths(k, np.zeros_like(variance), CASES))
+    drawn(draw_components(LOOK, table=component_table(variance[:1, :1], CASES[:1])))
+    drawn(draw_components(LOOK, table=component_table(np.zeros_like(variance), CASES)))
 
 
 @pytest.mark.parametrize("kind", ["svg", "png", "pdf"])
 def test_the_same_figure_gives_the_same_bytes(pixel: PixelFit, kind: str) -> None:
-    parameters, counts, origin = pixel.parameters, pixel.counts, pixel.origin
+    tables = cell_tables(pixel.parameters, pixel)
     first, second = (
-        figure_bytes(cluster_edges(parameters, counts=counts, origin=origin), kind, dpi=60, title="a <title>")
-        for _ in range(2)
+        drawing_bytes(draw_cells(LOOK, tables=tables), kind, dpi=60, title="a <title>") for _ in range(2)
     )
     assert first == second
 
 
 def test_fonts_are_embedded(pixel: PixelFit) -> None:
-    figure = cluster_edges(pixel.parameters)
-    svg = figure_bytes(figure, "svg").decode()
+    figure = draw_cells(LOOK, tables=cell_tables(pixel.parameters))
+    svg = drawing_bytes(figure, "svg").decode()
     assert "<text" not in svg
-    pdf = figure_bytes(figure, "pdf")
+    pdf = drawing_bytes(figure, "pdf")
     assert b"/FontFile2" in pdf
 
 
 def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
     with mpl.rc_context({"font.size": 31.0, "axes.facecolor": "red"}):
         before = dict(mpl.rcParams)
-        figure = cluster_edges(pixel.parameters)
-        figure_bytes(figure, "svg")
+        figure = draw_cells(LOOK, tables=cell_tables(pixel.parameters))
+        drawing_bytes(figure, "svg")
         assert dict(mpl.rcParams) == before
         assert figure.axes[0].get_facecolor() != (1.0, 0.0, 0.0, 1.0)
 
 
 def test_a_palette_does_not_change_a_map_visibly() -> None:
-    full = figure_bytes(map_and_histogram(_map("holes"), "bias"), "png", dpi=150)
+    full = drawing_bytes(bias(_map("holes")), "png", dpi=150)
     few = small_png(full)
     assert len(few) < len(full)
     before, after = (
@@ -300,3 +319,17 @@ def test_a_palette_does_not_change_a_map_visibly() -> None:
     )
     assert np.abs(before - after).mean() < 1.0
     assert np.abs(before - after).max() < 32
+
+
+def test_dark_paper_has_light_ink() -> None:
+    """Same lines, other colours: nothing is drawn dark on dark."""
+    light, dark = (
+        draw_cells(Look(palette=each), tables=cell_tables(PAPER_EXAMPLE)) for each in (LIGHT, DARK)
+    )
+    assert texts(light) == texts(dark)
+    np.testing.assert_array_equal(light.axes[0].lines[0].get_data(), dark.axes[0].lines[0].get_data())
+    with Image.open(io.BytesIO(drawing_bytes(dark, "png", dpi=50))) as image:
+        assert np.asarray(image.convert("L")).mean() < 60
+    assert dark.axes[0].lines[0].get_color() == DARK.ink
+    assert palette_of(mpl.style.library["dark_background"]).ink == "#ffffff"
+    assert palette_of({}) == LIGHT

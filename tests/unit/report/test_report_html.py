@@ -4,7 +4,7 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -14,13 +14,25 @@ from helpers.report_material import pixel_fit, report_data, true_maps
 
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import MAP_NAMES, ReportData
-from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES, Exhibit, exhibits
+from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figures
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.inspector.inspector import script
 from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
-from pchem_pipeline.report.pages.verdict import flags, sentence
+from pchem_pipeline.report.pages.summary import flags, sentence
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import Picture
+
+#: Of one exposure, with nothing compared or planned.
+NOT_HERE = {
+    "exposures",
+    "photon_transfer",
+    "map_charge_per_level",
+    "map_spurious_charge",
+    "methods_gain_error",
+    "frames_needed",
+}
+FIGURES = tuple(name for _, names in REPORT_FIGURES for name in names if name not in NOT_HERE)
 
 #: Fast drawings: no files, coarse maps.
 QUICK = ReportSettings(figure_formats=(), dpi=72)
@@ -100,9 +112,9 @@ def test_every_figure_of_the_paper_is_there_and_described(
 ) -> None:
     images = list(page.of("img"))
     shown = {str(a["id"]).removeprefix("figure-") for a in page.of("figure")}
-    assert shown == set(EXHIBIT_NAMES)
-    assert set(report.figures) == {f"{name}.svg" for name in EXHIBIT_NAMES}
-    assert len(images) == len(EXHIBIT_NAMES)
+    assert shown == set(FIGURES)
+    assert set(report.figures) == {f"{name}.svg" for name in FIGURES}
+    assert len(images) == len(FIGURES)
     for image in images:
         alt = str(image["alt"])
         assert re.search(r"\d", alt), alt
@@ -158,10 +170,10 @@ def test_the_tables_are_there(page: Page, words: str) -> None:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
-    def dot(exhibit: Exhibit, settings: ReportSettings, figures: dict[str, bytes]) -> object:
-        return Picture(exhibit, "data:image/png;base64,AA==", "", 10, 10)
+    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
+        return {figure.name: Drawn("data:image/png;base64,AA==", "", 10, 10) for figure in figures}
 
-    monkeypatch.setattr(report_module, "draw_picture", dot)
+    monkeypatch.setattr(report_module, "draw_here", dots)
 
 
 HOSTILE = (
@@ -305,8 +317,8 @@ def test_settings_decide_files_and_stretch() -> None:
     rendered = render_report(lean, ReportSettings(figure_formats=("pdf",), dpi=72, map_stretch="linear"))
     assert {name.rsplit(".")[-1] for name in rendered.figures} == {"pdf"}
     assert "between the 1st and the 99th percentile" in rendered.html
-    names = [exhibit.name for exhibit in exhibits(data, QUICK)]
-    assert names == list(EXHIBIT_NAMES)
+    names = [figure.name for figure in report_figures(data, QUICK)]
+    assert names == list(FIGURES)
 
 
 def test_settings_refuse_doubles() -> None:
@@ -358,5 +370,5 @@ def test_unfinished_stages_and_high_read_noise_are_said(data: ReportData) -> Non
 def test_a_pixel_beside_its_numbers() -> None:
     pixel = pixel_fit(true_maps((4, 4)), 1, 2, "mine")
     data = replace(report_data((4, 4)), pixels=[pixel])
-    alt = next(e.alt for e in exhibits(data, QUICK) if e.name == "pixel_fits")
+    alt = next(e.alt for e in report_figures(data, QUICK) if e.name == "pixel_fits")
     assert f"quanta exposure {pixel.parameters['quanta_exposure']:.3f} ± 0.012 e⁻" in alt

@@ -16,8 +16,8 @@ from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.inspector.inspector import embedded
 from pchem_pipeline.report.pages import sections
-from pchem_pipeline.report.pages.answers import answers
 from pchem_pipeline.report.pages.sections import Section
+from pchem_pipeline.report.pages.summary import answers
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report import inspector
 from pchem_pipeline.stages.report.inspected_pixels import choose_inspected

@@ -14,11 +14,10 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.figures.exhibits import EXHIBIT_NAMES
-from pchem_pipeline.report.figures.plan_exhibits import PLAN_FIGURE
+from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, FIGURE_NAMES
 from pchem_pipeline.report.pages.report import RenderedReport
 from pchem_pipeline.report.pages.report_json import report_numbers
-from pchem_pipeline.report.pages.verdict import flags
+from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.runner import execute
@@ -26,6 +25,7 @@ from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.report import report
 from pchem_pipeline.stages.report.report import choose_pixels, gather
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
@@ -95,7 +95,9 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     context = make_context(folder, {"figure_formats": ["svg"]}, title="My <sensor>")
     assert execute("report", context).state == "complete"
     store = folder / "run.zarr"
-    names = {f"{name}.svg" for name in (*EXHIBIT_NAMES, PLAN_FIGURE)}
+    of_others = {"exposures", "photon_transfer", "map_charge_per_level", "map_spurious_charge"}
+    of_others |= {"methods_gain_error", *(name for _, name in DISCREPANCY_FIGURES)}
+    names = {f"{name}.svg" for name in set(FIGURE_NAMES) - of_others}
     assert {path.name for path in (store / "figures").iterdir()} == names
     numbers = json.loads((store / "report.json").read_text())
     median = float(np.nanmedian(context.store.read("maps/read_noise_e")))
@@ -116,14 +118,14 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     html = (store / "report.html").read_text(encoding="utf-8")
     assert "My &lt;sensor&gt;" in html
     assert str(folder) not in html
-    assert status(report, context).state == "complete"
+    assert status(STAGES["report"], context).state == "complete"
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_settings_of_the_report_make_only_it_stale(folder: Path) -> None:
     execute("report", make_context(folder))
     changed = make_context(folder, {"map_stretch": "linear"})
-    state = status(report, changed)
+    state = status(STAGES["report"], changed)
     assert state.state == "stale"
     assert "report.map_stretch beta -> linear" in state.why
 
@@ -185,7 +187,7 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     def fail(exhibit: object, settings: object) -> None:
         raise MemoryError("no room to draw")
 
-    monkeypatch.setattr("pchem_pipeline.stages.report.drawing.draw_exhibit", fail)
+    monkeypatch.setattr("pchem_pipeline.stages.report.drawing.draw_figure", fail)
     state = execute("report", make_context(folder))
     assert state.state == "failed"
     assert state.why.startswith("1 of 1 units failed, first all: out of memory (no room to draw); use fewer")

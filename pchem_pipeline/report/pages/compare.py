@@ -11,18 +11,14 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.model.checks.run_differences import FAR
-from pchem_pipeline.report.figures import compare_figures
-from pchem_pipeline.report.figures.exhibits import Exhibit, drawing
-from pchem_pipeline.report.pages.compare_data import Comparison, Pair
-from pchem_pipeline.report.pages.compare_tables import pair_tables, run_table
+from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, Setting
+from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
+from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report import template
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.pictures import DrawAll, Picture, draw_picture, ready_picture
-from pchem_pipeline.report.style.style import PAGE_MM
-from pchem_pipeline.report.style.wording import count, short, symbol
-
-__all__ = ["COMPARE_JSON", "COMPARE_PAGE", "COMPARE_VERSION", "render_comparison", "sentence_of"]
+from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
 
 #: Names of the files.
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
@@ -95,18 +91,14 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
         found: the comparison.
         draw: draws all figures at once; None: one after the other, here.
     """
-    exhibits = {pair.other.label: _maps(pair) for pair in found.pairs}
-    whole = _ensembles(found)
-    drawn = (
-        {} if draw is None else draw([*whole, *(e for each in exhibits.values() for e in each)], _SETTINGS)
-    )
+    maps = {pair.other.label: difference_figures(pair) for pair in found.pairs}
+    whole = ensembles_figures(found.runs)
+    drawn = (draw or draw_here)([*whole, *(each for figures in maps.values() for each in figures)], _SETTINGS)
 
-    def picture(exhibit: Exhibit) -> Picture:
-        if exhibit.name in drawn:
-            return ready_picture(exhibit, drawn[exhibit.name], {})
-        return draw_picture(exhibit, _SETTINGS, {})
+    def pictures(figures: Sequence[Figure]) -> list[Picture]:
+        return [Picture(figure, drawn[figure.name]) for figure in figures]
 
-    parts = [_part(pair, found, [picture(e) for e in exhibits[pair.other.label]]) for pair in found.pairs]
+    parts = [_part(pair, found, pictures(maps[pair.other.label])) for pair in found.pairs]
     page = template("compare.html.j2").render(
         title=" · ".join(run.words for run in found.runs),
         level="caution" if found.changed else "good",
@@ -114,7 +106,7 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
         sentence=sentence_of(found),
         parts=parts,
         runs=run_table(found),
-        pictures=[picture(exhibit) for exhibit in whole],
+        pictures=pictures(whole),
         sign="▲" if found.changed else "✓",
     )
     return page, json.dumps(_numbers(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
@@ -133,64 +125,6 @@ def _part(pair: Pair, found: Comparison, pictures: list[Picture]) -> _Part:
         pictures,
         pair_tables(pair, found.tolerance),
     )
-
-
-def _maps(pair: Pair) -> list[Exhibit]:
-    """Return the maps of differences, those that are not zero throughout."""
-    shown = []
-    for name, each in pair.maps.items():
-        if not np.nan_to_num(each.difference).any():
-            continue
-        _, words, unit = symbol(name)
-        label = f"{words} ({unit})" if name.startswith("read_noise") else words
-        alt = (
-            f"Map and histogram of the difference of the {label} in standard errors: median "
-            f"{short(each.median)} ± {short(each.median_stderr)} {unit}, which is {each.median_z:+.3g} "
-            f"standard errors of a pixel; scatter {each.spread_z:.3g}; "
-            f"{count(each.n_far, 'good pixel')} beyond {FAR:g}."
-        )
-        caption = (
-            "The line is N(0, 1), what chance alone gives."
-            if not pair.same_data
-            else "Both runs come from the same frames, so that chance plays no part."
-        )
-        shown.append(
-            Exhibit(
-                f"difference_{name}_{pair.other.label}",
-                "",
-                f"{label[0].upper()}{label[1:]}",
-                f"{pair.other.label} − {pair.one.label}, each pixel in its own standard errors. {caption}",
-                alt,
-                drawing(
-                    compare_figures.difference_map,
-                    each,
-                    f"{label}: {pair.other.label} − {pair.one.label}",
-                    same_data=pair.same_data,
-                ),
-                raster=True,
-            )
-        )
-    return shown
-
-
-def _ensembles(found: Comparison) -> list[Exhibit]:
-    runs = [run for run in found.runs if "density" in run.ensemble]
-    if len(runs) < 2:
-        return []
-    highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
-    peaks = ", ".join(f"{run.words}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
-    return [
-        Exhibit(
-            "ensembles",
-            "",
-            "Ensemble histograms over each other",
-            "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
-            f"difference to {runs[0].label} in standard errors of counting; the gray band is ±2.",
-            f"Ensemble histograms of the runs; their highest points lie at {peaks}.",
-            drawing(compare_figures.ensembles, runs),
-            PAGE_MM,
-        )
-    ]
 
 
 def _numbers(found: Comparison) -> dict[str, Any]:
@@ -253,3 +187,149 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_plain(item) for item in value]
     return value
+
+
+_GRADES = ("good fit", "use with caution", "no value")
+_STATES = {
+    "identical": "identical to the bit",
+    "equal": "equal within rounding",
+    "changed": "changed",
+    "lost": "not there any more",
+    "new": "new",
+}
+
+
+def run_table(found: Comparison) -> Table:
+    """Return the runs side by side: sensor, frames, pixels, medians, RMSE."""
+    runs = found.runs
+    rows: list[tuple[str, ...]] = [
+        ("pixels", *(f"{run.shape[0]} × {run.shape[1]}" for run in runs)),
+        ("frames", *("not known" if run.n_frames is None else f"{run.n_frames:,}" for run in runs)),
+    ]
+    for place, grade in enumerate(_GRADES):
+        rows.append(
+            (
+                grade,
+                *(f"{run.pixels[place]:,} ({percent(run.pixels[place], sum(run.pixels))})" for run in runs),
+            )
+        )
+    for name in dict.fromkeys(each for run in runs for each in run.summary):
+        nan = (float("nan"),) * 3
+        cells = [measured(*run.summary.get(name, nan)[:2], symbol(name)[2]) for run in runs]
+        rows.append((f"{symbol(name)[1]} ({symbol(name)[2]}), median", *cells))
+    for name in dict.fromkeys(each for run in runs for each in run.rmse):
+        cells = [scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs]
+        rows.append((f"RMSE, {name.replace('_', ' ')}", *cells))
+    return Table("runs", "The runs", "", ("", *(run.words for run in runs)), tuple(rows))
+
+
+def pair_tables(pair: Pair, tolerance: float) -> list[Table]:
+    """Return the tables of a run against the first one; empty ones are left out."""
+    tables = (
+        _map_table(pair),
+        _transitions(pair),
+        _settings(pair),
+        _versions(pair),
+        _arrays(pair, tolerance),
+    )
+    return [table for table in tables if table.rows]
+
+
+def _map_table(pair: Pair) -> Table:
+    rows = []
+    for name, each in pair.maps.items():
+        _, words, unit = symbol(name)
+        reason = pair.reasons.get(name)
+        verdict = "" if reason is None else "changed" if reason else "as chance allows"
+        rows.append(
+            (
+                f"{words} ({unit})",
+                measured(each.median, each.median_stderr) if each.median else "0",
+                f"{each.median_z:+.3f}".replace("-", "−"),
+                f"{each.spread_z:.3f}",
+                f"{each.n_far:,} of {each.n_counted:,}",
+                short(each.largest_z),
+                verdict,
+            )
+        )
+    unit_words = (
+        "Both runs come from the same frames: the unit is the standard error of one fit."
+        if pair.same_data
+        else "Different frames: the unit is the standard error of the difference; chance gives a median of 0 "
+        "and a scatter of 1."
+    )
+    return Table(
+        f"maps-{pair.other.label}",
+        "Differences of the maps",
+        f"{pair.other.label} − {pair.one.label}, over pixels with a good fit in both. {unit_words}",
+        ("map", "median", "median (std. errors)", "scatter (std. errors)", f"beyond ±{FAR:g}", "largest", ""),
+        tuple(rows),
+    )
+
+
+def _transitions(pair: Pair) -> Table:
+    rows = tuple(
+        (f"{_GRADES[i]} in {pair.one.label}", *(f"{int(n):,}" for n in row))
+        for i, row in enumerate(pair.transitions)
+    )
+    heads = tuple(f"{grade} in {pair.other.label}" for grade in _GRADES)
+    return Table(f"quality-{pair.other.label}", "Pixels by quality", "", ("", *heads), rows)
+
+
+def _settings(pair: Pair) -> Table:
+    return Table(
+        f"settings-{pair.other.label}",
+        "Settings that differ",
+        "A setting that no stage reads changes no result.",
+        ("setting", pair.one.label, pair.other.label, "read by"),
+        tuple((*_both(each), ", ".join(each.stages) or "no stage") for each in pair.settings),
+    )
+
+
+def _versions(pair: Pair) -> Table:
+    return Table(
+        f"versions-{pair.other.label}",
+        "Versions that differ",
+        "",
+        ("program or algorithm", pair.one.label, pair.other.label),
+        tuple(_both(each) for each in pair.versions),
+    )
+
+
+def _both(each: Setting) -> tuple[str, str, str]:
+    return each.name, _cut(each.one), _cut(each.other)
+
+
+def _cut(text: str, most: int = 80) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def _arrays(pair: Pair, tolerance: float) -> Table:
+    order = {"changed": 0, "lost": 1, "new": 2, "equal": 3, "identical": 4}
+    rows = sorted(pair.arrays, key=lambda row: order[row.state])
+    return Table(
+        f"arrays-{pair.other.label}",
+        "Every array of the results",
+        f"Rounding is a difference below {tolerance:g} of the largest value of the array. The digests of all "
+        "values (SHA-256) are in compare.json in full.",
+        ("array", "state", "values", "differ", "beyond rounding", "largest difference", "SHA-256"),
+        tuple(_array_cells(row) for row in rows),
+    )
+
+
+def _array_cells(row: ArrayRow) -> tuple[str, ...]:
+    state = row.why or _STATES[row.state]
+    if not row.counts:
+        state += "; no result, not counted"
+    digests = dict.fromkeys(digest[:12] for digest in row.sha256 if digest)
+    if row.state in ("lost", "new"):
+        return row.name, state, "", "", "", "", ""
+    return (
+        row.name,
+        state,
+        f"{row.n_values:,}",
+        f"{row.n_different:,}",
+        f"{row.n_beyond:,}",
+        short(row.largest) if row.largest else "0",
+        ", ".join(digests),
+    )

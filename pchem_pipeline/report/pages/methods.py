@@ -1,16 +1,13 @@
-"""The comparison of methods in words: the table of the command line, and who wins up to which read noise."""
+"""The comparison of methods in words and tables: on the command line and on the page."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from pchem_pipeline.report.style.wording import short
-
-__all__ = ["bound_crossing", "measured_crossing", "method_rows", "methods_text", "verdict_words"]
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.methods import crossing_words, gain_rmse, percent_text
+from pchem_pipeline.report.pages.tables import Table
 
 _COLUMNS = (
     "pixels",
@@ -22,6 +19,20 @@ _COLUMNS = (
     "s_e rmse %",
     "H rmse %",
     "us/pixel",
+)
+
+
+_HEAD = (
+    "method",
+    "pixels with an answer",
+    "median g (e⁻/DN)",
+    "bias of g (%)",
+    "rms error of g (%)",
+    "bound (%)",
+    "error / bound",
+    "rms error of the read noise (%)",
+    "rms error of H (%)",
+    "µs per pixel",
 )
 
 
@@ -48,7 +59,7 @@ def methods_text(result: Mapping[str, Any]) -> str:
             f"{at['n_pixels']} pixels at each read noise: rmse of g in %",
             *_study_lines(result["study"]),
             "",
-            verdict_words(result["study"]),
+            crossing_words(result["study"]),
         ]
     return "\n".join(lines)
 
@@ -78,20 +89,16 @@ def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
         if not errors:
             cells = ["reference", "", "", "", "", ""]
         else:
-            cells = [_percent(gain.get(name)) for name in ("bias", "rmse", "bound")]
+            cells = [percent_text(gain.get(name)) for name in ("bias", "rmse", "bound")]
             cells += [
                 ratio,
-                *(_percent(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")),
+                *(percent_text(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")),
             ]
         time = f"{1e6 * method['seconds_per_pixel']:.0f}"
         gain_value = method["medians"]["conversion_gain"]
         value = "-" if gain_value is None else f"{gain_value:.5g}"
         rows.append((method["title"], f"{method['n_answered']:,}", value, *cells, time))
     return rows
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.3g}"
 
 
 def _ratio(value: float | None, bound: float | None) -> str:
@@ -102,67 +109,26 @@ def _study_lines(study: Sequence[Mapping[str, Any]]) -> list[str]:
     titles = {name: method["title"] for name, method in study[0]["methods"].items()}
     lines = [f"{'read noise, e-':<34}" + "".join(f"{point['read_noise_e']:>9g}" for point in study)]
     for name, title in titles.items():
-        cells = [_percent(_rmse(point, name)) for point in study]
+        cells = [percent_text(gain_rmse(point, name)) for point in study]
         lines.append(f"{title:<34}" + "".join(f"{cell:>9}" for cell in cells))
     for name in ("one sample", "a dark and a bright sample"):
-        cells = [_percent(point["bounds"][name]) for point in study]
+        cells = [percent_text(point["bounds"][name]) for point in study]
         lines.append(f"{'bound, ' + name:<34}" + "".join(f"{cell:>9}" for cell in cells))
     return lines
 
 
-def _rmse(point: Mapping[str, Any], name: str) -> float | None:
-    method = point["methods"][name]
-    # of few answered pixels the easy ones are left
-    if method["n_answered"] < 0.5 * method["n_pixels"]:
-        return None
-    found = method["errors"]["conversion_gain"]["rmse"]
-    return None if found is None else float(found)
-
-
-def bound_crossing(study: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the read noise, e-, at which photon transfer's error falls below the bound of one sample."""
-    return _crossing(
-        study,
-        [point["bounds"]["one sample"] for point in study],
-        [point["bounds"]["photon_transfer"] for point in study],
-    )
-
-
-def measured_crossing(study: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the same from the simulated pixels: PCH-EM of one sample against two-sample photon transfer."""
-    return _crossing(
-        study,
-        [_rmse(point, "pchem_em") for point in study],
-        [_rmse(point, "photon_transfer") for point in study],
-    )
-
-
-def _crossing(
-    study: Sequence[Mapping[str, Any]], one: Sequence[float | None], other: Sequence[float | None]
-) -> float | None:
-    """Interpolate where ``one`` grows above ``other``; None where it does not, or is above from the start."""
-    known = sorted(
-        (point["read_noise_e"], np.log(a / b))
-        for point, a, b in zip(study, one, other, strict=True)
-        if a and b
-    )
-    for (x0, y0), (x1, y1) in itertools.pairwise(known):
-        if y0 < 0 <= y1:
-            return float(x0 + (x1 - x0) * y0 / (y0 - y1))
-    return None
-
-
-def verdict_words(study: Sequence[Mapping[str, Any]]) -> str:
-    """Say up to which read noise one-sample PCH-EM beats photon transfer with as many frames."""
-    expected, measured = bound_crossing(study), measured_crossing(study)
-    if expected is None and measured is None:
-        return "one-sample PCH-EM and two-sample photon transfer do not cross in the read noises simulated"
-    parts = []
-    if expected is not None:
-        parts.append(f"{short(expected, 2)} e- by the Cramer-Rao bound")
-    if measured is not None:
-        parts.append(f"{short(measured, 2)} e- on the simulated pixels")
-    return (
-        "one-sample PCH-EM knows the gain better than two-sample photon transfer with as many frames up to a "
-        f"read noise of {', '.join(parts)}; above it, take several exposures"
-    )
+def method_tables(data: ReportData) -> list[Table]:
+    """Return the table of the comparison, where one was made."""
+    result = data.methods
+    if result is None:
+        return []
+    against = {"truth": "the truth", "fit": "the fit of this run, from the same frames"}[result["reference"]]
+    rows = [row if len(row) > 2 else (*row, *[""] * (len(_HEAD) - 2)) for row in method_rows(result)]
+    remarks = " ".join(f"{remark[0].upper()}{remark[1:]}." for remark in result["remarks"])
+    verdict = crossing_words(result["study"]) if result["study"] else ""
+    caption = (
+        f"The same {result['pixels']:,} {data.noun}s for every method; errors against {against}. "
+        f"{f'{verdict[0].upper()}{verdict[1:]}.' if verdict else ''} {remarks}"
+    ).strip()
+    caption = caption.replace(" e-", " e⁻")
+    return [Table("methods-table", "Methods", caption, _HEAD, tuple(rows), section="methods")]

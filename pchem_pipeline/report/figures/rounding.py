@@ -3,23 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.exact import LARGEST_BIAS, rounding_bias
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import COLUMN_MM, GREEN, PALETTE, SKY, new_figure, styled
-
-__all__ = ["rounding", "rounding_curves"]
+from pchem_pipeline.report.style.style import Drawing, Look, styled
+from pchem_pipeline.report.style.wording import short
 
 _STEPS = np.geomspace(1.5, 30.0, 40)  # DN per electron
 _PHASES = 8  # biases over a whole DN
 _NEEDED = ("quanta_exposure", "conversion_gain", "read_noise_e")
 _LEAST_NOISE = 0.01  # e-
 _NAMES = ("quanta exposure", "conversion gain", "bias", "read noise")
+
+
+_CAPTION = (
+    "Bias that rounding gives to estimates from the density of the PCD, in standard errors of one pixel, "
+    "at the median quanta exposure and read noise of this run and its number of frames; the worst of all "
+    "places of the bias between two whole DN. Above the dotted line (0.05) "
+    "fit.likelihood: auto fits with the exact masses."
+)
+
+
+def rounding_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return the bias by rounding against 1/g."""
+    curves = rounding_curves(data.maps, data.n_frames)
+    if not curves or not data.has_values("conversion_gain"):
+        return []
+    gain = data.maps["conversion_gain"]
+    step = 1.0 / float(np.median(finite(gain)))
+    words = [f"{name} {short(float(np.interp(step, curves['1/g'], curves[name])), 2)}" for name in _NAMES]
+    table = DataTable(curves, {"1/g": "DN/e-", **dict.fromkeys(_NAMES, "standard errors")})
+    return [
+        Figure(
+            "rounding",
+            "uncertainty",
+            "Bias by rounding to whole DN",
+            _CAPTION,
+            f"At {short(step)} DN per electron, in standard errors of a pixel: {', '.join(words)}.",
+            (table,),
+            partial(draw_rounding, table=table, gain=gain),
+        )
+    ]
 
 
 def rounding_curves(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, NDArray[np.float64]]:
@@ -30,7 +62,7 @@ def rounding_curves(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> d
         n_frames: frames of a pixel.
 
     Returns:
-        ``step``, DN per electron, and for each parameter the bias in standard errors of a pixel; empty where
+        ``1/g``, DN per electron, and for each parameter the bias in standard errors of a pixel; empty where
         the run does not know what is needed.
     """
     needed = [finite(maps[name]) for name in _NEEDED if name in maps]
@@ -48,30 +80,28 @@ def rounding_curves(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> d
     largest = np.abs(found).reshape(_STEPS.size, _PHASES, 4).max(axis=1)
     # beyond this the first order says no more than that the bias is large
     largest = np.where(largest < 30.0, largest, np.nan)
-    return {"step": _STEPS, **{name: largest[:, i] for i, name in enumerate(_NAMES)}}
+    return {"1/g": _STEPS, **{name: largest[:, i] for i, name in enumerate(_NAMES)}}
 
 
 @styled
-def rounding(
-    curves: Mapping[str, NDArray[np.float64]], gain: NDArray[Any], *, width_mm: float = COLUMN_MM
-) -> Figure:
+def draw_rounding(look: Look, *, table: DataTable, gain: NDArray[Any]) -> Drawing:
     """Draw the bias of the density's estimates against 1/g, with the range of this sensor.
 
     Args:
-        curves: from :func:`rounding_curves`.
+        look: width and colours.
+        table: from :func:`rounding_curves`.
         gain: map of the conversion gain, e-/DN.
-        width_mm: width of the figure.
     """
-    figure = new_figure(width_mm, 62.0)
+    figure, colours, steps = look.empty(62.0), look.palette, table["1/g"]
     axes = figure.add_subplot()
-    for colour, name in zip(PALETTE, _NAMES, strict=False):
-        axes.plot(curves["step"], curves[name], color=colour, label=name)
-    axes.axhline(LARGEST_BIAS, color=GREEN, linewidth=0.9, linestyle=":")
+    for colour, name in zip(colours.cycle, _NAMES, strict=False):
+        axes.plot(steps, table[name], color=colour, label=name)
+    axes.axhline(LARGEST_BIAS, color=colours.green, linewidth=0.9, linestyle=":")
     low, high = (1.0 / float(q) for q in np.quantile(finite(gain), [0.99, 0.01]))
-    axes.axvspan(low, high, color=SKY, alpha=0.3, linewidth=0, label="this sensor, 1–99 %")
+    axes.axvspan(low, high, color=colours.sky, alpha=0.3, linewidth=0, label="this sensor, 1–99 %")
     axes.set(xscale="log", yscale="log", ylim=(1e-4, 30.0))
     axes.set(xlabel="1/g (DN per electron)", ylabel="bias (standard errors)")
-    axes.set_xlim(min(float(curves["step"][0]), 0.9 * low), max(float(curves["step"][-1]), 1.1 * high))
+    axes.set_xlim(min(float(steps[0]), 0.9 * low), max(float(steps[-1]), 1.1 * high))
     ticks = [tick for tick in (1, 2, 5, 10, 20, 50) if axes.get_xlim()[0] <= tick <= axes.get_xlim()[1]]
     axes.set_xticks(ticks, labels=[str(tick) for tick in ticks])
     axes.minorticks_off()

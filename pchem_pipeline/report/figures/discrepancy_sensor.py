@@ -5,41 +5,40 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.effects.framework.evidence import SCORES
-from pchem_pipeline.report.pages.discrepancy_data import CHANNELS
+from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.maps import is_strip
+from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import (
-    BLACK,
-    BLUE,
-    COLUMN_MM,
-    GRAY,
-    NO_VALUE,
-    PAGE_MM,
-    VERMILION,
-    new_figure,
-    note,
-    styled,
-)
+from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, styled
 from pchem_pipeline.report.style.wording import count
-
-__all__ = ["LINE_WORDS", "PixelMap", "line_pictures", "pixel_maps", "telling_maps"]
 
 FloatArray = NDArray[np.float64]
 
-#: Diverging colours whose ends differ in lightness order for every kind of colour vision.
-_DIVERGING = "RdBu_r"
 #: Colours end at least, and at most, at so many standard deviations.
 _LEAST, _MOST = 4.0, 12.0
 #: A pixel beyond this is counted, and ringed if such pixels are few.
 _STANDS_OUT, _MOST_RINGS = 5.0, 60
+
+_MAPS_CAPTION = (
+    "Goodness of fit, and the quantities of the pixels that are farthest from chance. Below each map: its"
+    " histogram (gray) and that of chance (line). A shift of the whole histogram is an effect of all "
+    "pixels, long tails are one of few; these are ringed in the map where they are few."
+)
+_LINES_CAPTION = (
+    "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
+    "column over all frames; 1 is what independent pixels give. Stripes in the readout are noise common "
+    "to a row or column, slanted lines are periodic pickup."
+)
 
 _SCORE_WORDS = {
     "C2": "charge: variance beyond Poisson (C2)",
@@ -54,6 +53,98 @@ _SCORE_WORDS = {
 
 #: How the means of rows and columns are called, by name of their array.
 LINE_WORDS = {"row": "rows", "column": "columns"}
+
+
+def sensor_figures(data: DiscrepancyData) -> list[Figure]:
+    """Return the maps of what each pixel shows."""
+    maps = [each for each in largest_maps(data.arrays) if finite(each.z).size]
+    if not maps:
+        return []
+    origin = data.found.examined.origin
+    flagged = [pixel for place in data.found.where for pixel in place.pixels]
+    words = []
+    for each in maps:
+        known = finite(each.z)
+        words.append(
+            f"{each.words}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} (by chance 0 "
+            f"and 1), {count(each.outliers, 'pixel')} beyond 5"
+        )
+    columns = {each.words: each.z for each in maps}
+    table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
+    return [
+        Figure(
+            "discrepancy_maps",
+            "where",
+            "On the sensor",
+            _MAPS_CAPTION,
+            "Maps in standard deviations of chance. " + "; ".join(words).replace("-", "−") + ".",
+            (table,),
+            partial(draw_sensor, maps=maps, flagged=flagged, origin=origin),
+            PAGE_MM,
+            raster=True,
+        )
+    ]
+
+
+def line_figures(data: DiscrepancyData) -> list[Figure]:
+    """Return the means of rows and columns, and their scatter."""
+    origin = data.found.examined.origin
+    tables = line_tables(data.arrays, origin)
+    if not tables:
+        return []
+    words = [_line_words(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
+    return [
+        Figure(
+            "discrepancy_lines",
+            "where",
+            "Rows and columns",
+            _LINES_CAPTION,
+            "Scatter of the means over the frames, relative to chance (1). " + "; ".join(words) + ".",
+            tables,
+            partial(draw_lines, arrays=_line_arrays(data.arrays), origin=origin),
+            PAGE_MM,
+            raster=True,
+        )
+    ]
+
+
+def _lines(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
+    return [line for line in LINE_WORDS if arrays.get(f"{line}_rms", np.empty(0)).size]
+
+
+def _line_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    names = [f"{line}_{what}" for line in _lines(arrays) for what in ("rms", "image")]
+    return {name: arrays[name] for name in names if name in arrays}
+
+
+def line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
+    """Return the scatter of each row and column, and their means in the first frames.
+
+    Args:
+        arrays: group ``discrepancy`` of the store.
+        origin: row and column of the sensor of the first of them.
+    """
+    tables = []
+    for line in _lines(arrays):
+        axis, first = ("y", origin[0]) if line == "row" else ("x", origin[1])
+        rms, image = np.asarray(arrays[f"{line}_rms"]), arrays.get(f"{line}_image")
+        columns = {axis: first + np.arange(rms.shape[1])}
+        columns |= {f"{each}: rms / rms of chance": row for each, row in zip(CHANNELS, rms, strict=False)}
+        tables.append(DataTable(columns, {axis: "pixel"}, f"{line}_scatter"))
+        if image is not None and image.size:
+            means = dict(zip(CHANNELS, image, strict=False))
+            units = dict.fromkeys(means, "standard deviations")
+            tables.append(DataTable(means, units, f"{line}_means", ("frame", f"{axis} (pixel)"), (0, first)))
+    return tuple(tables)
+
+
+def _line_words(line: str, rms: np.ndarray[Any, Any]) -> str:
+    found = []
+    for channel, values in zip(CHANNELS, rms, strict=False):
+        known = finite(values)
+        if known.size:
+            found.append(f"{channel} median {np.median(known):.2f}, largest {known.max():.2f}")
+    return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
 @dataclass(frozen=True)
@@ -74,7 +165,7 @@ class PixelMap:
     outliers: int
 
 
-def telling_maps(arrays: Mapping[str, NDArray[Any]], most: int = 3) -> list[PixelMap]:
+def largest_maps(arrays: Mapping[str, NDArray[Any]], most: int = 3) -> list[PixelMap]:
     """Return the maps that are farthest from chance, goodness of fit first whatever it shows.
 
     Args:
@@ -115,30 +206,30 @@ def _pixel_map(words: str, values: NDArray[Any]) -> PixelMap:
 
 
 @styled
-def pixel_maps(
-    maps: Sequence[PixelMap],
+def draw_sensor(
+    look: Look,
     *,
+    maps: Sequence[PixelMap],
     flagged: Sequence[tuple[int, int]] = (),
     origin: tuple[int, int] = (0, 0),
-    width_mm: float = PAGE_MM,
-) -> Figure:
+) -> Drawing:
     """Draw maps of what each pixel shows, each over its histogram beside that of chance.
 
     Args:
-        maps: as :func:`telling_maps` returns them.
+        look: width and colours; a column stacks the maps.
+        maps: as :func:`largest_maps` returns them.
         flagged: pixels (y, x) of the sensor that the verdict points to; they are ringed.
         origin: row and column of the sensor of the maps' first pixel.
-        width_mm: width; a column's width stacks the maps.
     """
     shown = list(maps)
-    beside = len(shown) if width_mm > 1.5 * COLUMN_MM else 1
+    beside = len(shown) if look.wide else 1
     stacked = -(-len(shown) // beside)
     ny, nx = shown[0].z.shape
-    panel_mm = width_mm / beside - 14.0
+    panel_mm = look.width_mm / beside - 14.0
     ratio = ny / nx
     square = 0.25 <= ratio <= 4.0
     map_mm = float(np.clip(panel_mm * (ratio if square else 0.5), 22.0, 1.4 * panel_mm))
-    figure = new_figure(width_mm, stacked * (map_mm + 36.0))
+    figure = look.empty(stacked * (map_mm + 36.0))
     grid = figure.add_gridspec(2 * stacked, beside, height_ratios=[map_mm, 20.0] * stacked)
     for i, each in enumerate(shown):
         row, column = divmod(i, beside)
@@ -149,7 +240,7 @@ def pixel_maps(
             if each.far > 0
             else _LEAST
         )
-        if min(each.z.shape) < 2:
+        if is_strip(each.z.shape):
             _draw_line(top, each)
         else:
             _draw_map(figure, top, each, limit, flagged, origin)
@@ -159,18 +250,19 @@ def pixel_maps(
 
 
 def _draw_map(
-    figure: Figure,
+    figure: Drawing,
     axes: Axes,
     each: PixelMap,
     limit: float,
     flagged: Sequence[tuple[int, int]],
     origin: tuple[int, int],
 ) -> None:
+    colours = colours_of(axes)
     (y0, x0), (ny, nx) = origin, each.z.shape
-    axes.set_facecolor(NO_VALUE)
+    axes.set_facecolor(colours.no_value)
     extent = (x0 - 0.5, x0 + nx - 0.5, y0 + ny - 0.5, y0 - 0.5)
     image = axes.imshow(
-        each.z, cmap=_DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest", origin="upper",
+        each.z, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest", origin="upper",
         extent=extent, aspect="equal" if 0.25 <= ny / nx <= 4.0 else "auto",
     )  # fmt: skip
     rings = {(y, x) for y, x in flagged if y0 <= y < y0 + ny and x0 <= x < x0 + nx}
@@ -180,7 +272,13 @@ def _draw_map(
     if 0 < len(rings) <= _MOST_RINGS:
         ys, xs = np.array(sorted(rings)).T
         axes.plot(
-            xs, ys, "o", markersize=5, markerfacecolor="none", markeredgecolor=BLACK, markeredgewidth=0.6
+            xs,
+            ys,
+            "o",
+            markersize=5,
+            markerfacecolor="none",
+            markeredgecolor=colours.ink,
+            markeredgewidth=0.6,
         )
         axes.set(xlim=extent[:2], ylim=extent[2:])
     axes.set(xlabel="x (pixel)", ylabel="y (pixel)")
@@ -192,21 +290,23 @@ def _draw_map(
 
 def _draw_line(axes: Axes, each: PixelMap) -> None:
     """Draw a line of channels."""
+    colours = colours_of(axes)
     z = each.z.ravel()
-    axes.axhspan(-2, 2, color=GRAY, alpha=0.4, linewidth=0)
-    axes.plot(np.arange(z.size), z, "o", color=BLUE, markersize=3)
+    axes.axhspan(-2, 2, color=colours.bars, alpha=0.4, linewidth=0)
+    axes.plot(np.arange(z.size), z, "o", color=colours.blue, markersize=3)
     axes.set(xlabel="channel", ylabel="standard deviations", xlim=(-0.5, z.size - 0.5))
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
 
 
 def _draw_distribution(axes: Axes, each: PixelMap) -> None:
+    colours = colours_of(axes)
     known = finite(each.z)
     edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
     edges = np.linspace(-edge, edge, 61)
-    axes.stairs(np.histogram(np.clip(known, -edge, edge), edges)[0], edges, fill=True, color=GRAY)
+    axes.stairs(np.histogram(np.clip(known, -edge, edge), edges)[0], edges, fill=True, color=colours.bars)
     x = np.linspace(-edge, edge, 301)
     chance = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.plot(x, chance, color=BLUE, linewidth=0.9)
+    axes.plot(x, chance, color=colours.blue, linewidth=0.9)
     axes.set_yscale("log")
     axes.set_ylim(0.5, max(3.0 * chance.max(), 3.0))
     axes.set(xlim=(-edge, edge), xlabel="standard deviations", ylabel="pixels")
@@ -214,21 +314,20 @@ def _draw_distribution(axes: Axes, each: PixelMap) -> None:
 
 
 @styled
-def line_pictures(
-    arrays: Mapping[str, NDArray[Any]], *, origin: tuple[int, int] = (0, 0), width_mm: float = PAGE_MM
-) -> Figure:
+def draw_lines(
+    look: Look, *, arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)
+) -> Drawing:
     """Draw the means of rows and of columns: the first frames as a picture, and the scatter of each line.
 
     Args:
+        look: width and colours; a column stacks the panels.
         arrays: ``row_image``, ``row_rms``, ``column_image``, ``column_rms`` of group ``discrepancy``.
         origin: row and column of the sensor of the first of them.
-        width_mm: width; a column's width stacks the panels.
     """
-    lines = [line for line in LINE_WORDS if f"{line}_rms" in arrays]
-    wide = width_mm > 1.5 * COLUMN_MM
+    lines, wide = _lines(arrays), look.wide
     columns = 3 if wide else 1
     stacked = len(lines) if wide else 3 * len(lines)
-    figure = new_figure(width_mm, stacked * (50.0 if wide else 44.0))
+    figure = look.empty(stacked * (50.0 if wide else 44.0))
     grid = figure.add_gridspec(stacked, columns)
     for i, line in enumerate(lines):
         places = [(i, j) if wide else (3 * i + j, 0) for j in range(3)]
@@ -242,19 +341,20 @@ def line_pictures(
 
 
 def _draw_frames(
-    figure: Figure, axes: Axes, image: NDArray[Any] | None, line: str, channel: str, first: int
+    figure: Drawing, axes: Axes, image: NDArray[Any] | None, line: str, channel: str, first: int
 ) -> None:
+    colours = colours_of(axes)
     axes.set_title(f"{channel}: means of {LINE_WORDS[line]}")
     axes.set(xlabel="frame (the first ones examined)", ylabel=f"{'y' if line == 'row' else 'x'} (pixel)")
     if image is None or image.size == 0:
         note(axes, "not kept")
         return
-    axes.set_facecolor(NO_VALUE)
+    axes.set_facecolor(colours.no_value)
     n_frames, n_lines = image.shape
     drawn = axes.imshow(
         image.T,
         extent=(-0.5, n_frames - 0.5, first + n_lines - 0.5, first - 0.5),
-        cmap=_DIVERGING,
+        cmap=DIVERGING,
         vmin=-_LEAST,
         vmax=_LEAST,
         interpolation="nearest",
@@ -267,10 +367,11 @@ def _draw_frames(
 
 
 def _draw_scatter(axes: Axes, rms: FloatArray, line: str, first: int) -> None:
-    for channel, colour, marker in (("readout", VERMILION, "o"), ("charge", BLUE, "s")):
+    colours = colours_of(axes)
+    for channel, colour, marker in (("readout", colours.vermilion, "o"), ("charge", colours.blue, "s")):
         values = rms[CHANNELS.index(channel)]
         axes.plot(first + np.arange(values.size), values, marker, markersize=2.2, color=colour, label=channel)
-    axes.axhline(1.0, color=BLACK, linewidth=0.8)
+    axes.axhline(1.0, color=colours.ink, linewidth=0.8)
     top = float(np.nanmax(rms)) if np.isfinite(rms).any() else 1.0
     low = float(np.nanmin(rms)) if np.isfinite(rms).any() else 1.0
     axes.set_ylim(min(0.85, low - 0.05), max(1.25, 1.0 + 1.25 * (top - 1.0)))

@@ -1,0 +1,244 @@
+"""Figures of a comparison of runs: maps of differences in standard errors, and ensembles over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.checks.run_differences import FAR, MapDifference
+from pchem_pipeline.report.comparison import Pair, RunFacts
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.maps import is_strip, show_map
+from pchem_pipeline.report.style.palette import DIVERGING
+from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, plain, styled
+from pchem_pipeline.report.style.wording import count, power_of_ten, short, symbol
+
+FloatArray = NDArray[np.float64]
+
+#: Hues and styles of the ensembles of runs.
+_HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")
+_LINES = ("-", "--", "-.", ":")
+#: Colours end at the 99 % quantile of the differences, at least here, standard errors.
+_LEAST = 4.0
+#: Halves of an ensemble: (part, axis, prefix of the data, unit, title).
+_HALVES = (
+    ("raw", "dn", "", "DN", "raw ensemble"),
+    ("nuced", "electrons", "nuced_", "e⁻", "after non-uniformity correction"),
+)
+
+
+def difference_figures(pair: Pair) -> list[Figure]:
+    """Return the maps of differences of two runs, those that are not zero throughout."""
+    return [
+        _difference(pair, name, each)
+        for name, each in pair.maps.items()
+        if np.nan_to_num(each.difference).any()
+    ]
+
+
+def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
+    _, words, unit = symbol(name)
+    label = f"{words} ({unit})" if name.startswith("read_noise") else words
+    alt = (
+        f"Map and histogram of the difference of the {label} in standard errors: median "
+        f"{short(each.median)} ± {short(each.median_stderr)} {unit}, which is {each.median_z:+.3g} "
+        f"standard errors of a pixel; scatter {each.spread_z:.3g}; "
+        f"{count(each.n_far, 'good pixel')} beyond {FAR:g}."
+    )
+    caption = (
+        "The line is N(0, 1), what chance alone gives."
+        if not pair.same_data
+        else "Both runs come from the same frames, so that chance plays no part."
+    )
+    title = f"{label}: {pair.other.label} − {pair.one.label}"
+    return Figure(
+        f"difference_{name}_{pair.other.label}",
+        "",
+        f"{label[0].upper()}{label[1:]}",
+        f"{pair.other.label} − {pair.one.label}, each pixel in its own standard errors. {caption}",
+        alt,
+        (DataTable({"difference": each.z}, {"difference": "standard errors"}),),
+        partial(draw_difference, z=each.z, n_far=each.n_far, title=title, same_data=pair.same_data),
+        raster=True,
+    )
+
+
+def ensembles_figures(runs: Sequence[RunFacts]) -> list[Figure]:
+    """Return the ensembles of runs over each other, where at least two have one."""
+    runs = [run for run in runs if "density" in run.ensemble]
+    if len(runs) < 2:
+        return []
+    highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
+    peaks = ", ".join(f"{run.words}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
+    tables = ensemble_tables(runs)
+    return [
+        Figure(
+            "ensembles",
+            "",
+            "Ensemble histograms over each other",
+            "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
+            f"difference to {runs[0].label} in standard errors of counting; the gray band is ±2.",
+            f"Ensemble histograms of the runs; their highest points lie at {peaks}.",
+            tables,
+            partial(draw_ensembles, tables=tables),
+            PAGE_MM,
+        )
+    ]
+
+
+def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
+    """Return the ensembles of runs, raw and after correction where all have it: run, signal, density, error.
+
+    The error is that of counting.
+    """
+    tables = []
+    for part, axis, prefix, unit, _ in _HALVES:
+        if not all(axis in run.ensemble and np.sum(run.ensemble[f"{prefix}counts"]) > 0 for run in runs):
+            continue
+        curves = [_curve(run, axis, prefix) for run in runs]
+        names = np.concatenate([[run.words] * x.size for run, (x, _, _) in zip(runs, curves, strict=True)])
+        x, density, error = (np.concatenate(each) for each in zip(*curves, strict=True))
+        stored = unit.replace("e⁻", "e-")
+        units = {"signal": stored, "density": f"1/{stored}", "standard error": f"1/{stored}"}
+        columns = {"run": names, "signal": x, "density": density, "standard error": error}
+        tables.append(DataTable(columns, units, part))
+    return tuple(tables)
+
+
+@styled
+def draw_difference(look: Look, *, z: FloatArray, n_far: int, title: str, same_data: bool) -> Drawing:
+    """Draw the difference of a map of two runs in standard errors, and its histogram beside chance.
+
+    Args:
+        look: width and colours.
+        z: the difference in standard errors, (y, x).
+        n_far: good pixels that moved far.
+        title: what is subtracted from what.
+        same_data: both are fits of the same frames, for which N(0, 1) is not what chance gives.
+    """
+    ny, nx = z.shape
+    known, colours = finite(z), look.palette
+    limit = _limit(known, _LEAST if not same_data else 0.0)
+    unit, label = _unit(limit)
+    strip = is_strip(z.shape)
+    square = 0.25 <= ny / nx <= 4.0
+    map_mm = (
+        40.0 if strip else float(np.clip((look.width_mm - 24.0) * (ny / nx if square else 0.6), 26.0, 130.0))
+    )
+    figure = look.empty(map_mm + 46.0)
+    top, bottom = figure.subplots(2, 1, height_ratios=(map_mm, 28.0))
+    if strip:
+        top.axhspan(-2.0, 2.0, color=colours.band, linewidth=0)
+        top.plot(np.arange(z.size), z.ravel() / unit, "o", color=colours.blue, markersize=3)
+        top.set(xlabel="channel", ylabel=label, xlim=(-0.5, z.size - 0.5))
+    else:
+        image = show_map(top, z / unit, cmap=DIVERGING, vmin=-limit / unit, vmax=limit / unit)
+        bar = figure.colorbar(image, ax=top, fraction=0.05, pad=0.02, aspect=25, extend="both")
+        bar.set_label(label)
+    top.set_title(plain(title), fontsize=7.5)
+    edge = limit if same_data else max(limit, FAR)
+    _distribution(bottom, z / unit, edge / unit, chance=not same_data)
+    bottom.set_xlabel(f"difference ({label})")
+    note(bottom, f"{count(n_far, 'good pixel')} beyond ±{FAR:g}")
+    return figure
+
+
+def _unit(limit: float) -> tuple[float, str]:
+    """Return a power of ten in which differences up to ``limit`` have few digits, and its words."""
+    power = int(np.floor(np.log10(limit))) if limit < 0.01 else 0
+    return 10.0**power, f"{power_of_ten(power)} standard errors".strip()
+
+
+def _limit(known: FloatArray, least: float) -> float:
+    """Return where the colours end: the 99 % quantile (the largest where that is 0), at least ``least``."""
+    sizes = np.abs(known)
+    if sizes.size == 0 or sizes.max() == 0.0:
+        return max(least, 1.0)
+    quantile = float(np.quantile(sizes, 0.99))
+    return max(least, quantile if quantile > 0 else float(sizes.max()))
+
+
+def _distribution(axes: Axes, z: FloatArray, edge: float, *, chance: bool) -> None:
+    known, colours = finite(z), colours_of(axes)
+    edges = np.linspace(-edge, edge, 61)
+    counts = np.histogram(np.clip(known, -edge, edge), edges)[0]
+    axes.stairs(counts, edges, fill=True, color=colours.bars)
+    highest = float(np.max(counts, initial=1))
+    if chance:
+        x = np.linspace(-edge, edge, 601)
+        normal = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+        axes.plot(x, normal, color=colours.blue, linewidth=0.9)
+        highest = max(highest, float(normal.max()))
+    axes.set_yscale("log")
+    axes.set(xlim=(-edge, edge), ylim=(0.5, 5.0 * highest), ylabel="pixels")
+
+
+@styled
+def draw_ensembles(look: Look, *, tables: Sequence[DataTable]) -> Drawing:
+    """Draw the ensemble histograms of runs over each other, raw and NUCed (fig:ensemble_plot).
+
+    The strip below each shows the difference to the first run in standard errors of counting.
+
+    Args:
+        look: width and colours.
+        tables: of :func:`ensemble_tables`.
+    """
+    figure = look.empty(max(72.0 * len(tables), 30.0))
+    if not tables:
+        axes = figure.add_subplot()
+        axes.text(0.5, 0.5, "no ensemble histograms", ha="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return figure
+    grid = figure.subplots(2 * len(tables), 1, height_ratios=[3.0, 1.0] * len(tables), squeeze=False)[:, 0]
+    words = {part: (unit, title) for part, _, _, unit, title in _HALVES}
+    for i, table in enumerate(tables):
+        unit, title = words[table.part]
+        _one_half(grid[2 * i], grid[2 * i + 1], table, unit)
+        grid[2 * i].set_title(title)
+    return figure
+
+
+def _one_half(top: Axes, strip: Axes, table: DataTable, unit: str) -> None:
+    colours = colours_of(top)
+    low, high = np.inf, -np.inf
+    names = list(dict.fromkeys(table["run"].tolist()))
+    curves = {
+        name: tuple(table[column][table["run"] == name] for column in ("signal", "density", "standard error"))
+        for name in names
+    }
+    first = curves[names[0]]
+    for number, (name, (x, density, noise)) in enumerate(curves.items()):
+        colour, line = getattr(colours, _HUES[number % len(_HUES)]), _LINES[number % len(_LINES)]
+        seen = x[density > density.max() / 300.0]
+        low, high = min(low, float(seen[0])), max(high, float(seen[-1]))
+        top.plot(x, density, color=colour, linestyle=line, label=plain(name), drawstyle="steps-mid")
+        if number:
+            there = [np.interp(first[0], x, values, left=0.0, right=0.0) for values in (density, noise)]
+            error = np.hypot(there[1], first[2])
+            z = np.divide(there[0] - first[1], error, out=np.zeros_like(error), where=error > 0)
+            strip.plot(first[0], z, color=colour, linewidth=0.8)
+    strip.axhspan(-2.0, 2.0, color=colours.band, linewidth=0, zorder=0)
+    strip.axhline(0.0, color=colours.ink, linewidth=0.5)
+    margin = 0.04 * (high - low)
+    for axes in (top, strip):
+        axes.set_xlim(low - margin, high + margin)
+    top.tick_params(labelbottom=False)
+    top.set(ylabel=f"density (1/{unit})", ylim=(0.0, 1.3 * top.get_ylim()[1]))
+    top.legend(loc="upper right")
+    strip.set(xlabel=f"signal ({unit})", ylabel="difference\n(std. errors)")
+
+
+def _curve(run: RunFacts, axis: str, prefix: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the axis, the density and its standard error by counting."""
+    x, density, counts = (
+        np.asarray(run.ensemble[each], dtype=np.float64)
+        for each in (axis, f"{prefix}density", f"{prefix}counts")
+    )
+    total = max(float(counts.sum()), 1.0)
+    step = float(np.median(np.diff(x))) if x.size > 1 else 1.0
+    return x, density, np.sqrt(np.maximum(counts, 0.0)) / (total * step)

@@ -1,0 +1,434 @@
+"""Figures of single pixels: the cells of the electron number, and histograms with their fits."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import SubFigure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.electrons.electrons import thresholds
+from pchem_pipeline.model.law.pcd import pcd
+from pchem_pipeline.report.data import PixelFit, ReportData
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import (
+    COLUMN_MM,
+    PAGE_MM,
+    Drawing,
+    Look,
+    colours_of,
+    note,
+    plain,
+    styled,
+)
+from pchem_pipeline.report.style.wording import measured, short, stored_unit, symbol
+
+FloatArray = NDArray[np.float64]
+
+#: The example of the paper, PCD(1.8, 1, 0, 0.33^2), in units of e- (fig:optimal_quantization).
+PAPER_EXAMPLE: Mapping[str, float] = {
+    "quanta_exposure": 1.8,
+    "conversion_gain": 1.0,
+    "bias": 0.0,
+    "read_noise_dn": 0.33,
+}
+
+_LETTERS = "abcdefghijklmnop"
+_TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+
+_EXAMPLE_CAPTION = (
+    "The example of Hendrickson et al. (2023): density of a PCD with H = 1.8 e⁻ and a read noise of "
+    "0.33 e⁻ (line), and the edges of the cells in which each electron number is the most likely one "
+    "(dashed)."
+)
+_CELLS_CAPTION = (
+    "The same for a pixel of this run: its histogram (gray), fitted density (line) and cell edges (dashed)."
+)
+_FITS_CAPTION = (
+    "Gray: share of the frames at each digital number. Black: fitted density. Below: (observed − "
+    "expected) / √expected; the gray band is two standard deviations. A good fit has about one line "
+    "in twenty beyond the band and no pattern. Uncertainties are standard errors of the fit."
+)
+_WORST_CAPTION = (
+    "The pixels of the poorest fit, the poorest first, drawn as above. With thousands of pixels the "
+    "poorest look odd by chance, too: q is the rate of false discoveries at which the pixel counts."
+)
+
+
+def cell_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return the cells of the electron number, for the paper's example and for a pixel of the run."""
+    example = cell_tables(PAPER_EXAMPLE)
+    found = [
+        Figure(
+            "cluster_edges_example",
+            "cells",
+            "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
+            _EXAMPLE_CAPTION,
+            "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
+            f"{_edges_text(PAPER_EXAMPLE)} e⁻.",
+            example,
+            partial(draw_cells, tables=example),
+        )
+    ]
+    fitted = [pixel for pixel in data.pixels if has_fit(pixel.parameters)]
+    for pixel in fitted[:1]:
+        tables = cell_tables(pixel.parameters, pixel)
+        found.append(
+            Figure(
+                "cluster_edges_pixel",
+                "cells",
+                f"{pixel.place.capitalize()} of this run",
+                _CELLS_CAPTION,
+                f"Histogram and density of {pixel.place}; first cell edges at "
+                f"{_edges_text(pixel.parameters)} DN.",
+                tables,
+                partial(draw_cells, tables=tables),
+            )
+        )
+    return found
+
+
+def _edges_text(parameters: Mapping[str, float]) -> str:
+    edges = thresholds(*_theta(parameters), 4)
+    return ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
+
+
+def pixel_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return the histograms of the shown pixels with their fits."""
+    if not data.pixels:
+        return []
+    words = []
+    for pixel in data.pixels:
+        names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+        numbers = ", ".join(_value_text(pixel, name) for name in names)
+        state = f" ({pixel.status})" if pixel.status else ""
+        words.append(f"{pixel.label} {pixel.place}: {numbers}{state}".strip())
+    return [
+        Figure(
+            "pixel_fits",
+            "pixels",
+            "Histograms of single pixels with their fits",
+            _FITS_CAPTION,
+            "Histograms with fitted densities. " + "; ".join(words) + ".",
+            fit_tables(data.pixels),
+            partial(draw_pixels, pixels=data.pixels),
+            PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
+        )
+    ]
+
+
+def worst_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return the histograms of the pixels of the poorest fit."""
+    if not data.worst or not data.misfits or "goodness_q" not in data.fit:
+        return []
+    places = ", ".join(pixel.place for pixel in data.worst)
+    return [
+        Figure(
+            "worst_pixels",
+            "goodness",
+            "Pixels of the poorest fit",
+            _WORST_CAPTION,
+            f"Histograms with fitted densities and residuals: {places}.",
+            fit_tables(data.worst),
+            partial(draw_pixels, pixels=data.worst),
+            PAGE_MM if len(data.worst) > 1 else COLUMN_MM,
+        )
+    ]
+
+
+def _value_text(pixel: PixelFit, name: str) -> str:
+    _, words, unit = symbol(name)
+    nan = float("nan")
+    return f"{words} {measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), unit)}"
+
+
+def cell_tables(parameters: Mapping[str, float], pixel: PixelFit | None = None) -> tuple[DataTable, ...]:
+    """Return a density, the edges between the cells of its electron numbers, and the pixel's histogram.
+
+    Args:
+        parameters: the four parameters of the PCD, e.g. ``PAPER_EXAMPLE``; none are known where the fit
+            failed, and then there is no density.
+        pixel: whose histogram is drawn behind; None for an example without data, in e-.
+    """
+    unit = "e-" if pixel is None else "DN"
+    x = values = edges = np.empty(0)
+    if has_fit(parameters):
+        theta = _theta(parameters)
+        low, high, last = cell_range(*theta)
+        x = np.linspace(low, high, 1200)
+        values = pcd(x, *theta)
+        edges = thresholds(*theta, last + 1)
+        edges = edges[edges < high]
+    density = DataTable({"signal": x, "density": values}, {"signal": unit, "density": f"1/{unit}"})
+    between = DataTable({"below k": np.arange(1, edges.size + 1), "edge": edges}, {"edge": unit}, "edges")
+    if pixel is None:
+        return density, between
+    frames = {"dn": _codes(pixel), "frames": pixel.counts}
+    return density, between, DataTable(frames, {"dn": "DN"}, "histogram")
+
+
+def fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
+    """Return the histograms of pixels with what their fits expect, and their parameters."""
+    parts = [_pixel_columns(pixel) for pixel in pixels]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    units = {"y": "pixel", "x": "pixel", "dn": "DN", "residual": "standard deviations"}
+    facts: dict[str, list[Any]] = {
+        "y": [pixel.y for pixel in pixels],
+        "x": [pixel.x for pixel in pixels],
+        "shown as": [pixel.label for pixel in pixels],
+    }
+    for name in (*PAPER_EXAMPLE, "read_noise_e"):
+        units |= dict.fromkeys((name, f"{name} standard error"), stored_unit(name))
+        facts[name] = [pixel.parameters.get(name, np.nan) for pixel in pixels]
+        facts[f"{name} standard error"] = [pixel.stderr.get(name, np.nan) for pixel in pixels]
+    facts["goodness_p"] = [pixel.goodness_p for pixel in pixels]
+    facts["fit_status"] = [pixel.status for pixel in pixels]
+    return DataTable(columns, units), DataTable(facts, units, "parameters")
+
+
+def _codes(pixel: PixelFit) -> NDArray[np.int64]:
+    return pixel.origin + np.arange(pixel.counts.size)
+
+
+def _pixel_columns(pixel: PixelFit) -> dict[str, NDArray[Any]]:
+    dn, n = _codes(pixel), pixel.counts.size
+    expected = np.full(n, np.nan)
+    if has_fit(pixel.parameters):
+        expected = pixel.counts.sum() * _density(pixel, dn)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residual = np.where(expected >= 1.0, (pixel.counts - expected) / np.sqrt(expected), np.nan)
+    return {
+        "y": np.full(n, pixel.y),
+        "x": np.full(n, pixel.x),
+        "dn": dn,
+        "frames": pixel.counts,
+        "expected frames": expected,
+        "residual": residual,
+    }
+
+
+def _density(pixel: PixelFit, dn: NDArray[np.int64]) -> FloatArray:
+    """Return the density, or under a model with effects the mass, that a pixel's fit gives its codes."""
+    return pcd(dn.astype(np.float64), *_theta(pixel.parameters)) if pixel.mass is None else pixel.mass
+
+
+def has_fit(parameters: Mapping[str, float]) -> bool:
+    """Tell whether the four parameters of the PCD are all known and describe a density."""
+    values = [parameters.get(name, float("nan")) for name in PAPER_EXAMPLE]
+    return bool(np.all(np.isfinite(values))) and values[1] > 0 and values[3] > 0 and values[0] >= 0
+
+
+def _theta(parameters: Mapping[str, float]) -> tuple[float, float, float, float]:
+    return (
+        parameters["quanta_exposure"],
+        parameters["conversion_gain"],
+        parameters["bias"],
+        parameters["read_noise_dn"],
+    )
+
+
+@styled
+def draw_cells(look: Look, *, tables: Sequence[DataTable]) -> Drawing:
+    """Draw a PCD with the optimal edges between electron numbers (Hendrickson et al. 2023, eq. demarg_K_eqn).
+
+    Args:
+        look: width and colours.
+        tables: of :func:`cell_tables`.
+    """
+    figure, colours = look.empty(0.62 * min(look.width_mm, 1.3 * COLUMN_MM)), look.palette
+    axes = figure.add_subplot()
+    density, between, *histogram = tables
+    x, edges = density["signal"], between["edge"]
+    if x.size == 0:
+        axes.text(0.5, 0.5, "no fitted pixel to show", ha="center", va="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return figure
+    low, high, unit = float(x[0]), float(x[-1]), density.units["signal"].replace("e-", "e⁻")
+    for table in histogram:
+        _draw_frames(axes, table, low, high)
+    label = "fitted density" if histogram else "PCD"
+    axes.plot(x, density["density"], color=colours.ink, label=label)
+    top = 1.22 * axes.get_ylim()[1]
+    axes.vlines(
+        edges, 0.0, 0.86 * top, color=colours.blue, linestyle="--", linewidth=0.9, label="edge of a cell"
+    )
+    cells = np.concatenate([[low], edges, [high]])
+    every = max(1, int(np.ceil(len(cells) / (18 if look.width_mm <= COLUMN_MM else 30))))
+    for k in range(0, len(cells) - 1, every):
+        words, place = f"k = {k}" if k == 0 else str(k), (cells[k] + cells[k + 1]) / 2
+        axes.text(place, 0.87 * top, words, ha="center", va="bottom", color=colours.blue, fontsize=7)
+    axes.set(xlim=(low, high), ylim=(0.0, top), xlabel=f"signal ({unit})", ylabel=f"density (1/{unit})")
+    figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def _draw_frames(axes: Axes, table: DataTable, low: float, high: float) -> None:
+    """Draw the bars of a histogram between two signals; others would only make the files large."""
+    dn, frames = table["dn"], table["frames"]
+    if frames.sum() > 0:
+        first = int(np.clip(np.floor(low) - dn[0], 0, dn.size - 1))
+        last = int(np.clip(np.ceil(high) - dn[0], first, dn.size - 1))
+        _bars(axes, frames, int(dn[0]), slice(first, last + 1))
+
+
+def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple[float, float, int]:
+    """Return the signals between which cells are drawn (DN), and the last electron number among them.
+
+    Args:
+        exposure: H, e-.
+        gain: g, e-/DN.
+        bias: mu, DN.
+        sigma: read noise, DN.
+    """
+    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
+    return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last
+
+
+def _bars(axes: Axes, counts: NDArray[Any], origin: int, where: slice) -> None:
+    """Draw these bins of a histogram of DN, normalised with all of them, as gray bars of 1 DN."""
+    edges = (origin + np.arange(counts.size + 1) - 0.5)[where.start : where.stop + 1]
+    axes.stairs(counts[where] / counts.sum(), edges, fill=True, color=colours_of(axes).bars, label="frames")
+
+
+def shown_bins(counts: NDArray[Any], *, tail: float = 2e-4) -> slice:
+    """Return the bins to draw: all between the quantiles ``tail`` and ``1 - tail``, and a margin of a tenth.
+
+    Raises:
+        ValueError: if there is no count at all.
+    """
+    total = int(counts.sum())
+    if total == 0:
+        raise ValueError("the histogram is empty; there is nothing to show")
+    cumulative = np.cumsum(counts) / total
+    first = int(np.searchsorted(cumulative, tail))
+    last = int(np.searchsorted(cumulative, 1.0 - tail))
+    margin = max(2, (last - first) // 10)
+    occupied = np.flatnonzero(counts)
+    return slice(
+        max(first - margin, int(occupied[0]) - 2, 0),
+        min(last + margin, int(occupied[-1]) + 2, counts.size) + 1,
+    )
+
+
+@styled
+def draw_pixels(look: Look, *, pixels: Sequence[PixelFit]) -> Drawing:
+    """Draw histograms of pixels with the fitted density and the residuals (fig:plot_per_pixel_fits).
+
+    Gray bars are the share of frames at each DN, the black line is the fitted density, or under a model with
+    effects the mass of each DN. The strip below shows ``(count - expected) / sqrt(expected)`` where at least
+    one frame is expected.
+
+    Args:
+        look: width and colours.
+        pixels: any number; two in a row on a page, one in a row on a column.
+    """
+    columns = 2 if look.wide and len(pixels) > 1 else 1
+    rows = max(1, -(-len(pixels) // columns))
+    width_mm = look.width_mm / columns
+    lines = max((_title(pixel, "a", width_mm).count("\n") for pixel in pixels), default=0)
+    figure = look.empty((62.0 + 3.5 * lines) * rows)
+    parts = figure.subfigures(rows, columns, squeeze=False)
+    for i, pixel in enumerate(pixels):
+        letter = _LETTERS[i % len(_LETTERS)] if len(pixels) > 1 else ""
+        _one_pixel(parts[i // columns, i % columns], pixel, letter, width_mm)
+    return figure
+
+
+def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -> None:
+    top, strip = part.subplots(2, 1, sharex=True, height_ratios=(3.4, 1.0))
+    top.set_title(_title(pixel, letter, width_mm), fontsize=7.0, linespacing=1.35)
+    strip.set(xlabel="signal (DN)", ylabel="residual\n(σ)")
+    top.set_ylabel("density (1/DN)")
+    total = int(pixel.counts.sum())
+    if total == 0:
+        note(top, "no frames")
+        for axes in (top, strip):
+            axes.set(xticks=[], yticks=[])
+        return
+    where = shown_bins(pixel.counts)
+    dn, ink = _codes(pixel), colours_of(top).ink
+    low, high = dn[where][0] - 0.5, dn[where][-1] + 0.5
+    _bars(top, pixel.counts, pixel.origin, where)
+    top.set_xlim(low, high)
+    remarks = [f"{total:,} {'samples' if pixel.channel else 'frames'}"]
+    outside = total - int(pixel.counts[where].sum())
+    if outside:
+        remarks.append(f"{outside:,} outside the axis")
+    if has_fit(pixel.parameters):
+        x = np.linspace(low, high, int(np.clip(8 * (high - low), 400, 3000)))
+        if pixel.mass is None:
+            top.plot(x, pcd(x, *_theta(pixel.parameters)), color=ink)
+        else:
+            top.plot(dn[where], pixel.mass[where], color=ink)
+        if np.isfinite(pixel.goodness_p):
+            remarks.append(f"goodness of fit p = {pixel.goodness_p:.2g}")
+        _residual_strip(strip, pixel, where)
+    else:
+        remarks.append("no fit")
+        strip.set_yticks([])
+    top.set_ylim(0.0, 1.25 * max(top.get_ylim()[1], 1e-12))
+    note(top, "\n".join(remarks))
+
+
+def _residual_strip(strip: Axes, pixel: PixelFit, where: slice) -> None:
+    colours, columns = colours_of(strip), _pixel_columns(pixel)
+    enough = np.isfinite(columns["residual"][where])
+    dn, residual = (columns[name][where][enough] for name in ("dn", "residual"))
+    limit = float(np.clip(1.15 * np.max(np.abs(residual), initial=0.0), 3.5, 12.0))
+    strip.axhspan(-2.0, 2.0, color=colours.band, linewidth=0)
+    strip.axhline(0.0, color=colours.ink, linewidth=0.6)
+    _sticks(strip, dn, np.clip(residual, -limit, limit))
+    beyond = np.abs(residual) > limit
+    if beyond.any():
+        strip.plot(
+            dn[beyond],
+            np.sign(residual[beyond]) * 0.93 * limit,
+            "x",
+            color=colours.vermilion,
+            markersize=3,
+        )
+        note(strip, f"× {int(beyond.sum())} beyond {limit:.0f} σ")
+    strip.set_ylim(-limit, limit)
+
+
+def _sticks(axes: Axes, x: FloatArray, y: FloatArray) -> None:
+    """Draw lines from zero to each value, as one path: a fourth of the SVG that a path each takes."""
+    ends = np.stack([np.repeat(x, 2), np.stack([np.zeros_like(y), y], axis=1).ravel()], axis=1)
+    codes = np.tile([Path.MOVETO, Path.LINETO], x.size)
+    axes.add_patch(
+        PathPatch(Path(ends, codes), fill=False, edgecolor=colours_of(axes).blue, linewidth=0.7, zorder=2)
+    )
+
+
+def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
+    head = " ".join(part for part in (f"({letter})" if letter else "", plain(_cut(pixel.label))) if part)
+    lines = [f"{head}: {pixel.place}" if head else pixel.place]
+    if has_fit(pixel.parameters):
+        words = []
+        for name in _TITLE_NAMES:
+            sign, _, unit = symbol(name)
+            if name in pixel.parameters:
+                words.append(
+                    f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
+                )
+        pairs = ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
+        # a symbol in mathtext is about two letters wide
+        fits = all(len(re.sub(r"\$[^$]*\$", "MM", pair)) < 0.66 * width_mm for pair in pairs)
+        lines += pairs if fits else words
+    if pixel.status:
+        letters = max(20, int(width_mm * 0.6))
+        lines += textwrap.wrap(f"status: {plain(pixel.status)}", letters, max_lines=5, placeholder=" …")
+    return "\n".join(lines)
+
+
+def _cut(text: str, most: int = 40) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"

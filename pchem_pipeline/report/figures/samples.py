@@ -1,0 +1,236 @@
+"""Figures of several exposures fitted together: their line, its residuals, and photon transfer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from pchem_pipeline.report.data import ReportData, Samples
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.report.style.style import Drawing, Look, colours_of, note, styled
+from pchem_pipeline.report.style.wording import measured, short, symbol
+
+#: Label, unit and noun of what the exposures are drawn against, and the map of the slope.
+AXES = {
+    "integration_time": ("integration time", "s", "dark current", "dark_current"),
+    "light_level": ("light level", "", "charge per light level", "charge_per_level"),
+}
+
+_LINE_CAPTION = (
+    "Quanta exposure against {against} with the median line of the pixels; below, the median "
+    "residual with its standard error."
+)
+_TRANSFER_CAPTION = (
+    "Medians over the pixels; the curve is that of the joint fit with its median parameters, drawn "
+    "before the points and not through them."
+)
+
+
+def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return the exposures on their line, where samples lie on one."""
+    samples = data.samples
+    if samples is None or samples.against not in AXES:
+        return []
+    words, _unit, noun, slope = AXES[samples.against]
+    if not data.has_values(slope) or not samples.on_line:
+        return []
+    table = exposure_table(samples)
+    line = _median(data.maps[slope]), _median(data.maps["spurious_charge"])
+    centre, error, _low, _high = middle(data.maps[slope])
+    return [
+        Figure(
+            "exposures",
+            "exposures",
+            f"{noun.capitalize()} as the slope of H",
+            _LINE_CAPTION.format(against=words),
+            f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
+            (table,),
+            partial(draw_exposures, table=table, line=line),
+        )
+    ]
+
+
+def transfer_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return variance against mean of the samples, with the curve of the fit."""
+    samples = data.samples
+    if samples is None or not data.has_values("conversion_gain"):
+        return []
+    table = transfer_table(samples, data.maps["bias"])
+    fitted = {name: _median(data.maps[name]) for name in ("conversion_gain", "read_noise_dn")}
+    medians = zip(table["sample"], table["variance"], strict=True)
+    return [
+        Figure(
+            "photon_transfer",
+            "photon-transfer",
+            "Variance against mean",
+            _TRANSFER_CAPTION,
+            "Variance against mean above the bias: "
+            + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
+            (table,),
+            partial(draw_photon_transfer, table=table, fitted=fitted),
+        )
+    ]
+
+
+def _median(values: NDArray[Any]) -> float:
+    return float(np.median(finite(values)))
+
+
+def exposure_table(samples: Samples) -> DataTable:
+    """Return medians over the pixels of H and of its residuals, of the samples on the line."""
+    words, unit, *_ = AXES[samples.against]
+    chosen = samples.on_line
+    exposures = np.array([middle(samples.arrays["quanta_exposure"][i]) for i in chosen])
+    columns: dict[str, Any] = {
+        "sample": [samples.samples[i].name for i in chosen],
+        words: [samples.samples[i].x for i in chosen],
+        "H": exposures[:, 0],
+        "H at 16 %": exposures[:, 2],
+        "H at 84 %": exposures[:, 3],
+    }
+    # two points leave no residual
+    if len(chosen) > 2:
+        rest = np.array([middle(samples.arrays["linearity_residual"][i]) for i in chosen])
+        columns |= {"residual": rest[:, 0], "residual standard error": rest[:, 1]}
+    return DataTable(columns, dict.fromkeys(list(columns)[2:], "e-") | {words: unit})
+
+
+def transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:
+    """Return medians over the pixels of mean above the bias and variance of each sample.
+
+    Args:
+        samples: with their ``mean`` and ``variance``, (sample, y, x).
+        bias: map of mu, DN.
+    """
+    mean = np.array([middle(each) for each in samples.arrays["mean"] - bias])
+    variance = np.array([middle(each) for each in samples.arrays["variance"]])
+    columns: dict[str, Any] = {
+        "sample": [sample.name for sample in samples.samples],
+        "kind": [sample.kind for sample in samples.samples],
+        "mean above the bias": mean[:, 0],
+        "variance": variance[:, 0],
+        "variance at 16 %": variance[:, 2],
+        "variance at 84 %": variance[:, 3],
+    }
+    units = dict.fromkeys(list(columns)[3:], "DN2") | {"mean above the bias": "DN"}
+    return DataTable(columns, units)
+
+
+def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
+    """Return median, its standard error, and the 16 % and 84 % percentiles of the finite values."""
+    known = np.sort(finite(values))
+    if known.size == 0:
+        return (float("nan"),) * 4
+    low, centre, high = (float(q) for q in np.quantile(known, [0.1587, 0.5, 0.8413]))
+    # of the median, from the ranks half a standard deviation of the rank to either side
+    half, ranks = 0.5 * np.sqrt(known.size), np.arange(known.size)
+    ends = np.interp([0.5 * (known.size - 1) - half, 0.5 * (known.size - 1) + half], ranks, known)
+    return centre, 0.5 * float(ends[1] - ends[0]), low, high
+
+
+@styled
+def draw_exposures(look: Look, *, table: DataTable, line: tuple[float, float]) -> Drawing:
+    """Draw the quanta exposures against time or light with their line, and the residuals below.
+
+    Points are medians over the pixels, bars the 16 to 84 % range between pixels; the error bars of the
+    residuals are standard errors of the median.
+
+    Args:
+        look: width and colours.
+        table: of :func:`exposure_table`.
+        line: slope and offset, e-.
+    """
+    figure, colours = look.empty(92.0), look.palette
+    top, bottom = figure.subplots(2, 1, height_ratios=(2.0, 1.0), sharex=True)
+    against = list(table.columns)[1]
+    places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line
+    grid = np.linspace(0.0, 1.05 * places.max(), 50)
+    top.plot(grid, offset + slope * grid, color=colours.vermilion, label="median line of the pixels")
+    points: dict[str, Any] = {
+        "fmt": "o",
+        "color": colours.blue,
+        "markersize": 3.5,
+        "label": "median pixel, 16–84 %",
+    }
+    top.errorbar(places, exposures, yerr=_spread(table, "H"), **points)
+    top.axhline(offset, color=colours.bars, linewidth=0.8, linestyle=":")
+    top.set(ylabel="quanta exposure $H$ (e⁻)")
+    top.set_ylim(bottom=min(0.0, 1.1 * offset))
+    top.legend(loc="upper left")
+    note(top, f"offset {short(offset)} e⁻", where="lower right")
+    _residuals(bottom, places, table)
+    bottom.set(xlabel=table.heading(against), ylabel="residual (e⁻)", xlim=(0.0, grid[-1]))
+    return figure
+
+
+def _spread(table: DataTable, name: str) -> NDArray[np.float64]:
+    """Return how far the 16 and 84 % percentiles lie from the median, as error bars."""
+    ends = [table[f"{name} at {p} %"] - table[name] for p in (16, 84)]
+    return np.abs(np.stack(ends, dtype=np.float64))
+
+
+def _residuals(axes: Axes, places: NDArray[np.float64], table: DataTable) -> None:
+    """Draw median residuals with their errors; without freedom there are none to speak of."""
+    colours = colours_of(axes)
+    axes.axhline(0.0, color=colours.bars, linewidth=0.8)
+    if "residual" not in table:
+        note(axes, "two exposures: the line goes through both")
+        axes.set_ylim(-1.0, 1.0)
+        return
+    found, error = table["residual"], table["residual standard error"]
+    axes.errorbar(places, found, yerr=error, fmt="o", color=colours.blue, markersize=3.5, capsize=2)
+    most = 1.3 * np.nanmax(np.abs(found) + error)
+    axes.set_ylim(-most, most)
+
+
+@styled
+def draw_photon_transfer(look: Look, *, table: DataTable, fitted: Mapping[str, float]) -> Drawing:
+    """Draw variance against mean above the bias with the curve of the joint fit.
+
+    Photon transfer: ``variance = sigma^2 + (mean - mu) / g`` in DN. Points are medians over the pixels; the
+    curve has the median parameters.
+
+    Args:
+        look: width and colours.
+        table: of :func:`transfer_table`.
+        fitted: medians of ``conversion_gain`` and ``read_noise_dn``.
+    """
+    figure, colours = look.empty(66.0), look.palette
+    axes = figure.add_subplot()
+    x, y, kinds = (table[name] for name in ("mean above the bias", "variance", "kind"))
+    gain, noise = fitted["conversion_gain"], fitted["read_noise_dn"]
+    known = finite(x[kinds == "exposed"])
+    most = 1.15 * float(np.max(known, initial=1e-3))
+    least = float(np.min(known[known > 0], initial=most))
+    logarithmic = most > 60.0 * least
+    start = 0.3 * least if logarithmic else 0.0
+    grid = np.geomspace(start, most, 200) if logarithmic else np.linspace(0.0, most, 200)
+    curve, shot = "joint fit: $\\sigma^2 + (x - \\mu)/g$", "shot noise alone"
+    axes.plot(grid, noise**2 + grid / gain, color=colours.vermilion, label=curve)
+    axes.plot(grid, grid / gain, color=colours.sky, linewidth=0.9, linestyle="--", label=shot)
+    axes.axhline(noise**2, color=colours.bars, linewidth=0.8, linestyle=":", label="read noise $\\sigma^2$")
+    marks = (("exposed", "o", colours.blue, "median pixel, 16–84 %"), ("bias", "s", colours.ink, "bias"))
+    for kind, mark, colour, label in marks:
+        chosen = kinds == kind
+        if chosen.any():
+            points: dict[str, Any] = {
+                "fmt": mark,
+                "color": colour,
+                "markersize": 3.5,
+                "zorder": 3,
+                "label": label,
+            }
+            spread = _spread(table, "variance")[:, chosen]
+            axes.errorbar(np.maximum(x[chosen], grid[0]), y[chosen], yerr=spread, **points)
+    if logarithmic:
+        axes.set(xscale="log", yscale="log", ylim=(0.4 * noise**2, 2.0 * (noise**2 + most / gain)))
+    axes.set(xlabel="mean above the bias (DN)", ylabel="variance (DN²)")
+    axes.legend(loc="upper left")
+    return figure

@@ -1,0 +1,544 @@
+"""The page of a verdict on what the model is missing: verdict first, then its evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from pchem_pipeline.discrepancy.verdict import Candidate, GapChange, Moved, Place, Rival, Step, Verdict
+from pchem_pipeline.report.data import DiscrepancyData
+from pchem_pipeline.report.figures.catalogue import discrepancy_figures
+from pchem_pipeline.report.figures.discrepancy_gap import gap_words
+from pchem_pipeline.report.pages.pictures import Drawn, Picture
+from pchem_pipeline.report.pages.summary import Flag, Level
+from pchem_pipeline.report.pages.tables import Table
+from pchem_pipeline.report.style.wording import count, measured, percent, short, signed, symbol, unit_text
+
+#: File of the verdict's own page in the folder of a run.
+DISCREPANCY_PAGE = "discrepancy.html"
+#: Longer lists are in ``discrepancy.json`` only.
+_MOST_PLACES, _MOST_CANDIDATES = 12, 8
+#: A placebo that closes more than this share of the gap weakens the verdict.
+_PLACEBO_SHARE = 0.25
+#: Parameters that moved by less than this share of a pixel's standard error did not matter.
+_IMMATERIAL = 0.2
+
+#: Verdict to its level and its name.
+VERDICT_WORDS: dict[str, tuple[Level, str]] = {
+    "named": ("note", "Named"),
+    "ambiguous": ("caution", "Ambiguous"),
+    "unexplained": ("serious", "Unexplained"),
+    "consistent": ("good", "Consistent"),
+}
+
+#: (id, heading, introduction) of the parts of the page.
+PARTS: tuple[tuple[str, str, str], ...] = (
+    (
+        "where",
+        "Where data and model disagree",
+        "Every sample is split into a charge channel (the expected electron number) and a readout channel "
+        "(what is left). Effects of light and charge show in the first, effects of the electronics in the "
+        "second. All is in standard deviations of what the plain model would show by chance. The pictures "
+        "are of the frames in which effects were looked for; the table is of these and others to confirm it.",
+    ),
+    (
+        "evidence",
+        "Which effect it is",
+        "Each candidate's fingerprint (how it would move all statistics together) was compared with the data "
+        "on frames that its strength was not fitted to. Scores are differences of log-probability: larger is "
+        "better, and a difference below about three standard errors decides nothing.",
+    ),
+    (
+        "shown",
+        "How much of the gap is closed",
+        "The gap is the distance between data and model in nats per sample, on frames that no fit has seen. "
+        "It does not grow with the amount of data; more data only lower its floor, which chance alone makes.",
+    ),
+    (
+        "parameters",
+        "The effect, and what it changes",
+        "Parameters of the effects with their standard errors, and how far the delivered maps moved when the "
+        "model grew.",
+    ),
+    (
+        "limits",
+        "What these data cannot tell",
+        "Effects that frames of one constant exposure cannot show, whatever their number, and what was not "
+        "examined.",
+    ),
+)
+
+_EMPTY = {
+    "where": "Nothing was kept to draw.",
+    "evidence": "No candidate was asked for: nothing disagrees beyond chance.",
+    "shown": "No gap was measured.",
+    "parameters": "Nothing was added to the model.",
+    "limits": "Nothing was recorded.",
+}
+
+
+@dataclass(frozen=True)
+class KeyFact:
+    """One number of the first screen, with up to two lines below it."""
+
+    words: str
+    value: str
+    more: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the page: figures and tables under a heading; ``empty`` says why there are none."""
+
+    id: str
+    title: str
+    intro: str
+    empty: str
+    pictures: list[Picture]
+    tables: list[Table]
+
+
+@dataclass(frozen=True)
+class DiscrepancyView:
+    """All that the templates show.
+
+    Attributes:
+        level: how grave it is (a class of the style sheet).
+        name: the verdict's name.
+        sentence: the verdict in one sentence.
+        facts: the key numbers.
+        remarks: what speaks for and against it.
+        parts: figures and tables.
+    """
+
+    level: str
+    name: str
+    sentence: str
+    facts: list[KeyFact]
+    remarks: list[Flag]
+    parts: list[Part]
+
+
+def discrepancy_view(data: DiscrepancyData, drawn: Mapping[str, Drawn]) -> DiscrepancyView:
+    """Return the page's content.
+
+    Args:
+        data: verdict and arrays.
+        drawn: name of a figure to its drawing.
+    """
+    level, name = verdict_level(data.found)
+    pictures = [Picture(figure, drawn[figure.name]) for figure in discrepancy_figures(data)]
+    tables = discrepancy_tables(data)
+    parts = []
+    for id_, title, intro in PARTS:
+        shown = [picture for picture in pictures if picture.figure.section == id_]
+        rows = tables.get(id_, [])
+        empty = "" if shown or rows else _EMPTY[id_]
+        parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
+    sentence = data.found.sentence.replace(" -> ", " → ")
+    return DiscrepancyView(level, name, sentence, key_facts(data.found), remarks(data), parts)
+
+
+def verdict_level(found: Verdict) -> tuple[Level, str]:
+    """Return how grave a verdict is, and its name."""
+    return VERDICT_WORDS.get(found.verdict, ("note", found.verdict.capitalize()))
+
+
+def probability_words(p: float) -> str:
+    """Return a probability as people write it."""
+    if not math.isfinite(p):
+        return ""
+    return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
+
+
+def parameter_words(step: Step) -> list[str]:
+    """Return the parameters of a step's effect, each as ``name value ± error unit``."""
+    return [
+        f"{name} = {measured(p.value, p.stderr, unit_text(p.unit))}" for name, p in step.parameters.items()
+    ]
+
+
+def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
+    """Return the fields of a candidate as text, numbers to four digits."""
+    return [
+        (name, f"{value:.4g}" if isinstance(value, int | float) else str(value or ""))
+        for name, value in candidate.parameters.items()
+        if not isinstance(value, list | dict)
+    ]
+
+
+def parameter_name(name: str) -> str:
+    """Return what a map is called, for people."""
+    try:
+        return symbol(name)[1]
+    except KeyError:
+        return name.replace("_", " ")
+
+
+def key_facts(found: Verdict) -> list[KeyFact]:
+    """Return the numbers of the first screen."""
+    return [*_gap_fact(found), *_effect_facts(found), *_moved_fact(found), *_chance_fact(found)]
+
+
+def _gap_fact(found: Verdict) -> list[KeyFact]:
+    gap = found.gap
+    if not math.isfinite(gap.before):
+        return []
+    grown = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
+    value = f"{gap_words(gap.before)} → {gap_words(gap.after)}" if grown else gap_words(gap.before)
+    more = [f"10⁻⁶ nats per sample; floor {gap_words(gap.floor)}"]
+    if grown and math.isfinite(gap.closed_fraction):
+        more.append(f"{percent(max(gap.closed_fraction, 0.0), 1.0)} of the gap closed{_interval(gap)}")
+    return [KeyFact("gap", value, tuple(more))]
+
+
+def _interval(gap: GapChange) -> str:
+    low, high = gap.interval_after
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return ""
+    return f"; after: {gap_words(low)} to {gap_words(high)}"
+
+
+def _effect_facts(found: Verdict) -> list[KeyFact]:
+    facts = []
+    for step in found.steps:
+        if step.effect and step.parameters:
+            (name, first), *rest = step.parameters.items()
+            facts.append(
+                KeyFact(
+                    f"{step.effect}: {name}",
+                    measured(first.value, first.stderr, unit_text(first.unit)),
+                    tuple(f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}" for name, p in rest[:2]),
+                )
+            )
+    return facts[:4]
+
+
+def _moved_fact(found: Verdict) -> list[KeyFact]:
+    moved = _largest_move(found.steps)
+    if moved is None:
+        return []
+    name, largest = moved
+    unit = unit_text(largest.unit)
+    return [
+        KeyFact(
+            f"largest move: {parameter_name(name)}",
+            f"{_signed(largest.median)} {unit}".strip(),
+            (f"{_signed(largest.in_stderr, 2)} standard errors of a pixel",),
+        )
+    ]
+
+
+def _largest_move(steps: Sequence[Step]) -> tuple[str, Moved] | None:
+    moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
+    return max(moved, key=lambda pair: abs(pair[1].in_stderr), default=None)
+
+
+def _signed(value: float, digits: int = 3) -> str:
+    return short(value, digits) if value < 0 or not math.isfinite(value) else f"+{short(value, digits)}"
+
+
+def _chance_fact(found: Verdict) -> list[KeyFact]:
+    if not math.isfinite(found.p_global.before):
+        return []
+    more = [f"of a disagreement this large, from {found.replicates} replicates"] if found.replicates else []
+    before, after = probability_words(found.p_global.before), probability_words(found.p_global.after)
+    value = f"{before} → {after}" if after and found.effects else before
+    return [KeyFact("probability by chance", value, tuple(more))]
+
+
+def remarks(data: DiscrepancyData) -> list[Flag]:
+    """Return what speaks for and against the verdict, the gravest first."""
+    found = data.found
+    flags: list[Flag] = []
+    grown = [step for step in found.steps if step.effect]
+    if grown:
+        flags += _closing(found, grown[-1])
+        flags += _materiality(grown)
+    for step in found.steps:
+        for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
+            flags.append(Flag("note", f"To tell {rival} apart: {measurement}."))
+    if found.unexplained:
+        most = found.unexplained[0]
+        words = most.sentence or most.statistic
+        flags.append(Flag("caution", f"What is left shows most in: {words} ({_signed(most.z)} sd)."))
+    flags += [Flag("caution", f"{name} was left out: {why}.") for name, why in found.left_out.items()]
+    if found.untestable:
+        flags.append(Flag("note", f"Cannot be tested by these data: {', '.join(found.untestable)}."))
+    order = ("serious", "caution", "note", "good")
+    return sorted(flags, key=lambda flag: order.index(flag.level))
+
+
+def _closing(found: Verdict, last: Step) -> list[Flag]:
+    """Say whether the gap is at its floor, and whether a wrong effect closes it as well."""
+    gap, flags = found.gap, []
+    if math.isfinite(gap.after) and math.isfinite(gap.floor):
+        if gap.after <= gap.floor:
+            flags.append(Flag("good", "The gap that is left is at its floor: chance alone makes as much."))
+        else:
+            words = f"{gap_words(gap.after)} against {gap_words(gap.floor)} (10⁻⁶ nats per sample)"
+            flags.append(Flag("note", f"The gap that is left lies above its floor: {words}."))
+    share = _closed(last, last.placebo)
+    if last.placebo is not None and math.isfinite(share):
+        text = f"A placebo ({last.placebo.effect}), fitted in the same way, closes"
+        level: Level = "caution" if share > _PLACEBO_SHARE else "good"
+        flags.append(Flag(level, f"{text} {percent(max(share, 0.0), 1.0)} of the gap."))
+    share = _closed(last, last.runner_up)
+    if last.runner_up is not None and math.isfinite(share):
+        closed = percent(max(share, 0.0), 1.0)
+        text = f"The second-best effect ({last.runner_up.effect}) closes {closed} of the gap"
+        flags.append(Flag("note", f"{text}; {last.effect} leaves {gap_words(last.gap_after)}, it leaves "
+                                  f"{gap_words(last.runner_up.gap_after)}."))  # fmt: skip
+    return flags
+
+
+def _closed(step: Step, rival: Rival | None) -> float:
+    """Return the share of a step's gap that another effect closes."""
+    if rival is None or not step.gap_before > 0:
+        return math.nan
+    return 1.0 - max(rival.gap_after, 0.0) / step.gap_before
+
+
+def _materiality(grown: list[Step]) -> list[Flag]:
+    moved = _largest_move(grown)
+    if moved is None:
+        return []
+    name, largest = parameter_name(moved[0]), moved[1]
+    far = _signed(largest.in_stderr, 2)
+    words = f"{name} moved by {far} standard errors of a pixel"
+    if abs(largest.in_stderr) < _IMMATERIAL:
+        return [Flag("note", f"Significant, but immaterial for the maps: at most, {words}.")]
+    return [Flag("note", f"It matters for the maps: {words}.")]
+
+
+def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
+    """Return the tables of each part of the page that have rows."""
+    found = data.found
+    parts = {
+        "where": [_where(data, found.where)],
+        "evidence": [
+            *[_candidates(data, step, i) for i, step in enumerate(found.steps)],
+            _separate(found.steps),
+        ],
+        "shown": [_gaps(found)],
+        "parameters": [_parameters(data), _moved(found.steps)],
+        "limits": [_untestable(data), _unexplained(found.unexplained), _left_out(data), _examined(data)],
+    }
+    return {part: [table for table in tables if table.rows] for part, tables in parts.items()}
+
+
+def place_words(place: Place) -> str:
+    """Return where a statistic points to: pixels, DN, frames; empty for the whole sensor and run."""
+    words = []
+    if place.pixels:
+        shown = ", ".join(f"({y}, {x})" for y, x in place.pixels[:4])
+        more = f" … {count(len(place.pixels), 'pixel')}" if len(place.pixels) > 4 else ""
+        words.append(f"pixels (y, x) {shown}{more}")
+    if place.dn is not None:
+        low, high = place.dn
+        words.append(f"{low:g} DN" if low == high else f"{low:g} to {high:g} DN")
+    if place.frames:
+        words.append(_frame_words(place.frames))
+    return "; ".join(words)
+
+
+def _frame_words(frames: Sequence[int]) -> str:
+    if len(frames) <= 4:
+        return "frames " + ", ".join(str(frame) for frame in frames)
+    return f"{count(len(frames), 'frame')} from {min(frames)} to {max(frames)}"
+
+
+def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
+    rows = tuple(
+        (
+            place.sentence or _sentence(data, place.statistic),
+            place.channel or data.statistics.get(place.statistic, ("", ""))[0],
+            signed(place.z),
+            probability_words(place.p),
+            place_words(place) or "everywhere",
+            place.statistic,
+        )
+        for place in places[:_MOST_PLACES]
+    )
+    more = f" The first {_MOST_PLACES} of {len(places)}." if len(places) > _MOST_PLACES else ""
+    return Table(
+        "discrepancy-where",
+        "Statistics that disagree",
+        "How far each lies from what the plain model gives, in standard deviations of chance, with its "
+        f"probability, the farthest first.{more}",
+        ("what it says", "channel", "standard deviations", "p", "where", "statistic"),
+        rows,
+    )
+
+
+def _sentence(data: DiscrepancyData, statistic: str) -> str:
+    return data.statistics.get(statistic, ("", ""))[1] or statistic
+
+
+def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
+    rows = []
+    best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
+    for candidate in step.candidates[:_MOST_CANDIDATES]:
+        behind = candidate.score - best
+        rows.append(
+            (
+                candidate.effect,
+                data.titles.get(candidate.effect, ""),
+                measured(candidate.score, candidate.stderr),
+                short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
+                probability_words(candidate.probability),
+                ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
+            )
+        )
+    if step.effect:
+        outcome = f"{step.effect} was named"
+    elif data.found.verdict == "ambiguous":
+        outcome = "these data cannot tell them apart"
+    else:
+        outcome = "none of them explains it"
+    title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
+    return Table(
+        f"discrepancy-candidates-{index + 1}",
+        f"{title}: {outcome}",
+        "Held-out score with its standard error (nats, larger is better), how far behind the best one, and "
+        "the share of the probability among the candidates.",
+        ("effect", "in the literature", "score", "behind", "probability", "parameters"),
+        tuple(rows),
+    )
+
+
+def _separate(steps: Sequence[Step]) -> Table:
+    rows = tuple(dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items()))
+    return Table(
+        "discrepancy-separate",
+        "What would tell them apart",
+        "Measurements that separate the effects named here from those that they are confused with.",
+        ("effect", "measurement"),
+        rows,
+    )
+
+
+def _gaps(found: Verdict) -> Table:
+    rows = []
+    for i, step in enumerate(found.steps):
+        low, high = step.gap_interval_after
+        interval = f" ({gap_words(low)} to {gap_words(high)})" if math.isfinite(low) else ""
+        rivals = [
+            f"{gap_words(rival.gap_after)} ({rival.effect})" if rival is not None else ""
+            for rival in (step.runner_up, step.placebo)
+        ]
+        rows.append(
+            (
+                f"{i + 1}: {found.added(step) or step.verdict}",
+                gap_words(step.gap_before),
+                f"{gap_words(step.gap_after)}{interval}",
+                gap_words(step.gap_floor),
+                *rivals,
+            )
+        )
+    return Table(
+        "discrepancy-gap",
+        "Gap by step",
+        "In 10⁻⁶ nats per sample on frames that no fit has seen, with its interval; runner-up and placebo "
+        "were added in the place of the named effect.",
+        ("step", "before", "after", "floor", "runner-up instead", "placebo instead"),
+        tuple(rows),
+    )
+
+
+def _parameters(data: DiscrepancyData) -> Table:
+    rows = tuple(
+        (
+            f"{tag}: {name}",
+            measured(p.value, p.stderr, unit_text(p.unit)),
+            data.title(tag) + ("" if step.effect else " (the likeliest)"),
+            data.sources.get(tag, ""),
+        )
+        for step in data.found.steps
+        for tag in [step.likeliest]
+        for name, p in step.parameters.items()
+        if tag and (step.effect or data.found.verdict == "ambiguous")
+    )
+    return Table(
+        "discrepancy-parameters",
+        "Parameters of the effects",
+        "Estimates with their standard errors; these are the keys of model.effects in the run's YAML.",
+        ("parameter", "value", "effect", "source"),
+        rows,
+    )
+
+
+def _moved(steps: Sequence[Step]) -> Table:
+    rows = []
+    for step in steps:
+        for name, each in step.moved.items():
+            unit = unit_text(each.unit)
+            rows.append(
+                (
+                    f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
+                    step.effect or "",
+                    short(each.median) if math.isfinite(each.median) else "not known",
+                    signed(each.in_stderr),
+                )
+            )
+    return Table(
+        "discrepancy-moved",
+        "How the delivered parameters moved",
+        "Median over the pixels of (with the effect − without it), also in standard errors of a pixel.",
+        ("parameter", "effect added", "moved by", "in standard errors"),
+        tuple(rows),
+    )
+
+
+def _untestable(data: DiscrepancyData) -> Table:
+    rows = tuple((tag, data.title(tag), why or "") for tag, why in data.found.untestable.items())
+    return Table(
+        "discrepancy-untestable",
+        "Not tested by these data",
+        "They may be there or not: nothing in these frames depends on it.",
+        ("effect", "in the literature", "why, and what would show it"),
+        rows,
+    )
+
+
+def _unexplained(places: Sequence[Place]) -> Table:
+    rows = tuple(
+        (place.sentence or place.statistic, signed(place.z), place_words(place), place.statistic)
+        for place in places[:_MOST_PLACES]
+    )
+    return Table(
+        "discrepancy-unexplained",
+        "Left unexplained",
+        "What remains of the disagreement after all that was named.",
+        ("what it says", "standard deviations", "where", "statistic"),
+        rows,
+    )
+
+
+def _left_out(data: DiscrepancyData) -> Table:
+    return Table(
+        "discrepancy-left-out",
+        "Left out",
+        "Effects that could not be used as candidates.",
+        ("effect", "why"),
+        tuple(data.found.left_out.items()),
+    )
+
+
+def _examined(data: DiscrepancyData) -> Table:
+    found, rows = data.found, []
+    for key, words in (
+        ("frames", "frames"),
+        ("train", "frames to find and fit with"),
+        ("test", "frames to confirm and score with"),
+        ("final", "frames kept for the last gap"),
+        ("rows", "rows, first and after the last"),
+        ("columns", "columns, first and after the last"),
+    ):
+        value = getattr(found.examined, key)
+        rows.append((words, " to ".join(map(str, value)) if isinstance(value, tuple) else f"{value:,}"))
+    if found.replicates:
+        rows.append(("simulated replicates", f"{found.replicates:,}"))
+    rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
+    return Table("discrepancy-examined", "What was examined", "", ("item", "value"), tuple(rows))
