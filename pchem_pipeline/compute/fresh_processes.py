@@ -2,6 +2,10 @@
 
 Unlike the processes of :mod:`multiprocessing` they never import the main module of the program, so a user's
 script needs no ``if __name__ == "__main__"`` for them. Function and item travel as pickles.
+
+Not loky, which does not import the main module either: there a worker that dies takes the items of all
+others with it, and after a kill -9 of the program its workers live on for ever. Here a death is an error of
+its item, and a process ends when its input does.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -145,8 +144,8 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
 
 def _location(target: Target) -> dict[str, str]:
     """Return where the run's paths refer to, and its YAML file."""
-    place = {"base_dir": os.fspath(target.base_dir)}
-    return place if target.config_path is None else {**place, "config": os.fspath(target.config_path)}
+    place = {"base_dir": str(target.base_dir)}
+    return place if target.config_path is None else {**place, "config": str(target.config_path)}
 
 
 def run_status(target: Target) -> list[StageState]:

@@ -1,7 +1,10 @@
 """Paths of an object storage (``s3://bucket/run.zarr``, what else fsspec knows), used like those of a disk.
 
-What a run does to its small files beside the arrays is a handful of operations; here each is one request. An
-object appears whole or not at all, so a put takes the place of writing aside and renaming.
+What a run does to its small files beside the arrays is a handful of operations; here each is one request of
+fsspec. An object appears whole or not at all, so a put takes the place of writing aside and renaming.
+
+Not universal_pathlib: it asks S3 four times for a glob and twice for a listing or an unlink, where this asks
+once, and its errors, which differ by storage, would have to be made one line all the same.
 """
 
 from __future__ import annotations
@@ -11,8 +14,8 @@ import hashlib
 import re
 from collections.abc import Callable, Generator
 from fnmatch import fnmatchcase
-from pathlib import Path, PosixPath
-from typing import Any, Self, TypeVar, cast
+from pathlib import Path, PosixPath, PurePosixPath
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
 
 from pchem_pipeline.base.errors import MissingDependencyError, StoreError
 
@@ -60,9 +63,16 @@ def _asked(method: F) -> F:
     return cast("F", ask)
 
 
-class RemotePath(PosixPath):
+if TYPE_CHECKING:
+    _Pure = PosixPath  # it stands where a Path is expected
+else:
+    _Pure = PurePosixPath
+
+
+class RemotePath(_Pure):
     """A place in an object storage. Folders are but names with something below them.
 
+    A method of ``Path`` that is not here does not exist: nothing falls through to the disk of this machine.
     Keys and the address of the server come from where the storage's library looks for them.
     """
 
@@ -70,9 +80,13 @@ class RemotePath(PosixPath):
         """Return the URL."""
         return _URL.sub(r"\1://\2", super().__str__())
 
-    def __fspath__(self) -> str:
-        """Return the URL, which no system call understands."""
-        return str(self)
+    def __fspath__(self) -> NoReturn:
+        """Refuse to be a path of this machine.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError(f"{self} is no path of this machine")
 
     @property
     def storage(self) -> Any:

@@ -1,6 +1,7 @@
 import copy
+import os
 import pickle
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import fsspec
 import numpy as np
@@ -124,3 +125,27 @@ def test_what_the_storage_refuses_is_one_line():
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
     with pytest.raises(MissingDependencyError, match="needs another library"):
         place_of("nowhere://lab/x").exists()
+
+
+def test_no_method_touches_the_local_disk(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "memory:" / "lab" / "night").mkdir(parents=True)  # what the disk would take for the place
+    (tmp_path / "memory:" / "lab" / "night" / "a").write_text("of the disk")
+    path = place_of("memory://lab/night/a")
+    assert not isinstance(path, Path)
+    impure = {name for name in dir(Path) if not hasattr(PurePath, name) and not name.startswith("_")}
+    assert {"open", "read_bytes", "rename", "stat", "rglob"} <= impure
+    own = {name for name in impure if hasattr(RemotePath, name)}
+    assert all(name in vars(RemotePath) for name in own)
+    assert own == {
+        "absolute", "exists", "glob", "is_dir", "is_file", "iterdir", "mkdir", "read_bytes", "read_text",
+        "resolve", "unlink", "write_bytes", "write_text",
+    }  # fmt: skip
+    assert (path.exists(), path.is_file(), path.is_dir()) == (False, False, False)
+    assert list(path.parent.iterdir()) == []
+    for use in (os.fspath, os.stat, open, os.listdir, np.load):
+        with pytest.raises(TypeError, match="path"):
+            use(path)
+    path.write_text("far away")
+    path.unlink()
+    assert (tmp_path / "memory:" / "lab" / "night" / "a").read_text() == "of the disk"
