@@ -2,7 +2,8 @@
 
 The server listens on 127.0.0.1, reads one run and writes nothing. It answers GET and HEAD for a fixed list
 of paths, to requests that name this computer as their host, so that neither another computer nor a page of
-another site can read the run through the user's browser.
+another site can read the run through the user's browser. The server of the standard library is enough for
+that: a web framework would bring its own dependencies, and leave the checks of path and host to write.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Camera files on object storage (``s3://`` and what else fsspec knows): fetched once, then read as files.
 
 What was fetched is kept in the user's cache folder, and fetched again only when the storage says that it
-changed.
+changed. Not the file cache of fsspec: it writes into the place of the copy that another process may be
+reading, and asks for the state of the object after fetching it, so that a change in between is never seen.
 """
 
 from __future__ import annotations

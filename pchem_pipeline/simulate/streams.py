@@ -2,7 +2,8 @@
 
 Philox4x32-10 (Salmon et al. 2011) as a function from position to bits: the key is a hash of the seed and
 of what the numbers are for, the counter is the position. Nothing is drawn in sequence, so the block
-of frames that shares a key is a single frame, the smallest that there is.
+of frames that shares a key is a single frame, the smallest that there is. numpy has the same generator, but a
+keyed number costs 35 us there, since each key takes a generator of its own.
 """
 
 from __future__ import annotations

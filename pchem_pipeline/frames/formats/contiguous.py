@@ -2,8 +2,8 @@
 
 Raw files, npy, SER, uncompressed TIFF and uncompressed FITS all come down to a table of byte offsets. Each
 call opens the file, reads by ``preadv`` and closes it: so threads do not disturb each other, a reader can
-be pickled,
-and thousands of files do not exhaust the file descriptors.
+be pickled, and thousands of files do not exhaust the file descriptors. The libraries of the formats read into
+arrays of their own, and cannot hash what they read.
 """
 
 from __future__ import annotations

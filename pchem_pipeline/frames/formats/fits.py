@@ -2,7 +2,8 @@
 
 FITS stores unsigned integers as signed ones with BZERO = 2**(bits - 1). Uncompressed images are read
 straight from their offset, byte-swapped, and get their sign bit flipped in place; compressed ones go
-through astropy.
+through astropy. Not astropy for all: it cannot map such integers into memory, and its sections read less
+than half as fast (0.9 against 2.4 GB/s) into arrays of their own.
 """
 
 from __future__ import annotations

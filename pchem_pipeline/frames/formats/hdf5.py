@@ -2,7 +2,8 @@
 
 Frames that lie plainly in the file (contiguous, or in chunks of whole frames without filters) are read from
 their offsets. For others the file is opened for each call: handles of HDF5 must not cross processes, and h5py
-itself lets one thread in at a time.
+itself lets one thread in at a time. For that lock, plain frames are not read through h5py: threads would
+wait for each other, and the bytes would be read a second time for the hash of the file.
 """
 
 from __future__ import annotations
