@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
 from pchem_pipeline.methods.compare import MethodResult, compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
@@ -74,7 +75,7 @@ def study_point(point: StudyPoint, settings: Settings) -> dict[str, Any]:
                 point.conversion_gain,
                 # pixels differ in where a DN begins
                 100.0 + rng.random(point.n_pixels),
-                max(point.read_noise_e, point.conversion_gain / np.sqrt(12.0)),
+                max(point.read_noise_e, point.conversion_gain * np.sqrt(QUANTISATION_VARIANCE)),
                 frames,
             )
             for share in exposures[:1]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import TARGET_NAMES, Target
@@ -125,7 +126,7 @@ def contour_data(targets: Sequence[Target], conversion_gain: float, *, fine: int
         fine: points along each axis.
     """
     exposures, noises = exposure_grid(0.05, 30.0, fine), np.linspace(0.15, 0.9, fine)
-    noises = noises[noises >= conversion_gain / np.sqrt(12.0)]
+    noises = noises[noises >= conversion_gain * np.sqrt(QUANTISATION_VARIANCE)]
     return {
         "exposures": exposures,
         "read_noises": noises,

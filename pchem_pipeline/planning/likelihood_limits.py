@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from pchem_pipeline.model.law.pcd import QUANTISATION_VARIANCE, log_pcd, pcd_mass
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
 from pchem_pipeline.planning.point import FloatArray, Point
 
 __all__ = ["Ambiguity", "ambiguity", "gain_rival", "rounding_shift"]

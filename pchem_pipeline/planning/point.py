@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
 __all__ = ["FloatArray", "Point"]
 
@@ -40,10 +41,11 @@ class Point:
         for option, (value, low, high, unit) in ranges.items():
             if not low <= value <= high:
                 raise ConfigError(f"{option} {value:g}: give a number of {low:g} to {high:g} {unit}")
-        if self.read_noise_e < self.conversion_gain / np.sqrt(12.0):
+        rounding = self.conversion_gain * np.sqrt(QUANTISATION_VARIANCE)
+        if self.read_noise_e < rounding:
             raise ConfigError(
                 f"--read-noise {self.read_noise_e:g}: below that of rounding to whole DN, "
-                f"{self.conversion_gain / np.sqrt(12.0):.3g} e- at {self.conversion_gain:g} e-/DN; "
+                f"{rounding:.3g} e- at {self.conversion_gain:g} e-/DN; "
                 "it includes the rounding"
             )
 

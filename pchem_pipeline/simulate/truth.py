@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 __all__ = ["Defect", "TruthMaps"]
 
 # variance of rounding to whole DN, uniform over one DN (sigma_Q of the paper)
-_QUANTISATION_VARIANCE = 1.0 / 12.0
 #: largest quanta exposure that can be simulated, e-
 LARGEST_EXPOSURE = 1e7
 
@@ -82,7 +82,7 @@ class TruthMaps:
     @property
     def read_noise_dn(self) -> NDArray[np.float64]:
         """Read noise with quantisation, DN: sigma = (sigma_R^2 / g^2 + 1/12)^(1/2)."""
-        return np.sqrt((self.analog_read_noise_e / self.conversion_gain) ** 2 + _QUANTISATION_VARIANCE)
+        return np.sqrt((self.analog_read_noise_e / self.conversion_gain) ** 2 + QUANTISATION_VARIANCE)
 
     @property
     def read_noise_e(self) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps, observe
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -15,8 +16,6 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 
 __all__ = ["Acquisition", "Replicate", "simulate_frames", "truth_of"]
-
-_QUANTISATION_VARIANCE = 1.0 / 12.0
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ def truth_of(maps: PixelMaps) -> TruthMaps:
             one = np.array(getattr(maps, item.name), np.float64)
             one[~maps.usable] = np.median(one[maps.usable])
             values[item.name] = one
-    analog = np.sqrt(np.maximum(values["read_noise_dn"] ** 2 - _QUANTISATION_VARIANCE, 0.0))
+    analog = np.sqrt(np.maximum(values["read_noise_dn"] ** 2 - QUANTISATION_VARIANCE, 0.0))
     return TruthMaps(
         quanta_exposure=values["quanta_exposure"],
         conversion_gain=values["conversion_gain"],

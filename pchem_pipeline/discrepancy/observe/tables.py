@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS, supports
-from pchem_pipeline.model.law.pcd import QUANTISATION_VARIANCE
 
 __all__ = ["LONGEST_SUPPORT", "PixelLaws", "pixel_laws"]
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe.law_numba import (
     N_COLUMNS,
     N_NUISANCE,
@@ -319,6 +320,6 @@ def summarise_pixels(
         used += size
         if first >= axis and first + size <= axis + codes.shape[1]:
             _code_sums(
-                law, seen, expected, table[1] / (width * width + 1.0 / 12.0), inside, first, axis, coarse,
-                codes, fold, fold_covariance, bins, bin_covariance,
+                law, seen, expected, table[1] / (width * width + QUANTISATION_VARIANCE), inside, first, axis,
+                coarse, codes, fold, fold_covariance, bins, bin_covariance,
             )  # fmt: skip

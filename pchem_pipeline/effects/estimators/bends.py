@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import usable_codes
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ def _tangents(
     """Return masses and tangents of the pixels' PCDs (exact rounded mass and its derivatives)."""
     from scipy.special import gammaln, ndtr
 
-    sigma = np.sqrt(np.maximum(noise**2 - 1.0 / 12.0, 0.01))
+    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
     first = np.floor(bias - 5.0 * sigma).astype(np.int64)
     most = int(np.ceil((exposure + 6.0 * np.sqrt(exposure) + 3.0).max()))
     cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))

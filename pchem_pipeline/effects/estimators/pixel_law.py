@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
@@ -29,7 +30,6 @@ FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 _PARAMETERS = ((1, 0), (0, 1), (1, 1), (2, 0))
 _SMALLEST_MASS = 1e-100
 _SMALLEST_WIDTH = 0.1  # DN
-_ROUNDING = 1 / 12  # DN^2, of rounding to whole DN
 # samples expected beyond the codes of a pixel, on either side
 _ALLOWED = 1e-2
 # samples expected in a code for it to count in chi squared
@@ -82,7 +82,7 @@ class PixelLaw:
             float(getattr(self.maps, name)[0])
             for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
         )
-        analog = float(np.sqrt(max(sigma**2 - _ROUNDING, _SMALLEST_WIDTH**2)))
+        analog = float(np.sqrt(max(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2)))
         counts = _counts(exposure)
         levels = bias + counts / gain
         self._wide = _wide_codes(levels, analog, gain)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.ensemble.ensemble_numba import _capacity, poisson_weights
 
 __all__ = ["convert_frames", "count_errors", "electron_of_dn", "sum_cell_probabilities", "tally_electrons"]
@@ -186,7 +187,7 @@ def sum_cell_probabilities(
     weights = np.zeros(_capacity(exposure))
     for p in range(exposure.size):
         low, high = poisson_weights(exposure[p], weights)
-        analog = math.sqrt(max(sigma[p] * sigma[p] - 1.0 / 12.0, 1e-12))
+        analog = math.sqrt(max(sigma[p] * sigma[p] - QUANTISATION_VARIANCE, 1e-12))
         noise = used_gain[p] * used_sigma[p] * used_sigma[p]
         correct = 0.0
         for k in range(low, high + 1):

@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_pmf
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
@@ -156,7 +157,9 @@ def epcd_independent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoic
     )
     period, origin = _period(exposures, gains, biases, variances, dn)
     narrow = variances.values[0] < ensemble_numba.NARROW**2
-    spread = np.where(narrow, np.maximum(variances.values[0] - 1 / 12, _NARROWEST**2), variances.values[0])
+    spread = np.where(
+        narrow, np.maximum(variances.values[0] - QUANTISATION_VARIANCE, _NARROWEST**2), variances.values[0]
+    )
     n_frequencies = math.ceil(period * ensemble_numba.REACH / (2 * np.pi * math.sqrt(spread.min())))
     folded = np.zeros(period, dtype=np.complex128)
     for start in range(0, n_frequencies + 1, 64):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
 __all__ = [
     "add_density",
@@ -105,7 +106,7 @@ def add_component(out: FloatArray, base: float, weight: float, centre: float, si
     if sigma >= NARROW:
         add_density(out, base, weight, centre, sigma)
     else:  # sigma holds the 1/12 DN^2 of rounding, which the integration over the cell puts back
-        add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - 1.0 / 12.0, 1e-12)))
+        add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - QUANTISATION_VARIANCE, 1e-12)))
 
 
 @kernel

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.model.law.pcd import QUANTISATION_VARIANCE, pcd_mass
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.pcd import pcd_mass
 
 __all__ = ["DrawnHistograms", "draw_histograms"]
 

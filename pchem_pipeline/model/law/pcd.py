@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law import pcd_numba
 
 __all__ = [
-    "QUANTISATION_VARIANCE",
     "PcdMoments",
     "analog_read_noise",
     "draw_pcd",
@@ -28,8 +28,6 @@ __all__ = [
     "total_read_noise",
 ]
 
-#: Variance of the rounding to whole DN, DN^2 (sigma_Q^2 in eq. X_density).
-QUANTISATION_VARIANCE = 1.0 / 12.0
 
 _Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.maps.pixels import FloatArray
 
@@ -16,7 +17,6 @@ __all__ = [
     "CAUTION",
     "GOOD",
     "NO_VALUE",
-    "QUANTISATION_VARIANCE",
     "MapSummary",
     "derived_maps",
     "display_transform",
@@ -25,8 +25,6 @@ __all__ = [
     "summarise",
 ]
 
-#: Variance of rounding to integers, DN^2.
-QUANTISATION_VARIANCE = 1.0 / 12.0
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
 

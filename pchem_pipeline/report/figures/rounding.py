@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.exact import LARGEST_BIAS, rounding_bias
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
@@ -69,10 +70,10 @@ def rounding_curves(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> d
     if len(needed) < len(_NEEDED) or not n_frames or any(values.size == 0 for values in needed):
         return {}
     exposure, gain, total = (float(np.median(values)) for values in needed)
-    noise = np.sqrt(max(total**2 - gain**2 / 12.0, _LEAST_NOISE**2))
+    noise = np.sqrt(max(total**2 - gain**2 * QUANTISATION_VARIANCE, _LEAST_NOISE**2))
     steps = np.repeat(_STEPS, _PHASES)
     phases = np.tile(np.arange(_PHASES) / _PHASES, _STEPS.size)
-    sigma = np.sqrt((noise * steps) ** 2 + 1.0 / 12.0)
+    sigma = np.sqrt((noise * steps) ** 2 + QUANTISATION_VARIANCE)
     found = rounding_bias(
         [np.full(steps.size, exposure), 1.0 / steps, 100.0 + phases, sigma],
         np.full(steps.size, float(n_frames)),
