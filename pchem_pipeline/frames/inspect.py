@@ -6,7 +6,7 @@ import re
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
@@ -79,15 +79,6 @@ class InputReport:
             cure = "" if len(self.files) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
             self.skipped = False
             raise InputError(self.message() + cure)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the report for JSON, file names without folders."""
-        return {
-            "files": len(self.files),
-            "used": len(self.good),
-            "left_out": [{"name": file.path.name, "problem": file.problem} for file in self.bad],
-            "notes": list(self.notes),
-        }
 
 
 def survey(

@@ -4,28 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pchem_pipeline.frames.inspect import InputReport, survey
+from pchem_pipeline.frames.inspect import survey
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["inspect_files", "open_frames"]
-
-
-def inspect_files(settings: InputSettings, base_dir: Path) -> InputReport:
-    """Open every file, and report all that is wrong with them in one message.
-
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
-
-    Returns:
-        The report; nothing is raised for bad files, whatever ``on_bad_file`` says.
-
-    Raises:
-        InputError: a path is missing or a folder empty.
-        ConfigError: an unknown format, or an optional library is missing.
-    """
-    return survey(settings, base_dir)[1]
+__all__ = ["open_frames"]
 
 
 def open_frames(settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True) -> FrameSequence:

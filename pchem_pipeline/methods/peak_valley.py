@@ -17,10 +17,7 @@ from pchem_pipeline.methods.base import (
 from pchem_pipeline.methods.plain_em import first_start
 from pchem_pipeline.model.fit.start import kernel_counts
 
-__all__ = ["LARGEST_READ_NOISE", "PeakValley", "read_noise_of_valley"]
-
-#: Read noise at which the valley is as high as the peaks, e-; beyond it there is no answer.
-LARGEST_READ_NOISE = 1.0 / np.sqrt(8.0 * np.log(2.0))
+__all__ = ["PeakValley", "read_noise_of_valley"]
 
 _SMOOTHING = 0.12  # standard deviation of the smoothing in units of the distance of two peaks
 

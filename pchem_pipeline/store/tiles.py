@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 from pchem_pipeline.base.errors import ConfigError
 
-__all__ = ["TILE_SIZES", "Tile", "parse_tiles", "roi_tiles", "tile_grid"]
-
-#: Sizes that divide, or are multiples of, the 64-row groups of the summaries.
-TILE_SIZES = (8, 16, 32, 64, 128, 256)
+__all__ = ["Tile", "parse_tiles", "roi_tiles", "tile_grid"]
 
 
 @dataclass(frozen=True, order=True)

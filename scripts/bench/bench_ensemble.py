@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.checks.residuals import central_window, counting_variance, noise_floor, rmse
+from pchem_pipeline.model.checks.residuals import central_window, noise_floor, rmse
 from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_counts
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
 from pchem_pipeline.model.ensemble.ensemble_binned import (
@@ -42,6 +42,13 @@ PAPER = {
     "nuced_dependent": 2.3e-4,
     "nuced_independent": 2.7e-4,
 }
+
+
+def counting_variance(
+    total: NDArray[np.float64], square: NDArray[np.float64], n_pixels: int, n_frames: int, width: float = 1.0
+) -> NDArray[np.float64]:
+    """Return the variance of the density of an ensemble histogram from sums of probabilities over pixels."""
+    return np.maximum(total - square, 0.0) / (n_frames * (n_pixels * width) ** 2)
 
 
 @dataclass

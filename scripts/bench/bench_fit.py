@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
-from pchem_pipeline.model.errors.fisher import cramer_rao_stderr
+from pchem_pipeline.model.errors.fisher import cramer_rao
 from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.fit.start import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
@@ -211,7 +211,8 @@ def bench_efficiency(rng: np.random.Generator, n: int, n_pulls: int, n_frames: i
             result = fit_histograms(pixels.counts, pixels.origin)
             error = estimates(result) - pixels.truth
             pulls = (error / np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2)))[:n_pulls]
-            ratios.append(np.sqrt((error**2).mean(0)) / cramer_rao_stderr(h, 1 / 11, noise * 11, n_frames))
+            bound = np.sqrt(np.diagonal(cramer_rao(h, 1 / 11, noise * 11, n_frames)))
+            ratios.append(np.sqrt((error**2).mean(0)) / bound)
             means.append(pulls.mean(axis=0))
             variances.append(pulls.var(axis=0))
             columns = ["".join(f"{v:7.3f}" for v in row[-1]) for row in (ratios, means, variances)]

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,11 +34,12 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 from pchem_pipeline.model.checks.multiple_testing import false_discovery  # noqa: E402
-from pchem_pipeline.model.checks.shrinkage import judge_together  # noqa: E402
+from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of  # noqa: E402
 from pchem_pipeline.model.errors.fisher import sandwich_covariance  # noqa: E402
 from pchem_pipeline.model.fit.intervals import profile_intervals, quantile_of  # noqa: E402
 from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
+from pchem_pipeline.model.fit.status import FitStatus  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -47,6 +48,17 @@ LEVELS = (0.68, 0.95)
 STEP = 11.0  # DN per electron
 GRID = tuple(itertools.product((0.1, 0.5, 2.0, 8.0), (0.2, 0.3, 0.4, 0.48), (2_000, 17_750)))
 GUARD_OFF = FitSettings(tail_guard=0)
+
+
+def judge_together(fit: FitResult) -> FitResult:
+    """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
+    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, fit.covariance)
+    pixels = Judged(noise, stderr, fit.likelihood_gap)
+    pool = NoisePool.of(pixels)
+    if pool is None:
+        return fit
+    word = np.where(pool.weak(pixels, FitSettings()), int(FitStatus.WEAKLY_IDENTIFIED), 0)
+    return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
 
 
 @dataclass(frozen=True)

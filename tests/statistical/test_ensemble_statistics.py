@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.counting_noise import counting_variance
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.checks.residuals import counting_variance, noise_floor, rmse
+from pchem_pipeline.model.checks.residuals import noise_floor, rmse
 from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_numbers
 from pchem_pipeline.model.ensemble.components import moment_errors, predicted_moments, sample_moments
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, ensemble_sums, nuced_axis, tally

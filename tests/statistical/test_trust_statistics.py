@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.drawn_pixels import Drawn, draw
@@ -10,18 +12,30 @@ from scipy.special import chdtrc
 from scipy.stats import binom, kstest
 
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
-from pchem_pipeline.model.checks.shrinkage import judge_together
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, epcd_exact
+from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, ensemble_sums
 from pchem_pipeline.model.errors.fisher import sandwich_covariance
 from pchem_pipeline.model.fit.intervals import profile_intervals, quantile_of
 from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.model.maps.pixels import PixelParameters
 
 Array = NDArray[np.float64]
 GUARD_OFF = FitSettings(tail_guard=0)
+
+
+def judge_together(fit: FitResult) -> FitResult:
+    """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
+    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, fit.covariance)
+    pixels = Judged(noise, stderr, fit.likelihood_gap)
+    pool = NoisePool.of(pixels)
+    if pool is None:
+        return fit
+    word = np.where(pool.weak(pixels, FitSettings()), int(FitStatus.WEAKLY_IDENTIFIED), 0)
+    return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
 
 
 def estimates(fit: FitResult) -> Array:
@@ -186,7 +200,7 @@ def test_the_error_of_the_ensemble_is_its_scatter() -> None:
         pixels = draw(rng, exposure, 11.0, 0.3, bias, n_frames=2000)
         fit = fit_histograms(pixels.counts, pixels.origin)
         some = PixelParameters(*np.ascontiguousarray(estimates(fit).T))
-        curves.append(epcd_exact(some, dn))
+        curves.append(ensemble_sums(some, dn).raw / len(some))
         raw, corrected = curve_errors(some, fit.covariance, dn, nuced)
         predicted += np.sqrt(raw) / len(some) / n
         assert (corrected[5:] > 0).all()

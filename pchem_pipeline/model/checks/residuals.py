@@ -15,7 +15,6 @@ __all__ = [
     "ChiSquare",
     "central_window",
     "chi_square",
-    "counting_variance",
     "noise_floor",
     "normalised_residuals",
     "rmse",
@@ -69,33 +68,11 @@ def rmse(data: FloatArray, model: FloatArray, window: slice = slice(None)) -> fl
     return math.sqrt(float(np.mean((data[window] - model[window]) ** 2)))
 
 
-def counting_variance(
-    total: FloatArray, total_square: FloatArray, n_pixels: int, n_frames: int, width: float = 1.0
-) -> FloatArray:
-    """Variance of the density of an ensemble histogram, the pixels given.
-
-    A pixel of probability p_p for a bin puts a binomial number of its m frames there, independently of the
-    other pixels. Over the m P samples and bins of width w the density has variance
-    ``sum_p m p_p (1 - p_p) / (m P w)^2``.
-
-    Args:
-        total: sum over pixels of p_p, shape (n,).
-        total_square: sum over pixels of p_p squared, shape (n,).
-        n_pixels: P.
-        n_frames: m.
-        width: w, in the unit of the axis.
-
-    Returns:
-        Variance of the density of each bin, shape (n,).
-    """
-    return np.maximum(total - total_square, 0.0) / (n_frames * (n_pixels * width) ** 2)
-
-
 def noise_floor(variance: FloatArray, window: slice = slice(None)) -> float:
     """Root of the expected mean square difference between data and their own true density.
 
     Args:
-        variance: variance of the density of each bin, shape (n,), see :func:`counting_variance`.
+        variance: variance of the density of each bin, shape (n,).
         window: the bins to compare.
 
     Returns:

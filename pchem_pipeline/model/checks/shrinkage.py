@@ -16,17 +16,15 @@ errors rough. On a sensor whose pixels differ more than their errors this change
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.errors.fisher import propagate
-from pchem_pipeline.model.fit.pchem import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FitStatus
 
-__all__ = ["LOOSEST", "Judged", "NoisePool", "judge_together", "noise_of"]
+__all__ = ["LOOSEST", "Judged", "NoisePool", "noise_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -170,19 +168,3 @@ def noise_of(gain: FloatArray, sigma: FloatArray, covariance: FloatArray) -> tup
     with np.errstate(invalid="ignore"):
         stderr = propagate(covariance, np.stack([nothing, sigma, nothing, gain], axis=-1))
     return gain * sigma, stderr
-
-
-def judge_together(fit: FitResult, settings: FitSettings | None = None) -> FitResult:
-    """Return the fit of a sensor's pixels with the word of those that are weakly identified.
-
-    Args:
-        fit: of all pixels of a sensor, or of many that are alike.
-        settings: of the fit; the defaults if None.
-    """
-    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, fit.covariance)
-    pixels = Judged(noise, stderr, fit.likelihood_gap)
-    pool = NoisePool.of(pixels)
-    if pool is None:
-        return fit
-    word = np.where(pool.weak(pixels, settings or FitSettings()), int(FitStatus.WEAKLY_IDENTIFIED), 0)
-    return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))

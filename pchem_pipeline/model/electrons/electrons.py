@@ -26,7 +26,6 @@ __all__ = [
     "compare_electron_numbers",
     "electron_counts",
     "electron_numbers",
-    "nuc",
     "thresholds",
 ]
 
@@ -191,17 +190,3 @@ def compare_electron_numbers(
     sizes = np.zeros(n_sizes, dtype=np.int64)
     compared, signed = electrons_numba.count_errors(estimated, true, NO_NUMBER, sizes)
     return ErrorTally(int(compared), sizes, int(signed))
-
-
-def nuc(dn: NDArray[Any], conversion_gain: FloatArray, bias: FloatArray) -> FloatArray:
-    """Two-point non-uniformity correction ``(x - mu) g`` (Hendrickson et al. 2023, Sec. IV-C).
-
-    Args:
-        dn: DN, shape (..., ny, nx).
-        conversion_gain: g, e-/DN, shape (ny, nx).
-        bias: mu, DN, shape (ny, nx).
-
-    Returns:
-        Corrected data, e-, same shape as ``dn``.
-    """
-    return np.asarray((dn - bias) * conversion_gain, dtype=np.float64)

@@ -27,7 +27,6 @@ __all__ = [
     "curve_errors",
     "electron_pmf",
     "ensemble_sums",
-    "epcd_exact",
     "nuced_axis",
     "tally",
 ]
@@ -171,19 +170,6 @@ def ensemble_sums(pixels: PixelParameters, dn: DnAxis, nuced: NucedAxis | None =
         bins_square,
     )
     return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square)
-
-
-def epcd_exact(pixels: PixelParameters, dn: DnAxis) -> FloatArray:
-    """Ensemble PCD as the mean over the pixels (Hendrickson et al. 2023, eq. full_ensemble_dist).
-
-    Args:
-        pixels: the pixels.
-        dn: where to evaluate it.
-
-    Returns:
-        f_E, 1/DN, shape (n_dn,). For pixels narrower than 1 DN it is the mass of the DN cell.
-    """
-    return ensemble_sums(pixels, dn).raw / len(pixels)
 
 
 def curve_errors(

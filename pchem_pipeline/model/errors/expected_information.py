@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln
 
-__all__ = ["COORDINATES", "SHARED", "expected_information", "inverse_information", "shared_information"]
+__all__ = ["COORDINATES", "expected_information", "inverse_information", "shared_information"]
 
 #: The coordinates in which the information depends on H and the read noise in electrons only.
 COORDINATES = ("quanta_exposure", "log_gain", "bias_e", "log_read_noise_dn")
-#: Those that all samples of a pixel share.
-SHARED = COORDINATES[1:]
 
 _NODES_PER_SIGMA = 3.0  # halving the step changes no digit that matters; see the tests
 _REACH = 10.0  # read noises beyond which nothing is left
@@ -71,7 +69,7 @@ def expected_information(quanta_exposure: float, read_noise_e: float) -> NDArray
 
 
 def shared_information(quanta_exposure: float, read_noise_e: float) -> NDArray[np.float64]:
-    """Return what one frame of a sample tells about :data:`SHARED`, the exposure being unknown.
+    """Return what one frame of a sample, its exposure unknown, tells of the other :data:`COORDINATES`.
 
     A sample without electrons (H = 0, bias frames) is one Gaussian: it tells bias and read noise, not the
     gain.

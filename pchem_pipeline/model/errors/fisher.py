@@ -15,7 +15,6 @@ __all__ = [
     "correlations",
     "covariance_from",
     "cramer_rao",
-    "cramer_rao_stderr",
     "observed_covariance",
     "propagate",
     "sandwich_covariance",
@@ -90,17 +89,6 @@ def observed_covariance(counts: ArrayLike, origin: int, parameters: ArrayLike) -
     covariance = np.empty((4, 4))
     fisher_numba.to_natural(theta, middle, space.information, np.zeros(4, np.bool_), np.empty(4), covariance)
     return covariance
-
-
-def cramer_rao_stderr(
-    quanta_exposure: ArrayLike,
-    conversion_gain: ArrayLike,
-    read_noise_dn: ArrayLike,
-    n_frames: ArrayLike,
-) -> NDArray[np.float64]:
-    """Return the smallest standard errors of (H, g, mu, sigma), shape (..., 4); see :func:`cramer_rao`."""
-    bound = cramer_rao(quanta_exposure, conversion_gain, read_noise_dn, n_frames)
-    return np.asarray(np.sqrt(np.diagonal(bound, axis1=-2, axis2=-1)))
 
 
 def propagate(covariance: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray[np.float64]:

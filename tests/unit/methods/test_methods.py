@@ -10,7 +10,7 @@ from pchem_pipeline.methods import base, peak_valley_numba, plain_em_numba
 from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
 from pchem_pipeline.methods.moments import sample_moments
-from pchem_pipeline.methods.peak_valley import LARGEST_READ_NOISE, read_noise_of_valley
+from pchem_pipeline.methods.peak_valley import read_noise_of_valley
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
@@ -156,7 +156,7 @@ def test_valley_and_read_noise_belong_together():
     noise = np.array([0.15, 0.25, 0.35, 0.42])
     np.testing.assert_allclose(read_noise_of_valley(2 * np.exp(-1 / (8 * noise**2))), noise)
     assert np.isnan(read_noise_of_valley(np.array([1.0, 1.5, 0.0, -1.0]))).all()
-    assert pytest.approx(0.4247, abs=1e-4) == LARGEST_READ_NOISE
+    assert read_noise_of_valley(np.array([1 - 1e-9])) == pytest.approx(0.4247, abs=1e-4)
 
 
 EMPTY = np.zeros((1, 40), np.uint32)

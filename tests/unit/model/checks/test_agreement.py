@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.counting_noise import counting_variance
 
 from pchem_pipeline.model.checks.residuals import (
     central_window,
     chi_square,
-    counting_variance,
     noise_floor,
     normalised_residuals,
     rmse,

@@ -14,7 +14,6 @@ from pchem_pipeline.model.electrons.electrons import (
     electron_counts,
     electron_numbers,
     electrons_numba,
-    nuc,
     thresholds,
 )
 from pchem_pipeline.model.maps.pixels import PixelParameters
@@ -147,8 +146,3 @@ def test_comparison_with_the_truth() -> None:
     result = compare_electron_numbers(estimated, true, 3)
     np.testing.assert_array_equal(result.by_size, [3, 1, 1])
     assert (result.n_samples, result.signed) == (5, 7)
-
-
-def test_two_point_correction() -> None:
-    dn = np.array([[[100, 120]]], dtype=np.uint16)
-    np.testing.assert_allclose(nuc(dn, np.array([[0.1, 0.2]]), np.array([[105.0, 100.0]])), [[[-0.5, 4.0]]])
