@@ -107,31 +107,23 @@ def _ends(group: str, names: tuple[str, ...]) -> list[Variable]:
     return found
 
 
-def _joint() -> list[Variable]:
-    """Return what a joint fit of several exposures keeps beside its maps; axis `sample`: the exposures."""
+def _samples() -> list[Variable]:
+    """Return what a fit of several exposures keeps beside its maps; axis ``sample``: the exposures."""
     unit, sentence, symbol = _PARAMETER_WORDS["quanta_exposure"]
     cube = ("sample", *_MAP)
-    both = ("joint_parameter", "joint_parameter_2")
-    found: list[tuple[str, tuple[str, ...], str, str, str, str]] = [
-        ("quanta_exposure", cube, "float64", unit, sentence, symbol),
-        ("quanta_exposure_stderr", cube, "float64", unit, f"standard error of the {sentence}", ""),
-        ("mean", cube, "float64", "DN", "mean of the sample", ""),
-        ("variance", cube, "float64", "DN2", "variance of the sample", ""),
-        ("linearity_residual", cube, "float64", "e-", "quanta exposure minus the line through all", ""),
-        ("linearity_residual_stderr", cube, "float64", "e-", "standard error of that residual", ""),
-        ("linearity_chi2", _MAP, "float64", "1", "chi-square of the exposures against the line", ""),
-        ("linearity_p", _MAP, "float64", "1", "probability of a larger one if the pixel is linear", ""),
-        ("covariance", (*_MAP, *both), "float64", "1", "covariance of (H_1 ... H_J, g, mu, sigma)", ""),
-        ("log_likelihood", _MAP, "float64", "nat", "joint log-likelihood at the estimate", ""),
-        ("likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up", ""),
-        ("fit_status", _MAP, "uint16", "1", "reasons for caution or failure, as bits; 0 is fine", ""),
-        ("n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel", ""),
-        ("goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of all samples, bins merged", ""),
-        ("goodness_dof", _MAP, "int32", "1", "degrees of freedom of goodness_chi2", ""),
-        ("goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds", ""),
-        ("outlier_share", _MAP, "float64", "1", "share of all frames that the tail guard left out", ""),
+    both = ("sample_parameter", "sample_parameter_2")
+    found: list[tuple[str, tuple[str, ...], str, str, str]] = [
+        ("quanta_exposure", cube, unit, sentence, symbol),
+        ("quanta_exposure_stderr", cube, unit, f"standard error of the {sentence}", ""),
+        ("mean", cube, "DN", "mean of the sample", ""),
+        ("variance", cube, "DN2", "variance of the sample", ""),
+        ("covariance", (*_MAP, *both), "1", "covariance of (H_1 ... H_J, g, mu, sigma)", ""),
+        ("linearity_residual", cube, "e-", "quanta exposure minus the line through all", ""),
+        ("linearity_residual_stderr", cube, "e-", "standard error of that residual", ""),
+        ("linearity_chi2", _MAP, "1", "chi-square of the exposures against the line", ""),
+        ("linearity_p", _MAP, "1", "probability of a larger one if the pixel is linear", ""),
     ]
-    return [Variable(f"joint/{name}", *rest) for name, *rest in found]  # type: ignore[arg-type]
+    return [Variable(f"samples/{name}", dims, "float64", *rest) for name, dims, *rest in found]
 
 
 def _discrepancy() -> list[Variable]:
@@ -255,8 +247,8 @@ _ALL: list[Variable] = [
     Variable(
         "maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is called misfit"
     ),
-    *_both("maps", ("spurious_charge", "charge_per_level")),  # of a joint fit
-    *_joint(),
+    *_both("maps", ("spurious_charge", "charge_per_level")),  # of several exposures
+    *_samples(),
     Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
     # raw ensemble (paper, Sec. II-C): axis `dn`
     Variable("ensemble/dn", ("dn",), "int32", "DN", "digital number"),

@@ -178,16 +178,16 @@ def joint(
     *,
     command: Command,
 ) -> None:
-    """Fit several exposures of a sensor together.
+    """Fit several exposures of a sensor together, as a run whose samples they are.
 
     One gain, bias and read noise for each pixel; dark current as the slope of H. Runs get their histograms.
     """
     from pchem_pipeline.commands.joint import find_joint, run_joint
 
-    fit = find_joint(targets, bias or [], store, write=not command.options.dry_run)
-    run_joint(fit, command)
+    target, is_new = find_joint(targets, bias or [], store, write=not command.options.dry_run)
+    run_joint(target, command, is_new=is_new)
     if not command.options.dry_run:
-        typer.echo(fit.store / "report.html")
+        typer.echo(target.store / "report.html")
 
 
 app.command()(methods)

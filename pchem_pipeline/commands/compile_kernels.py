@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.config.load import make_config
+from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.compilation import mark_path
 from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
@@ -34,13 +35,12 @@ def compile_kernels(content: Mapping[str, Any], stages: Sequence[str]) -> None:
     config = make_config(content, "the run")
     with tempfile.TemporaryDirectory(prefix="pchem-kernels-") as place:
         folder = Path(place)
-        np.savez(folder / "invented.npz", **_histograms(config.input.bit_depth or 16))
         small = make_config(
             {
                 **content,
                 "simulate": None,
                 "run": {"store": str(folder / "run.zarr")},
-                "input": {"files": ["invented.npz"], "bit_depth": config.input.bit_depth},
+                "input": _invented_input(config, folder),
                 "compute": {"backend": "serial", "workers": 1},
             },
             "the invented run",
@@ -48,6 +48,21 @@ def compile_kernels(content: Mapping[str, Any], stages: Sequence[str]) -> None:
         target = Target(small, folder, folder / "run.zarr")
         run_stages(target, _with_upstream(stages), Command(progress="off", quiet=True))
     mark_path(config, stages).touch()
+
+
+def _invented_input(config: RunConfig, folder: Path) -> dict[str, Any]:
+    """Write invented histograms; return the section ``input`` that reads them, as one sample or as two."""
+    depth = config.input.bit_depth
+    inputs = []
+    for i in range(2 if config.input.samples else 1):
+        np.savez(folder / f"invented{i}.npz", **_histograms(depth or 16, seed=i + 1))
+        inputs.append({"files": [f"invented{i}.npz"], "bit_depth": depth})
+    if not config.input.samples:
+        return inputs[0]
+    for i, each in enumerate(inputs):
+        sample = make_config({"run": {"store": f"sample{i}.zarr"}, "input": each}, "an invented sample")
+        (folder / f"sample{i}.yaml").write_text(dump_config(sample))
+    return {"samples": [{"run": f"sample{i}.yaml"} for i in range(2)], "against": "none"}
 
 
 def _with_upstream(stages: Sequence[str]) -> list[str]:
@@ -59,9 +74,9 @@ def _with_upstream(stages: Sequence[str]) -> list[str]:
     return [name for name in STAGES if name in wanted]
 
 
-def _histograms(bit_depth: int) -> dict[str, Any]:
+def _histograms(bit_depth: int, seed: int) -> dict[str, Any]:
     """Draw histograms of pixels of many exposures and read noises: ``dn`` (bin,), ``counts`` (pixel, bin)."""
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed)
     exposure, noise = np.meshgrid([0.3, 2.0, 6.0], [0.2, 0.3, 0.6])
     dn_per_electron = min(8.0, 2.0**bit_depth / 64)
     electrons = rng.poisson(exposure.ravel(), (1000, 9)) + noise.ravel() * rng.standard_normal((1000, 9))

@@ -83,15 +83,14 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def _say_if_old(target: Target) -> None:
     """Warn where the maps are not those of the present settings and input."""
-    state = next(state for state in run_status(target) if state.stage in ("maps", "joint"))
+    state = next(state for state in run_status(target) if state.stage == "maps")
     if state.state != "complete":
         Reporter("off").warning(f"maps: {state.words()}; they are written as they are")
 
 
 def _images(store: RunStore) -> list[MapImage]:
     chosen: list[Variable] = [v for v in variables_of("maps") if store.has(v.path)]
-    both = (*variables_of("fit"), *variables_of("joint"))
-    chosen += [v for v in both if v.name in _FROM_FIT and store.has(v.path)]
+    chosen += [v for v in variables_of("fit") if v.name in _FROM_FIT and store.has(v.path)]
     return [MapImage(v.name, store.read(v.path), v.unit, v.long_name) for v in chosen]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -86,9 +87,34 @@ def make_config(content: Mapping[str, Any], name: str) -> RunConfig:
         ConfigError: a setting is wrong.
     """
     try:
-        return RunConfig.model_validate(content)
+        return RunConfig.model_validate(_of_earlier_version(content, name))
     except ValidationError as error:
         raise ConfigError(f"{name}: {complaints(error)}") from error
+
+
+def _of_earlier_version(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Turn the YAML of a joint fit of version 0.1 into that of a run of several samples, and say so."""
+    if "samples" not in content:
+        return content
+    joint = dict(content.get("joint") or {})
+    known = {**_OLD_JOINT, **{key: value for key, value in joint.items() if value is not None}}
+    samples = [_sample(each) for each in content["samples"] or ()]
+    rest = {key: value for key, value in content.items() if key not in ("samples", "joint")}
+    sys.stderr.write(
+        f"pchem: {name}: samples and joint are now input.samples, input.against and run; kind: bias is bias: "
+        "true\n"
+    )
+    return {"run": known, "input": {"samples": samples, "against": known.pop("against")}, **rest}
+
+
+_OLD_JOINT = {"store": "joint.zarr", "against": "integration_time"}
+
+
+def _sample(given: Any) -> Any:
+    """Turn a sample of version 0.1 into one of now; what is wrong with it is said by its section."""
+    if not isinstance(given, dict) or given.get("kind") not in ("bias", "exposed"):
+        return given
+    return {**{key: value for key, value in given.items() if key != "kind"}, "bias": given["kind"] == "bias"}
 
 
 def dump_config(config: RunConfig) -> str:

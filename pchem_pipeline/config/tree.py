@@ -93,7 +93,7 @@ class RunConfig(Section):
         if not isinstance(data, dict) or data.get("simulate") is None:
             return data
         given = data.get("input") or {}
-        if not isinstance(given, dict) or given.get("files"):
+        if not isinstance(given, dict) or given.get("files") or given.get("samples"):
             return data
         try:
             simulated = SimulateSettings.model_validate(data["simulate"])
@@ -109,7 +109,7 @@ class RunConfig(Section):
 
     @model_validator(mode="after")
     def _has_input(self) -> RunConfig:
-        if self.simulate is None and not self.input.files:
+        if self.simulate is None and not (self.input.files or self.input.samples):
             raise ValueError(
                 "input.files: there is nothing to read; name camera files, or add a section simulate"
             )

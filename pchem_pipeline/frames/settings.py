@@ -8,11 +8,26 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["InputSettings"]
+__all__ = ["InputSettings", "SampleSettings"]
+
+
+class SampleSettings(Section):
+    """One exposure of several that are fitted together: an ordinary run of the same pixels."""
+
+    run: str = Field(min_length=1, description="config.yaml or store of the run, relative to this file")
+    bias: bool = Field(
+        default=False, description="frames without any electrons, H = 0; they pin the bias and the read noise"
+    )
+    integration_time: float | None = Field(
+        default=None, ge=0, description="s; null: what the run says. 0 is allowed: no time to integrate"
+    )
+    light_level: float | None = Field(
+        default=None, ge=0, description="exposure in any unit, for input.against: light_level"
+    )
 
 
 class InputSettings(Section):
-    """Camera files (or ready-made histograms) and what their format does not say itself.
+    """Camera files (or ready-made histograms, or other runs) and what their format does not say itself.
 
     A value given here wins over what the file, its header or its sidecar says. ``None`` means:
     take it from the file; if the file does not say, the value stays unknown and is never guessed.
@@ -23,6 +38,24 @@ class InputSettings(Section):
         description="camera files, globs or folders, relative to this YAML file, or URLs such as "
         "s3://bucket/frames/*.tif; "
         "read in natural order of their names (frame2 before frame10)",
+    )
+    samples: tuple[SampleSettings, ...] = Field(
+        default=(),
+        max_length=64,
+        description="instead of files: several exposures in increasing order, each a run of the same pixels, "
+        "fitted together with one g, mu and sigma for each pixel; entries: run, bias, integration_time, "
+        "light_level",
+    )
+    against: Literal["integration_time", "light_level", "none"] = Field(
+        default="integration_time",
+        description="samples: what their exposures are drawn against. integration_time: the slope of H is "
+        "the dark current and its offset the spurious charge. none: no line",
+    )
+    shown_sample: int | None = Field(
+        default=None,
+        ge=0,
+        description="samples: whose histograms, H and ensemble are shown, counted from 0; null: the last "
+        "that holds electrons",
     )
     format: str = Field(
         default="auto",
@@ -93,6 +126,19 @@ class InputSettings(Section):
         description="unreadable, truncated, duplicate or odd-shaped files: error stops and lists them all; "
         "skip leaves them out and reports them",
     )
+
+    @model_validator(mode="after")
+    def _check_samples(self) -> Self:
+        if not self.samples:
+            return self
+        if self.files:
+            raise ValueError("files and samples: give one of them; samples are runs of their own")
+        if all(sample.bias for sample in self.samples):
+            raise ValueError("samples: every sample is a bias; list at least one that holds electrons")
+        shown = self.shown_sample
+        if shown is not None and (shown >= len(self.samples) or self.samples[shown].bias):
+            raise ValueError(f"shown_sample: {shown} is no sample that holds electrons; choose another")
+        return self
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -75,7 +75,16 @@ def mark_path(config: RunConfig, stages: Sequence[str]) -> Path:
     for file in files:
         state.update(file.read_bytes())
     sections = config.model_dump(mode="json", by_alias=True, include=set(_SECTIONS))
-    about = (sorted(stages), sections, platform.machine(), sys.version, version("numba"), version("llvmlite"))
+    several = bool(config.input.samples)
+    about = (
+        sorted(stages),
+        sections,
+        several,
+        platform.machine(),
+        sys.version,
+        version("numba"),
+        version("llvmlite"),
+    )
     state.update(json.dumps(about, sort_keys=True).encode())
     return cache_folder() / f"compiled-{state.hexdigest()[:32]}"
 

@@ -58,6 +58,7 @@ class Stage:
         applies: tells from the configuration whether a run has the stage.
         on_demand: done only where it is asked for by name.
         follows: stages that write the files which this one reads as input.
+        reads_input: it looks at the camera files, or at the runs of the samples, as they are now.
         single_pass: what does its work, and that of the stages after it, in one pass over the input.
         plan: ``"module:function"`` that takes (configuration, folder, stages to be done) and returns lines
             which say what the stage will take.
@@ -78,6 +79,7 @@ class Stage:
     applies: Callable[[RunConfig], bool] = _every_run
     on_demand: bool = False
     follows: tuple[str, ...] = ()
+    reads_input: bool = False
     single_pass: SinglePass | None = None
     plan: str | None = None
     status_words: str | None = None

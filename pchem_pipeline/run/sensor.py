@@ -8,7 +8,24 @@ from typing import Any, Literal
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["SensorInfo"]
+__all__ = ["Sample", "SensorInfo"]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One of several exposures that are fitted together.
+
+    Attributes:
+        name: name of its store.
+        bias: it holds no electrons.
+        n_frames: frames.
+        integration_time: s, as its run says; None where it does not.
+    """
+
+    name: str
+    bias: bool
+    n_frames: int
+    integration_time: float | None
 
 
 @dataclass(frozen=True)
@@ -16,8 +33,10 @@ class SensorInfo:
     """The input as the later stages see it; kept in the attributes of the group ``frames``.
 
     Attributes:
-        kind: frames, or ready-made histograms (no order in time, no neighbours).
-        n_frames: number of frames (for histograms: the largest number of samples of a channel).
+        kind: frames; ready-made histograms (no order in time, no neighbours); or samples, other runs of the
+            same pixels that are fitted together.
+        n_frames: number of frames (for histograms: the largest number of samples of a channel; for samples:
+            of all together).
         ny: rows.
         nx: columns (for histograms: channels).
         dtype: numpy name of the DN type.
@@ -26,9 +45,11 @@ class SensorInfo:
         mode: copy (``frames/dn`` holds the frames) or reference (they stay in the camera files).
         identity: names, sizes and content hashes of the files.
         names: names of the channels of ready-made histograms.
+        samples: the exposures, where there are several.
+        shown: place of the one whose histograms, H and ensemble are shown.
     """
 
-    kind: Literal["frames", "histograms"]
+    kind: Literal["frames", "histograms", "samples"]
     n_frames: int
     ny: int
     nx: int
@@ -38,6 +59,8 @@ class SensorInfo:
     mode: Literal["copy", "reference"]
     identity: dict[str, Any]
     names: tuple[str, ...] = ()
+    samples: tuple[Sample, ...] = ()
+    shown: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -46,7 +69,8 @@ class SensorInfo:
 
     def write(self, store: RunStore) -> None:
         """Keep this in the store."""
-        store.set_attributes("frames", {"sensor": {**asdict(self), "names": list(self.names)}})
+        content = {**asdict(self), "names": list(self.names), "samples": [asdict(s) for s in self.samples]}
+        store.set_attributes("frames", {"sensor": content})
 
     @classmethod
     def read(cls, store: RunStore) -> SensorInfo:
@@ -58,4 +82,5 @@ class SensorInfo:
         content = store.attributes("frames").get("sensor")
         if content is None:
             raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
-        return cls(**{**content, "names": tuple(content["names"])})
+        samples = tuple(Sample(**each) for each in content.get("samples", ()))
+        return cls(**{**content, "names": tuple(content["names"]), "samples": samples})

@@ -18,6 +18,7 @@ from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest, stop_on_signals
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_targets
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.progress_file import ProgressFile
@@ -84,6 +85,7 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         IncompleteRunError: tiles failed, or more pixels failed than the configuration allows.
         PchEmError: a stage cannot be done; the message says why.
     """
+    _bring_samples(target, stages, command)
     if command.options.dry_run:
         return _dry_run(target, stages, command)
     ahead = [name for name in stages if STAGES[name].compiled_ahead]
@@ -98,11 +100,29 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     return states
 
 
+def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> None:
+    """Bring the runs of the samples up to their histograms, where a run has several and looks at its input.
+
+    Raises:
+        ConfigError: the samples do not belong together.
+    """
+    if not target.config.input.samples or not any(STAGES[name].reads_input for name in stages):
+        return
+    own = replace(command, options=replace(command.options, force=False, tiles=None, roi=None))
+    reporter = Reporter("off", quiet=command.quiet)
+    for sample in sample_targets(target.config, target.base_dir):
+        reporter.info(f"sample {sample.store.name}")
+        run_stages(sample, up_to(SAMPLES_UNTIL, pipeline_of(sample.config)), own)
+    if not command.options.dry_run:
+        check_samples(target.config, target.base_dir)
+
+
 def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageState:
     """Bring a stage up to date; with those after it, where one pass does the work of all."""
     single_pass = STAGES[name].single_pass
+    of_files = not context.config.input.samples
     with announced(context.reporter, name):
-        if single_pass is not None and set(single_pass.stages) <= set(stages):
+        if of_files and single_pass is not None and set(single_pass.stages) <= set(stages):
             imported(single_pass.run)(context)
         return execute(name, context)
 
@@ -154,8 +174,6 @@ def run_status(target: Target) -> list[StageState]:
     if not (target.store / "zarr.json").exists():
         return [StageState(name, "missing") for name in stages]
     context = _reading_context(target, Reporter("off", quiet=True), Options())
-    if "samples" in context.store.attributes("samples"):
-        stages = ()  # a joint fit
     done = (name for name in STAGES if context.store.records.read(name) is not None)
     stages += tuple(name for name in done if STAGES[name].on_demand)
     states: list[StageState] = []

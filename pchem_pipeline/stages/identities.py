@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.run.input_identity import known_identity
@@ -17,7 +18,6 @@ __all__ = [
     "fit_inputs",
     "input_content",
     "integration_time",
-    "joint_samples",
     "known_added_exposure",
     "other_samples",
     "search_start",
@@ -35,10 +35,27 @@ def input_content(context: StageContext) -> dict[str, Any]:
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
+    if context.config.input.samples:
+        return _sample_content(context)
     from pchem_pipeline.frames.identity import digest_of
 
     identity = known_identity(context)
     return {"content": digest_of([file["xxh3_128"] for file in identity["files"]])}
+
+
+def _sample_content(context: StageContext) -> dict[str, Any]:
+    """Return what the histograms of the samples are; as last known where their runs are gone."""
+    from pchem_pipeline.base.errors import ConfigError, StoreError
+    from pchem_pipeline.stages.samples import sample_facts
+
+    try:
+        return sample_facts(context.config, context.base_dir)
+    except (ConfigError, StoreError):
+        record = context.store.records.read("ingest")
+        if record is None or not record.content.get("input"):
+            raise
+        known: dict[str, Any] = record.content["input"]
+        return known
 
 
 def adc_limits(context: StageContext) -> dict[str, Any]:
@@ -68,8 +85,15 @@ def known_added_exposure(store: RunStore, effects: Sequence[dict[str, Any]]) -> 
 
 
 def integration_time(context: StageContext) -> dict[str, Any]:
-    """Return what the files may say and the settings of the maps do not: the integration time."""
-    return {"integration_time": context.integration_time}
+    """Return what the files may say and the settings of the maps do not: time, or the samples' exposures."""
+    if not context.config.input.samples:
+        return {"integration_time": context.integration_time}
+    from pchem_pipeline.stages.samples import exposure_axis
+
+    settings = context.config.input
+    x = exposure_axis(settings, context.sensor.samples)
+    known = None if x is None else [None if math.isnan(each) else each for each in x.tolist()]
+    return {"against": settings.against, "exposures": known}
 
 
 def verdict(context: StageContext) -> dict[str, str] | None:
@@ -99,8 +123,3 @@ def search_start(context: StageContext) -> dict[str, Any]:
     if kept.get("model_after") == present:
         present = kept["model_before"]
     return {"model": present, "roi": list(context.options.roi or kept.get("roi") or ())}
-
-
-def joint_samples(context: StageContext) -> dict[str, Any]:
-    """Return the samples of a joint fit, with the fingerprints of their histograms, and the ADC's limits."""
-    return {**context.store.attributes("samples"), **adc_limits(context)}

@@ -21,6 +21,7 @@ from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, nothing_left, open_store
+from pchem_pipeline.stages.samples import check_samples, sample_sensor
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.reader import FrameReader
@@ -66,6 +67,11 @@ def run(context: StageContext) -> None:
         InputError: the input is bad, vanished or changed; the message lists all bad files.
         StoreError: the store refuses.
     """
+    if context.config.input.samples:
+        samples = check_samples(context.config, context.base_dir)
+        sample_sensor(context.config, samples).write(context.store)
+        _run_whole(context)
+        return
     if is_histogram_input(context.config.input, context.base_dir):
         _record_histograms(context)
         return

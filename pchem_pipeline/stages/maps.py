@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +16,18 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery, poores
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
+from pchem_pipeline.model.maps.sample_maps import LINE_MAPS, line_maps
 from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
+    from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
 __all__ = ["maps_tile", "run"]
 
-_SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")
+_SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 _NO_TIME = "integration time is not known: no dark current; give input.integration_time, s"
 
 
@@ -59,21 +62,48 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: the fit is missing, or the store refuses.
     """
-    time = context.integration_time
-    names = [name for name in _SUMMARISED if time is not None or name != "dark_current"]
+    time, line = context.integration_time, _line(context)
+    of_time = ("dark_current",) if time is not None and line is None else ()
+    names = [*_SUMMARISED, *(of_time if line is None else LINE_MAPS[line.against])]
     context.create_maps([f"maps/{name}" for each in names for name in (each, f"{each}_stderr")])
-    ends = [path for each in (*INTERVALS, *names[len(_SUMMARISED) - 1 :]) for path in interval_names(each)]
+    ends = [path for each in (*INTERVALS, *of_time) for path in interval_names(each)]
     if context.store.has(f"fit/{ends[0]}"):
         context.create_maps([f"maps/{name}" for name in ends])
     context.create_maps(["maps/quality", "maps/goodness_q"])
-    if time is None:
+    if line is not None:
+        _create_residuals(context, len(line.x))
+    elif time is None and not context.sensor.samples:
         context.note(_NO_TIME)
-    task = functools.partial(_do_tile, store=context.store.path, integration_time=time)
+    task = functools.partial(_do_tile, store=context.store.path, integration_time=time, line=line)
     context.run_units(context.tiles(), task, needs="fit")
     _summarise(context, names)
 
 
-def _do_tile(tile: Tile, *, store: Path, integration_time: float | None) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Line:
+    """What the exposures of several samples are drawn against, and where each stands (NaN: nowhere)."""
+
+    against: str
+    x: tuple[float, ...]
+
+
+def _line(context: StageContext) -> _Line | None:
+    settings = context.config.input
+    x = exposure_axis(settings, context.sensor.samples) if context.sensor.samples else None
+    return None if x is None else _Line(settings.against, tuple(x.tolist()))
+
+
+def _create_residuals(context: StageContext, n_samples: int) -> None:
+    """Make the arrays of what the line leaves."""
+    tile, shape = context.config.run.tile, context.sensor.shape
+    for name in ("linearity_residual", "linearity_residual_stderr"):
+        context.create(f"samples/{name}", (n_samples, *shape), chunks=(n_samples, tile, tile))
+    context.create_maps(["samples/linearity_chi2", "samples/linearity_p"])
+
+
+def _do_tile(
+    tile: Tile, *, store: Path, integration_time: float | None, line: _Line | None = None
+) -> dict[str, Any]:
     opened = open_store(store)
     needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "fit_status"]
     needed += [path for name in INTERVALS for path in interval_names(name) if opened.has(f"fit/{path}")]
@@ -81,7 +111,24 @@ def _do_tile(tile: Tile, *, store: Path, integration_time: float | None) -> dict
     fit["correlation"] = opened.read("fit/correlation", (*tile.region, slice(None)))
     for name, values in maps_tile(fit, integration_time).items():
         opened.write(f"maps/{name}", tile.region, values)
+    if line is not None:
+        _write_line(opened, tile, line)
     return {}
+
+
+def _write_line(store: RunStore, tile: Tile, line: _Line) -> None:
+    """Draw the line through the exposures of each pixel of a tile, and write what it tells."""
+    cube = (slice(None), *tile.region)
+    exposure = store.read("samples/quanta_exposure", cube).reshape(len(line.x), -1).T
+    covariance = store.read("samples/covariance", tile.region)
+    maps, left = line_maps(
+        exposure, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.against
+    )
+    for name, values in maps.items():
+        store.write(f"maps/{name}", tile.region, values.reshape(tile.shape))
+    for name, values in left.items():
+        whole = np.ascontiguousarray(values.T).reshape(*values.shape[1:], *tile.shape)
+        store.write(f"samples/{name}", cube if values.ndim == 2 else tile.region, whole)
 
 
 def _summarise(context: StageContext, names: list[str]) -> None:

@@ -35,6 +35,8 @@ _INPUT_SETTINGS = (
     "on_bad_file",
 )
 
+_LINE = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "linearity_p")
+
 _SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:count_in_one_pass")
 
 
@@ -65,6 +67,7 @@ _ALL = (
         run=f"{_HERE}.ingest:run",
         identity=f"{_HERE}.identities:input_content",
         follows=("simulate",),
+        reads_input=True,
         single_pass=_SINGLE_PASS,
     ),
     Stage(
@@ -91,7 +94,7 @@ _ALL = (
         upstream=("histogram",),
         settings=("fit", "model", "run.tile"),
         reads=("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),
-        writes=("fit",),
+        writes=("fit", "samples"),
         run=f"{_HERE}.fit.fit:run",
         identity=f"{_HERE}.identities:fit_inputs",
         summary="Fit H, g, mu and sigma of every pixel by PCH-EM.",
@@ -103,8 +106,8 @@ _ALL = (
         version=3,
         upstream=("fit",),
         settings=("maps", "run.tile"),
-        reads=("fit",),
-        writes=("maps",),
+        reads=("fit", "samples"),
+        writes=("maps", *(f"samples/{name}" for name in _LINE)),
         run=f"{_HERE}.maps:run",
         identity=f"{_HERE}.identities:integration_time",
         summary="Make the maps, with units, standard errors and quality.",
@@ -125,7 +128,7 @@ _ALL = (
         version=2,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
-        reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "truth"),
+        reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "samples", "truth"),
         writes=(),
         run=f"{_HERE}.report.report:run",
         identity=f"{_HERE}.identities:verdict",
@@ -162,29 +165,6 @@ _ALL = (
         writes=("methods",),
         run=f"{_HERE}.methods.methods:run",
         identity=f"{_HERE}.identities:other_samples",
-        on_demand=True,
-    ),
-    # of a joint fit, whose samples are other runs
-    Stage(
-        "joint",
-        version=1,
-        upstream=(),
-        settings=("fit", "maps", "run.tile"),
-        reads=(),
-        writes=("joint", "maps"),
-        run=f"{_HERE}.joint.joint:run",
-        identity=f"{_HERE}.identities:joint_samples",
-        on_demand=True,
-        status_words="joint/fit_status",
-    ),
-    Stage(
-        "joint_report",
-        version=1,
-        upstream=("joint",),
-        settings=("report", "run.title", "run.allowed_failed_pixels"),
-        reads=("joint", "maps"),
-        writes=(),
-        run=f"{_HERE}.joint.report:run",
         on_demand=True,
     ),
 )

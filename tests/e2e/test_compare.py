@@ -93,7 +93,7 @@ def test_lost_and_new_arrays_settings_and_versions(shell, copies):
         "fit/goodness_p: is not there any more."
     ]  # what is new, or no result, counts nothing
     assert pair["settings"] == [
-        {"name": "fit.gap_threshold", "one": "5.0", "other": "7.0", "stages": ["fit", "joint"]}
+        {"name": "fit.gap_threshold", "one": "5.0", "other": "7.0", "stages": ["fit"]}
     ]
     assert pair["versions"] == []
 

@@ -1,9 +1,12 @@
-"""``pchem joint``: runs of one sensor at several exposures, from the command line to maps and report."""
+"""``pchem joint``: a run whose samples are runs of one sensor, from command line to report and verdict."""
 
+import http.client
 import json
 import os
 import re
 import shutil
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -12,8 +15,12 @@ from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.commands.joint import find_joint, run_joint
-from pchem_pipeline.run.session import Command
+from pchem_pipeline.commands.notebook import open_run
+from pchem_pipeline.commands.view import make_server
+from pchem_pipeline.run.session import Command, run_stages, run_status, up_to
 from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.target import find_run
+from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(Options(), quiet=True, progress="off")
@@ -44,8 +51,8 @@ def camera(folder, name, seed, time, dead=0.0):
 def joint(tmp_path_factory, kernels):
     """Three exposures and a bias, fitted with one command in a folder of their own; do not change it."""
     folder = tmp_path_factory.mktemp("exposures")
-    for seed, time in enumerate((1.0, 2.0, 5.0)):
-        camera(folder, f"dark_{time:g}s", 10 + seed, time)
+    for seed, seconds in enumerate((1.0, 2.0, 5.0)):
+        camera(folder, f"dark_{seconds:g}s", 10 + seed, seconds)
     camera(folder, "bias", 20, 0.001, dead=1.0)
     shell = Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -55,18 +62,29 @@ def joint(tmp_path_factory, kernels):
     return folder
 
 
-def write(folder, name, samples, **joint):
-    lines = ["samples:", *(f"  - {{run: {run}, {rest}}}" for run, rest in samples)]
-    settings = ", ".join(f"{key}: {value}" for key, value in {"store": f"{name}.zarr", **joint}.items())
+def write(folder, name, samples, tile=8, **input_settings):
     path = folder / f"{name}.yaml"
-    report = "report: {figure_formats: [], dpi: 72}"
-    path.write_text("\n".join([*lines, f"joint: {{{settings}}}", report, ""]))
+    lines = [
+        f"run: {{store: {name}.zarr, tile: {tile}}}",
+        "input:",
+        *(f"  {key}: {value}" for key, value in input_settings.items()),
+        "  samples:",
+        *(f"    - {{run: {run}, {rest}}}" for run, rest in samples),
+        "report: {figure_formats: [], dpi: 72}",
+    ]
+    path.write_text("\n".join([*lines, ""]))
     return path
+
+
+def fit(path, until="maps"):
+    target = find_run(path)
+    run_stages(target, up_to(until, pipeline_of(target.config)), QUIET)
+    return RunStore.open(target.store)
 
 
 def test_dark_current_is_the_slope_and_the_pulls_are_normal(joint):
     store = RunStore.open(joint / "dark.zarr")
-    status = store.read("joint/fit_status")
+    status = store.read("fit/fit_status")
     good = status == 0
     assert good.mean() > 0.9
     truth = RunStore.open(joint / "dark_1s.zarr")
@@ -81,123 +99,206 @@ def test_dark_current_is_the_slope_and_the_pulls_are_normal(joint):
             # a wrong gain, bias or time by a tenth would be far outside
             errors = store.read(f"maps/{name}_stderr")[good]
             assert 0.1 * np.median(values) / np.median(errors) * np.sqrt(pulls.size) > 20, name
-    assert (store.read("joint/quanta_exposure")[3] == 0).all()
-    assert np.isnan(store.read("joint/linearity_residual")[3]).all()
-    p = store.read("joint/linearity_p")[good]
+    assert (store.read("samples/quanta_exposure")[3] == 0).all()
+    assert np.isnan(store.read("samples/linearity_residual")[3]).all()
+    p = store.read("samples/linearity_p")[good]
     assert abs(p.mean() - 0.5) < 5 / np.sqrt(12 * p.size)
 
 
 def test_report_numbers_and_yaml_are_there(joint):
     numbers = json.loads((joint / "dark.zarr" / "report.json").read_text())
-    assert [each["integration_time"] for each in numbers["samples"]] == [1.0, 2.0, 5.0, None]
-    assert 0.3 < numbers["maps"]["dark_current"]["median"] < 0.7
+    assert numbers["samples"]["against"] == "integration_time"
+    assert [each["x"] for each in numbers["samples"]["rows"]] == [1.0, 2.0, 5.0, None]
+    assert 0.3 < numbers["summary"]["dark_current"]["median"] < 0.7
     page = (joint / "dark.zarr" / "report.html").read_text()
     for words in (
         "Dark current as the slope of H",
         "Variance against mean",
         "spurious charge",
         "dark_5s.zarr",
+        "4 samples; maps and ensemble show dark_5s.zarr",
     ):
         assert words in page
     assert (joint / "dark.zarr" / "figures" / "exposures.svg").exists()
-    assert "kind: bias" in (joint / "dark.yaml").read_text()
+    assert "bias: true" in (joint / "dark.yaml").read_text()
+
+
+def test_the_shown_sample_stands_in_fit_and_maps(joint):
+    store = RunStore.open(joint / "dark.zarr")
+    shown = RunStore.open(joint / "dark_5s.zarr")
+    for name in ("fit", "maps"):
+        for end in ("", "_stderr"):
+            np.testing.assert_array_equal(
+                store.read(f"{name}/quanta_exposure{end}"), store.read(f"samples/quanta_exposure{end}")[2]
+            )
+    np.testing.assert_array_equal(store.read("histogram/counts"), shown.read("histogram/counts"))
+    assert store.has("ensemble/density")
 
 
 def test_nothing_is_done_twice_and_tiles_do_not_matter(joint):
-    before = (joint / "dark.zarr" / "joint" / "bias").exists(), RunStore.open(joint / "dark.zarr")
-    fit = find_joint([joint / "dark.zarr"])
-    record = before[1].records.read("joint")
-    run_joint(fit, QUIET)
-    assert before[1].records.read("joint") == record
-    other = write(
-        joint,
-        "wide",
-        [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "kind: bias")],
-        tile=16,
-    )
-    run_joint(find_joint([other]), QUIET)
-    for name in ("maps/conversion_gain", "joint/quanta_exposure", "joint/covariance"):
-        np.testing.assert_array_equal(
-            RunStore.open(joint / "wide.zarr").read(name), before[1].read(name), err_msg=name
-        )
+    store = RunStore.open(joint / "dark.zarr")
+    target, is_new = find_joint([joint / "dark.zarr"])
+    assert not is_new
+    record = store.records.read("fit")
+    run_joint(target, QUIET)
+    assert store.records.read("fit") == record
+    four = [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "bias: true")]
+    other = fit(write(joint, "wide", four, tile=16))
+    for name in ("maps/conversion_gain", "samples/quanta_exposure", "samples/covariance"):
+        np.testing.assert_array_equal(other.read(name), store.read(name), err_msg=name)
 
 
-def test_a_changed_time_fits_again_and_status_knows(joint, kernels):
-    shutil.copytree(joint / "dark_1s.zarr", joint / "copy1.zarr")
+def test_a_changed_time_makes_new_maps_of_the_same_fit(joint, kernels):
     path = write(joint, "again", [("dark_1s.zarr", ""), ("dark_2s.zarr", "")])
-    run_joint(find_joint([path]), QUIET)
-    first = RunStore.open(joint / "again.zarr").read("maps/dark_current")
+    store = fit(path)
+    first, record = store.read("maps/dark_current"), store.records.read("fit")
     write(joint, "again", [("dark_1s.zarr", "integration_time: 0.5"), ("dark_2s.zarr", "")])
-    run_joint(find_joint([path]), QUIET)
-    assert (RunStore.open(joint / "again.zarr").read("maps/dark_current") != first).all()
+    states = {state.stage: state.words() for state in run_status(find_run(path))}
+    assert states["maps"].startswith("stale - input.exposures [1.0, 2.0] -> [0.5, 2.0]")
+    assert states["fit"] == "complete"
+    assert (fit(path).read("maps/dark_current") != first).all()
+    assert store.records.read("fit") == record
     shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
-    assert shell.ok("status", "again.zarr").stdout.split() == [
-        "joint",
-        "complete",
-        "joint_report",
-        "complete",
+    rows = shell.ok("status", "again.zarr").stdout.split("\n")
+    assert [row.split()[:2] for row in rows[:4]] == [
+        [stage, "complete"] for stage in ("ingest", "histogram", "fit", "maps")
     ]
-    assert "maps.fits" in shell.ok("export", "again.zarr", "--format", "fits").stdout
+
+
+def test_histograms_made_again_make_the_fit_stale(joint):
+    shutil.copytree(joint / "dark_2s.zarr", joint / "moved.zarr")
+    path = write(joint, "two", [("dark_1s.zarr", ""), ("moved.zarr", "")])
+    fit(path, "histogram")
+    (joint / "moved.zarr" / ".pchem" / "stages" / "histogram.json").unlink()
+    states = {state.stage: state.words() for state in run_status(find_run(path))}
+    assert states["ingest"] == "complete"  # as last known
+    sample = find_run(joint / "moved.zarr").changed("histogram", window_frames=500)
+    run_stages(sample, ["histogram"], QUIET)
+    states = {state.stage: state.words() for state in run_status(find_run(path))}
+    assert states["ingest"].startswith("stale - input.samples")
 
 
 def test_light_levels_and_no_line(joint):
     samples = [("dark_1s.zarr", "light_level: 10"), ("dark_2s.zarr", "light_level: 20")]
-    run_joint(find_joint([write(joint, "light", samples, against="light_level")]), QUIET)
-    store = RunStore.open(joint / "light.zarr")
+    store = fit(write(joint, "light", samples, against="light_level"))
     assert 0.03 < np.nanmedian(store.read("maps/charge_per_level")) < 0.07
-    run_joint(find_joint([write(joint, "plain", samples, against="none")]), QUIET)
-    store = RunStore.open(joint / "plain.zarr")
+    store = fit(write(joint, "plain", samples, against="none"))
     assert not store.has("maps/dark_current")
-    assert not store.has("joint/linearity_chi2")
+    assert not store.has("samples/linearity_chi2")
     assert np.isfinite(store.read("maps/conversion_gain")).mean() > 0.8
 
 
+def test_the_yaml_of_version_0_1_is_read_and_says_what_is_new(joint, capsys):
+    path = joint / "old.yaml"
+    path.write_text(
+        "samples: [{run: dark_1s.zarr}, {run: dark_2s.zarr, integration_time: 3}, "
+        "{run: bias.zarr, kind: bias}]\njoint: {store: old.zarr, tile: 16, title: Old}\n"
+        "fit: {likelihood: exact}\n"
+    )
+    config = find_run(path).config
+    assert [each.bias for each in config.input.samples] == [False, False, True]
+    assert (config.run.store, config.run.tile, config.run.title) == ("old.zarr", 16, "Old")
+    assert (config.input.against, config.fit.likelihood) == ("integration_time", "exact")
+    said = capsys.readouterr().err
+    assert said.startswith(f"pchem: {path}: samples and joint are now input.samples, input.against and run")
+    assert said.count("\n") == 1
+
+
+def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
+    shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    assert "maps.fits" in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv").stdout
+    assert "spurious_charge" in (tmp_path / "summary.csv").read_text()
+    shutil.copytree(joint / "dark.zarr", joint / "same.zarr")
+    words = shell.ok("compare", "dark.zarr", "same.zarr", "-o", str(tmp_path / "compare")).stderr
+    assert "Nothing changed" in words
+    drawn = shell.ok("figures", "dark.zarr", "-o", str(tmp_path), "--only", "exposures,pixel_fits").stdout
+    assert "exposures.pdf" in drawn
+    run = open_run(joint / "dark.zarr")
+    assert run.group("samples").quanta_exposure.dims == ("sample", "y", "x")
+    assert run.pixel(2, 3).histogram.sum() == 1500
+    assert "dark_current" in run.maps
+    server, _ = make_server(joint / "dark.zarr")
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection.request("GET", "/api/pixel?y=2&x=3")
+    answer = connection.getresponse()
+    assert answer.status == 200
+    assert json.loads(answer.read())
+    connection.close()
+    server.shutdown()
+    server.server_close()
+    thread.join()
+    refused = shell("electrons", "dark.zarr")
+    assert refused.code == 4
+    assert "was made from samples, which have no frames here" in refused.last
+
+
+def test_killed_it_ends_with_the_same_bits(joint, kernels):
+    shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    four = [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "bias: true")]
+    write(joint, "killed", four)
+    with shell.start("run", "killed.yaml", "--until", "maps", "--quiet", "--backend", "serial") as process:
+        done = joint / "killed.zarr" / ".pchem" / "done" / "fit"
+        while process.poll() is None and not list(done.rglob("*.json")):
+            time.sleep(0.01)
+        process.kill()
+    shell.ok("run", "killed.yaml", "--until", "maps", "--quiet")
+    one, other = (RunStore.open(joint / f"{name}.zarr") for name in ("killed", "dark"))
+    for name in ("fit/fit_status", "fit/bias", "samples/covariance", "maps/dark_current"):
+        np.testing.assert_array_equal(one.read(name), other.read(name), err_msg=name)
+
+
 @pytest.mark.parametrize(
-    ("samples", "joint_settings", "words"),
+    ("samples", "settings", "words"),
     [
         (
             [("dark_1s.zarr", ""), ("dark_1s.yaml", "")],
             {},
-            "samples.1.run: dark_1s.yaml is the run of samples.0 again",
+            "input.samples.1.run: dark_1s.yaml is the run of input.samples.0 again",
         ),
         (
             [("dark_2s.zarr", ""), ("dark_1s.zarr", "")],
             {},
-            "integration time 1 is not above the 2 of samples.0",
+            "integration time 1 is not above the 2 of input.samples.0",
         ),
         (
             [("dark_1s.zarr", ""), ("dark_2s.zarr", "integration_time: 1")],
             {},
-            "is not above the 1 of samples.0",
+            "is not above the 1 of input.samples.0",
         ),
         (
             [("dark_1s.zarr", ""), ("small.yaml", "")],
             {},
-            "has 8 x 8 pixels, samples.0 (dark_1s.zarr) 8 x 12",
+            "has 8 x 8 pixels, input.samples.0 (dark_1s.zarr) 8 x 12",
         ),
         (
             [("dark_1s.zarr", ""), ("twelve.yaml", "")],
             {},
-            "has codes of 12 bits, samples.0 (dark_1s.zarr) of 14",
+            "has codes of 12 bits, input.samples.0 (dark_1s.zarr) of 14",
         ),
-        ([("dark_1s.zarr", ""), ("twin.yaml", "")], {}, "holds the same frames as samples.0 (dark_1s.zarr)"),
+        (
+            [("dark_1s.zarr", ""), ("twin.yaml", "")],
+            {},
+            "holds the same frames as input.samples.0 (dark_1s.zarr)",
+        ),
         (
             [("timeless.yaml", ""), ("dark_2s.zarr", "")],
             {},
             "(timeless.yaml) has no integration time, so there is no",
         ),
-        ([("dark_1s.zarr", ""), ("bias.zarr", "kind: bias")], {}, "a slope needs two exposures"),
+        ([("dark_1s.zarr", ""), ("bias.zarr", "bias: true")], {}, "a slope needs two exposures"),
         (
             [("dark_1s.zarr", ""), ("dark_2s.zarr", "")],
             {"against": "light_level"},
-            "samples.0 (dark_1s.zarr) has no light_level",
+            "input.samples.0 (dark_1s.zarr) has no light_level",
         ),
-        ([("bias.zarr", "kind: bias")], {}, "every sample is a bias"),
-        ([("dark_1s.zarr", "knd: bias")], {}, "samples.0.knd: unknown key; did you mean kind?"),
+        ([("bias.zarr", "bias: true")], {}, "every sample is a bias"),
+        ([("dark_1s.zarr", "bia: true")], {}, "input.samples.0.bia: unknown key; did you mean bias?"),
         ([("nowhere.yaml", ""), ("dark_1s.zarr", "")], {}, "nowhere.yaml: no such file"),
     ],
 )
-def test_samples_that_do_not_belong_together_get_one_line(joint, samples, joint_settings, words):
+def test_samples_that_do_not_belong_together_get_one_line(joint, samples, settings, words):
     frames = "input: {files: [dark_1s-frames/*.npy], format: npy"
     others = {
         "small": f"{frames}, integration_time: 7, roi: [0, 8, 0, 8]}}",
@@ -207,9 +308,9 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, joint_
     }
     for name, text in others.items():
         (joint / f"{name}.yaml").write_text(f"run: {{store: {name}.zarr, tile: 8}}\n{text}\n")
-    path = write(joint, "bad", samples, **joint_settings)
+    path = write(joint, "bad", samples, **settings)
     with pytest.raises(PchEmError) as caught:
-        run_joint(find_joint([path]), QUIET)
+        run_joint(find_joint([path])[0], QUIET)
     message = str(caught.value)
     assert words in message
     assert "\n" not in message
@@ -219,12 +320,13 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, joint_
 def test_a_refused_list_leaves_its_name_free(joint):
     store = joint / "refused.zarr"
     for runs in (["dark_2s.yaml", "dark_1s.yaml"], ["dark_1s.yaml", "dark_1s.zarr"]):
+        target, is_new = find_joint([joint / run for run in runs], store=store)
         with pytest.raises(ConfigError, match=r"is not above|is the run of"):
-            run_joint(find_joint([joint / run for run in runs], store=store), QUIET)
+            run_joint(target, QUIET, is_new=is_new)
         assert not store.with_suffix(".yaml").exists()
     kept = write(joint, "kept", [("dark_2s.zarr", ""), ("dark_1s.zarr", "")])
     with pytest.raises(ConfigError):
-        run_joint(find_joint([kept]), QUIET)
+        run_joint(find_joint([kept])[0], QUIET)
     assert kept.exists()
 
 

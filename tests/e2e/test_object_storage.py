@@ -208,10 +208,19 @@ def test_a_bucket_that_does_not_exist_is_one_line(cloud, frames):
     assert result.last.startswith("pchem: s3://elsewhere/night/run.zarr")
 
 
-def test_the_store_of_a_joint_fit_cannot_be_a_url(shell):
-    (shell.folder / "joint.yaml").write_text(
-        "samples: [{run: a.yaml}, {run: b.yaml}]\njoint: {store: 's3://lab/j.zarr'}"
+def test_several_samples_are_fitted_into_a_bucket(cloud):
+    for seed, seconds in enumerate((1, 3)):
+        (cloud.folder / f"dark_{seconds}s.yaml").write_text(
+            f"run: {{store: dark_{seconds}s.zarr, tile: 8}}\n"
+            f"simulate: {{shape: [8, 8], n_frames: 400, seed: {seed}, sensor_seed: 3, format: npy, "
+            f"integration_time: {seconds}, output: frames_{seconds}s}}\n"
+        )
+    (cloud.folder / "joint.yaml").write_text(
+        "run: {store: 's3://lab/joint.zarr', tile: 8}\n"
+        "input: {samples: [{run: dark_1s.yaml}, {run: dark_3s.yaml}]}\n"
     )
-    result = shell("joint", "joint.yaml")
-    assert result.code == 2
-    assert "joint.store" in result.last
+    cloud.ok("run", "joint.yaml", "--until", "maps", "--quiet")
+    rows = cloud.ok("status", "s3://lab/joint.zarr").stdout.splitlines()
+    assert [row.split()[:2] for row in rows[:4]] == [
+        [stage, "complete"] for stage in ("ingest", "histogram", "fit", "maps")
+    ]

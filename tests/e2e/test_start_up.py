@@ -75,5 +75,5 @@ def test_every_function_that_a_row_names_is_there(name):
     for place in (stage.run, stage.identity, stage.plan, single_pass):
         assert place is None or callable(imported(place))
     commands = {command.name or command.callback.__name__ for command in app.registered_commands}
-    assert name in commands or name == "joint_report"
+    assert name in commands
     assert {*stage.upstream, *stage.follows} < set(STAGES)

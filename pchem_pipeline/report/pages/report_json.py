@@ -12,6 +12,7 @@ import numpy as np
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import status_counts
 from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.samples import middle
 from pchem_pipeline.report.pages.summary import flags, pixel_counts, sentence, summaries
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import stored_unit
@@ -48,6 +49,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             "moments": list(data.moments),
             "electron_numbers": _electron_numbers(data),
             "truth": _truth(data),
+            "samples": _samples(data),
             "missing": dict(data.missing),
             "discrepancy": _discrepancy(data),
             "run": dict(data.run),
@@ -104,6 +106,26 @@ def _fit_status(data: ReportData) -> dict[str, Any]:
             if bit.name and int(bit)
         },
     }
+
+
+def _samples(data: ReportData) -> dict[str, Any] | None:
+    """Return what each exposure has of its own; None for a run of one."""
+    if data.samples is None:
+        return None
+    rows = []
+    for i, sample in enumerate(data.samples.samples):
+        row: dict[str, Any] = {
+            "name": sample.name,
+            "bias": sample.kind == "bias",
+            "x": sample.x,
+            "n_frames": sample.n_frames,
+        }
+        for name in ("quanta_exposure", "linearity_residual"):
+            if name in data.samples.arrays:
+                centre, error, *_ = middle(data.samples.arrays[name][i])
+                row[name] = {"median": centre, "median_stderr": error}
+        rows.append(row)
+    return {"against": data.samples.against, "rows": rows}
 
 
 def _goodness(data: ReportData) -> dict[str, Any]:

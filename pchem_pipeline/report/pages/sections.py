@@ -145,7 +145,7 @@ MAP_READING: dict[str, str] = {
 
 #: Sections that only a run of several samples has.
 _OF_SAMPLES = ("exposures", "photon-transfer")
-_NO_LINE = "The samples share g, μ and σ; no line was asked for (joint.against: none)."
+_NO_LINE = "The samples share g, μ and σ; no line was asked for (input.against: none)."
 
 
 @dataclass(frozen=True)

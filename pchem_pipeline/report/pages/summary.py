@@ -254,7 +254,7 @@ def _conditions(data: ReportData) -> list[Flag]:
         if part in data.missing
     ]
     read_noise = finite(data.maps.get("read_noise_e", np.empty(0)))
-    if read_noise.size and float(np.median(read_noise)) > 0.5:
+    if data.samples is None and read_noise.size and float(np.median(read_noise)) > 0.5:
         found.append(
             Flag("caution", "Read noise above 0.5 e⁻: one exposure tells little; take several exposures.")
         )

@@ -81,7 +81,7 @@ def run(context: StageContext) -> None:
     truth = _place_in_truth(context) if frames is not None else None
     everything = frames == (0, context.sensor.n_frames)
     source = open_source(context) if frames is not None and (truth or not everything) else None
-    if frames is None:
+    if context.sensor.kind == "histograms":
         context.note(
             "the input is histograms: the ensemble is of all samples, every channel counting the same"
         )

@@ -23,10 +23,12 @@ from pchem_pipeline.model.fit.intervals import profile_intervals
 from pchem_pipeline.model.fit.outliers import without_outliers
 from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.sample_law import MarginalModel
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.added_exposure import read_added_exposure
+from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.samples import fit_samples
 from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
 from pchem_pipeline.stages.fit.together import judge_sensor
 
@@ -139,20 +141,17 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: the histograms are missing, or the store refuses.
     """
+    if context.sensor.samples:
+        fit_samples(context)
+        return
     effects = context.config.model.effects
-    left_out = {"fit_status", *(() if effects else FREE_LOBES)}
+    left_out = set(() if effects else FREE_LOBES)
     settings, plain = context.config.fit, not (effects or context.config.model.set_aside_e)
     if settings.intervals == "normal" or not plain:
         left_out |= {path for name in INTERVALS for path in interval_names(name)}
     if not plain and (settings.intervals, settings.errors) != ("normal", "information"):
         context.note(_PLAIN_ONLY)
-    context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])
-    context.create_maps(
-        ["fit/fit_status"],
-        flag_masks=[int(bit) for bit in MEANINGS],
-        flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
-        flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
-    )
+    create_fit_maps(context, left_out)
     if not context.executor.shares_memory:
         _compile(context.store.array("histogram/counts").dtype, effects)
     task = functools.partial(

@@ -96,7 +96,7 @@ def plan_lines(config: RunConfig, base_dir: Path, todo: Sequence[str]) -> list[s
         base_dir: folder to which its paths refer.
         todo: the stages that are to be done.
     """
-    if "simulate" in todo or is_histogram_input(config.input, base_dir):
+    if "simulate" in todo or config.input.samples or is_histogram_input(config.input, base_dir):
         return []
     return make_plan(config, base_dir).words()
 

@@ -26,6 +26,7 @@ from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, Emit, StackCounter, TileCounter
 from pchem_pipeline.stages.histogram.memory import band_bytes, bytes_per_row
+from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
 
 if TYPE_CHECKING:
     from pchem_pipeline.compute.executor import Outcome
@@ -102,6 +103,9 @@ def run(context: StageContext) -> None:
         InputError: the camera files vanished or changed.
         StoreError: the input is not complete, or the store refuses.
     """
+    if context.sensor.samples:
+        copy_shown_sample(context)
+        return
     if context.sensor.kind == "histograms":
         _copy_histograms(context)
         return

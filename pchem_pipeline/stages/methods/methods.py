@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.methods.base import FloatArray, PixelSamples, Sample, Settings
 from pchem_pipeline.methods.compare import MethodResult, compare
@@ -103,9 +104,14 @@ def run(context: StageContext) -> None:
 
     Raises:
         ConfigError: a run is listed twice.
-        InputError: another run is of other pixels.
+        InputError: another run is of other pixels, or the run is one of several samples.
         StoreError: a run is missing or the store cannot be written.
     """
+    if context.sensor.samples:
+        raise InputError(
+            f"{context.store.path} has several samples, fitted together; compare methods in the run of one "
+            "of them, with the others beside it: pchem methods RUN --with OTHER"
+        )
     settings = context.config.methods
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
     n_pixels = min(settings.pixels, context.sensor.ny * context.sensor.nx)

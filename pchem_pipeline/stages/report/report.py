@@ -29,6 +29,7 @@ from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
 from pchem_pipeline.stages.report.drawing import draw_by_workers
 from pchem_pipeline.stages.report.inspector import gather_inspector
 from pchem_pipeline.stages.report.plan_section import plan_section
+from pchem_pipeline.stages.report.samples import read_samples
 from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
@@ -175,6 +176,7 @@ def gather(
     from pchem_pipeline.run.sensor import SensorInfo
 
     sensor = SensorInfo.read(store)
+    n_frames = sensor.n_frames if sensor.kind == "frames" else None
     intervals = _intervals(store)
     ends = [path for name in intervals for path in interval_names(name)]
     maps = _group(store, "maps", skip=(*_NOT_SHOWN, *ends))
@@ -197,7 +199,7 @@ def gather(
     return ReportData(
         title=config.run.title or store.path.name,
         shape=sensor.shape,
-        n_frames=sensor.n_frames if sensor.kind == "frames" else None,
+        n_frames=n_frames,
         integration_time=integration_time,
         maps=maps,
         fit=fit,
@@ -224,10 +226,12 @@ def gather(
             for file in sensor.identity.get("files", [])
         ],
         stages=list(stages),
-        missing=_missing(maps, ensemble) | _not_compared(store),
+        missing=_missing(maps, ensemble, sensor) | _not_compared(store, sensor),
         methods=read_methods(store),
-        plan=plan_section(maps, sensor.n_frames if sensor.kind == "frames" else None),
+        # several samples need other frames than one: see pchem plan
+        plan=None if sensor.samples else plan_section(maps, n_frames),
         discrepancy=discrepancy,
+        samples=read_samples(store, config.input, sensor),
         inspector=gather_inspector(store, sensor, maps, fit, [(p.y, p.x) for p in pixels], suspects),
     )
 
@@ -330,7 +334,7 @@ def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[s
     record = store.records.read("report")
     facts: dict[str, Any] = {
         "store": store.path.name,
-        "input": f"{sensor.kind}, {sensor.mode}" if sensor.kind == "frames" else "ready-made histograms",
+        "input": _input_words(sensor),
         "type of the data": sensor.dtype,
         "bit depth": sensor.bit_depth,
         "digest of the input": sensor.identity.get("digest", ""),
@@ -367,12 +371,22 @@ def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:
     }
 
 
-def _missing(maps: Mapping[str, NDArray[Any]], ensemble: Mapping[str, NDArray[Any]]) -> dict[str, str]:
+def _input_words(sensor: SensorInfo) -> str:
+    if sensor.samples:
+        return f"{len(sensor.samples)} samples; maps and ensemble show {sensor.samples[sensor.shown].name}"
+    return f"{sensor.kind}, {sensor.mode}" if sensor.kind == "frames" else "ready-made histograms"
+
+
+def _missing(
+    maps: Mapping[str, NDArray[Any]], ensemble: Mapping[str, NDArray[Any]], sensor: SensorInfo
+) -> dict[str, str]:
     """Say why parts are left out."""
     found: dict[str, str] = {}
     if "dark_current" not in maps:
         found["dark_current"] = (
-            "no dark current, since the integration time is not known; set input.integration_time (s)"
+            "no dark current: the samples are not drawn over their integration time (input.against)"
+            if sensor.samples
+            else "no dark current, since the integration time is not known; set input.integration_time (s)"
         )
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"
@@ -388,7 +402,9 @@ def _missing(maps: Mapping[str, NDArray[Any]], ensemble: Mapping[str, NDArray[An
     return found
 
 
-def _not_compared(store: RunStore) -> dict[str, str]:
+def _not_compared(store: RunStore, sensor: SensorInfo) -> dict[str, str]:
+    if sensor.samples:
+        return {"methods": "methods are compared in the run of a sample, with the others beside it (--with)"}
     if (store.path / METHODS_FILE).exists():
         return {}
     return {"methods": f"not compared in this run; to do so, run: pchem methods {store.path.name}"}

@@ -50,7 +50,7 @@ def test_the_list_is_that_of_the_store(store: RunStore) -> None:
     assert len(paths) == len(set(paths)) >= 14
 
 
-@pytest.mark.parametrize("group", ["fit", "joint"])
+@pytest.mark.parametrize("group", ["fit", "samples"])
 def test_a_new_array_appears_by_itself(
     store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch, group: str
 ) -> None:

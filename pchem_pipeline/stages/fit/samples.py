@@ -1,0 +1,168 @@
+"""The stage ``fit`` of a run of several samples: one g, mu and sigma for each pixel, an H for each exposure.
+
+The group ``fit`` holds the shared parameters with H of the shown sample, as a run of one sample has them; the
+group ``samples`` what each exposure has of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names
+from pchem_pipeline.model.errors.fisher import correlations
+from pchem_pipeline.model.fit.joint import JointFit, fit_joint
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.store.tiles import Tile
+
+__all__ = ["fit_samples", "fit_samples_tile"]
+
+_HISTOGRAM = ("counts", "origin", "under", "over")
+_OF_SAMPLES = ("quanta_exposure", "quanta_exposure_stderr", "mean", "variance")
+_OF_PIXELS = (
+    "log_likelihood", "likelihood_gap", "fit_status", "n_iterations", "goodness_chi2", "goodness_dof",
+    "goodness_p", "outlier_share",
+)  # fmt: skip
+_SUSPICIOUS_SHARE = 0.2  # of pixels in poor agreement, from which the samples themselves are in doubt
+
+Histogram = Mapping[str, NDArray[Any]]
+
+
+def fit_samples_tile(
+    histograms: Sequence[Histogram],
+    bias: Sequence[bool],
+    shown: int,
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the groups ``fit`` and ``samples`` of a tile, by path.
+
+    Args:
+        histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
+        bias: which samples hold no electrons.
+        shown: the sample whose H stands in ``fit``.
+        settings: of the fit.
+        adc_limits: first and last code of the ADC, DN, or None where they are not known.
+    """
+    shape = histograms[0]["counts"].shape[:2]
+    found = _fitted(histograms, bias, settings, adc_limits)
+    n_samples = len(histograms)
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    fit: dict[str, NDArray[Any]] = {"quanta_exposure": found.quanta_exposure[:, shown]}
+    fit |= {name: getattr(found, name) for name in (*PARAMETERS[1:], *_OF_PIXELS)}
+    places = [shown, *range(n_samples, n_samples + 3)]
+    fit |= {f"{name}_stderr": errors[:, i] for name, i in zip(PARAMETERS, places, strict=True)}
+    fit["correlation"] = correlations(found.covariance[:, places][:, :, places])
+    own = {
+        "quanta_exposure": found.quanta_exposure,
+        "quanta_exposure_stderr": errors[:, :n_samples],
+        "mean": found.mean,
+        "variance": found.variance,
+    }
+    arrays = {f"fit/{name}": values.reshape(shape + values.shape[1:]) for name, values in fit.items()}
+    arrays |= {
+        f"samples/{name}": np.ascontiguousarray(values.T).reshape(-1, *shape) for name, values in own.items()
+    }
+    arrays["samples/covariance"] = found.covariance.reshape(shape + found.covariance.shape[1:])
+    return arrays
+
+
+def _fitted(
+    histograms: Sequence[Histogram],
+    bias: Sequence[bool],
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+) -> JointFit:
+    """Fit the pixels of a tile in all samples together."""
+    outside = sum(each["under"].astype(np.int64) + each["over"] for each in histograms)
+    return fit_joint(
+        [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms],
+        [each["origin"].ravel() for each in histograms],
+        dark=list(bias),
+        settings=settings,
+        adc_limits=adc_limits,
+        outside=np.ravel(outside),
+    )
+
+
+def fit_samples(context: StageContext) -> None:
+    """Fit every tile, all samples together.
+
+    Raises:
+        ConfigError: the model holds effects.
+        StoreError: histograms of a sample are missing, or the store refuses.
+    """
+    if context.config.model.effects or context.config.model.set_aside_e:
+        raise ConfigError("model: several samples are fitted with the plain model; remove model.effects")
+    samples, tile, shape = context.sensor.samples, context.config.run.tile, context.sensor.shape
+    create_fit_maps(context, {*FREE_LOBES, *(path for name in INTERVALS for path in interval_names(name))})
+    for name in _OF_SAMPLES:
+        context.create(f"samples/{name}", (len(samples), *shape), chunks=(len(samples), tile, tile))
+    rest = (len(samples) + 3,) * 2
+    context.create("samples/covariance", (*shape, *rest), chunks=(tile, tile, *rest))
+    bias = [sample.bias for sample in samples]
+    if not context.executor.shares_memory:
+        _compile(bias, context.sensor.shown, context.config.fit)
+    task = functools.partial(
+        _do_tile,
+        store=context.store.path,
+        stores=[target.store for target in sample_targets(context.config, context.base_dir)],
+        bias=bias,
+        shown=context.sensor.shown,
+        settings=context.config.fit,
+        adc_limits=context.adc_limits,
+    )
+    done = context.run_units(context.tiles(), task, needs="histogram")
+    pixels, poor = (sum(tile.get(key, 0) for tile in done.values()) for key in ("pixels", "poor"))
+    if poor > _SUSPICIOUS_SHARE * pixels:
+        context.note(
+            f"{poor / pixels:.0%} of the pixels do not agree with one g, mu and sigma for all samples: are "
+            "they from one sensor, with the same gain, offset and temperature?"
+        )
+
+
+def _compile(bias: Sequence[bool], shown: int, settings: FitSettings) -> None:
+    """Compile the kernels once, into the cache, before other processes do it all at the same time."""
+    histogram = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
+    histogram["counts"] = np.ones((1, 1, 8), np.uint32)
+    fit_samples_tile([histogram] * len(bias), bias, shown, settings, None)
+
+
+def _do_tile(
+    tile: Tile,
+    *,
+    store: Path,
+    stores: Sequence[Path],
+    bias: Sequence[bool],
+    shown: int,
+    settings: FitSettings,
+    adc_limits: tuple[int, int] | None,
+) -> dict[str, Any]:
+    """Fit one tile; the summary counts its pixels."""
+    histograms = []
+    for path in stores:
+        sample = RunStore.open(path)
+        histograms.append({name: sample.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM})
+    arrays = fit_samples_tile(histograms, bias, shown, settings, adc_limits)
+    target = open_store(store)
+    for path_, values in arrays.items():
+        along = path_.startswith("samples/") and path_ != "samples/covariance"
+        target.write(path_, (slice(None), *tile.region) if along else tile.region, values)
+    words = arrays["fit/fit_status"]
+    bits = {"failed": int(FAILED), "poor": int(FitStatus.POOR_FIT)}
+    counts = {name: int(np.count_nonzero(words & np.uint16(bit))) for name, bit in bits.items()}
+    return {"pixels": int(words.size), **counts}

@@ -1,1 +1,0 @@
-"""Stage ``joint``: several exposures of the same pixels fitted together."""

@@ -1,0 +1,256 @@
+"""The samples of a run of several exposures: which runs they are, and whether all show one sensor."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.run.sensor import Sample, SensorInfo
+from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.frames.settings import InputSettings
+
+__all__ = [
+    "SAMPLES_UNTIL",
+    "OpenSample",
+    "check_samples",
+    "exposure_axis",
+    "open_samples",
+    "sample_facts",
+    "sample_sensor",
+    "sample_targets",
+    "shown_sample",
+]
+
+#: The stage up to which the run of each sample must be brought, before they are fitted together.
+SAMPLES_UNTIL = "histogram"
+
+_LISTED_FILES = 64
+
+
+@dataclass(frozen=True)
+class OpenSample:
+    """The run of a sample, with its histograms.
+
+    Attributes:
+        where: what messages call it.
+        target: its configuration.
+        store: opened for reading.
+        sensor: its input.
+        histogram: fingerprint of its histograms.
+    """
+
+    where: str
+    target: Target
+    store: RunStore
+    sensor: SensorInfo
+    histogram: str
+
+    @property
+    def bit_depth(self) -> int | None:
+        """Bits of the ADC, where they are known."""
+        return self.target.config.input.bit_depth or self.sensor.bit_depth
+
+    @property
+    def integration_time(self) -> float | None:
+        """Seconds per frame, as its run says."""
+        return self.target.config.input.integration_time or self.sensor.integration_time
+
+    @property
+    def content(self) -> Any:
+        """What tells its frames from those of another."""
+        files = [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
+        return files if files and all(files) else id(self)
+
+
+def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
+    """Return the runs of the samples.
+
+    Raises:
+        ConfigError: two samples are one run, or a run cannot be found.
+    """
+    targets, seen = [], dict[str, int]()
+    for i, sample in enumerate(config.input.samples):
+        target = find_run(base_dir / sample.run)
+        place = str(target.store.resolve())
+        if place in seen:
+            raise ConfigError(
+                f"input.samples.{i}.run: {sample.run} is the run of input.samples.{seen[place]} again; "
+                "list each run once"
+            )
+        seen[place] = i
+        targets.append(target)
+    return targets
+
+
+def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
+    """Return the runs of the samples with their histograms.
+
+    Raises:
+        ConfigError: two samples are one run, or a run cannot be found.
+        StoreError: a run has no histograms.
+    """
+    found = []
+    for i, target in enumerate(sample_targets(config, base_dir)):
+        store = RunStore.open(target.store)
+        record = store.records.read("histogram")
+        where = f"input.samples.{i} ({config.input.samples[i].run})"
+        if record is None or not store.has("histogram/counts"):
+            raise StoreError(
+                f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
+            )
+        found.append(OpenSample(where, target, store, SensorInfo.read(store), record.fingerprint))
+    return found
+
+
+def check_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
+    """Return the runs of the samples, if they belong together.
+
+    Raises:
+        ConfigError: samples of different sensors, sizes or regions, the same frames twice, no integration
+            time where one is needed, or exposures that do not increase.
+        StoreError: a run has no histograms.
+    """
+    samples = open_samples(config, base_dir)
+    for i in range(1, len(samples)):
+        _same_sensor(samples[:i], samples[i])
+    _check_increasing(config.input, samples)
+    return samples
+
+
+def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
+    """Compare a sample with those before it."""
+    first = others[0]
+    if mine.sensor.shape != first.sensor.shape:
+        sizes = [f"{each.sensor.ny} x {each.sensor.nx}" for each in (mine, first)]
+        raise ConfigError(
+            f"{mine.where} has {sizes[0]} pixels, {first.where} {sizes[1]}; "
+            "all samples must show the same region of one sensor"
+        )
+    depths = [each.bit_depth for each in (mine, first)]
+    if None not in depths and depths[0] != depths[1]:
+        raise ConfigError(
+            f"{mine.where} has codes of {depths[0]} bits, {first.where} of {depths[1]}; "
+            "all samples must come from one sensor with the same settings"
+        )
+    regions = [each.target.config.input.roi for each in (mine, first)]
+    if regions[0] != regions[1]:
+        raise ConfigError(
+            f"{mine.where} is cropped to {regions[0]} (input.roi), {first.where} to {regions[1]}; "
+            "all samples must show the same region of one sensor"
+        )
+    for other in others:
+        if other.content == mine.content:
+            raise ConfigError(f"{mine.where} holds the same frames as {other.where}; list each sample once")
+
+
+def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray[np.float64] | None:
+    """Return the integration time (s) or light level of each sample, NaN for a bias; None without a line.
+
+    Raises:
+        ConfigError: one is needed and not known.
+    """
+    if settings.against == "none":
+        return None
+    found = np.full(len(samples), np.nan)
+    for i, (given, sample) in enumerate(zip(settings.samples, samples, strict=True)):
+        where = f"input.samples.{i} ({given.run})"
+        if given.bias:
+            continue
+        if settings.against == "light_level":
+            if given.light_level is None:
+                raise ConfigError(
+                    f"{where} has no light_level; give one to each sample, or set input.against: none"
+                )
+            found[i] = given.light_level
+            continue
+        time = sample.integration_time if given.integration_time is None else given.integration_time
+        if time is None:
+            raise ConfigError(
+                f"{where} has no integration time, so there is no slope for the dark current; "
+                "give integration_time, s, or set input.against: none"
+            )
+        found[i] = time
+    return found
+
+
+def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) -> None:
+    """Refuse exposures that do not increase, or too few of them for a line."""
+    x = exposure_axis(settings, [_sample(settings, i, each) for i, each in enumerate(samples)])
+    if x is None:
+        return
+    what = settings.against.replace("_", " ")
+    exposed = np.flatnonzero(np.isfinite(x)).tolist()
+    for last, i in itertools.pairwise(exposed):
+        if x[i] <= x[last]:
+            raise ConfigError(
+                f"{samples[i].where}: {what} {x[i]:g} is not above the {x[last]:g} of input.samples.{last}; "
+                f"list the samples in increasing order, each {what} once"
+            )
+    if len(exposed) < 2:
+        raise ConfigError(
+            f"input.samples: a slope needs two exposures of different {what}, this has {len(exposed)}; "
+            "add a run or set input.against: none"
+        )
+
+
+def _sample(settings: InputSettings, i: int, found: OpenSample) -> Sample:
+    bias = settings.samples[i].bias
+    return Sample(found.store.path.name, bias, found.sensor.n_frames, found.integration_time)
+
+
+def shown_sample(settings: InputSettings) -> int:
+    """Return the place of the sample whose histograms, H and ensemble are shown."""
+    if settings.shown_sample is not None:
+        return settings.shown_sample
+    return max(i for i, sample in enumerate(settings.samples) if not sample.bias)
+
+
+def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInfo:
+    """Return the sensor that all samples share, as the stages see it."""
+    first = samples[0].sensor
+    files = [file for each in samples for file in each.sensor.identity.get("files", [])]
+    digests = " ".join(str(each.sensor.identity.get("digest", each.store.path)) for each in samples)
+    return SensorInfo(
+        kind="samples",
+        n_frames=sum(each.sensor.n_frames for each in samples),
+        ny=first.ny,
+        nx=first.nx,
+        dtype=first.dtype,
+        bit_depth=next((each.bit_depth for each in samples if each.bit_depth is not None), None),
+        integration_time=None,
+        mode="reference",
+        identity={
+            "files": files[:_LISTED_FILES],
+            "n_files": len(files),
+            "digest": hashlib.sha256(digests.encode()).hexdigest(),
+        },
+        names=first.names,
+        samples=tuple(_sample(config.input, i, each) for i, each in enumerate(samples)),
+        shown=shown_sample(config.input),
+    )
+
+
+def sample_facts(config: RunConfig, base_dir: Path) -> dict[str, Any]:
+    """Return what decides the histograms of the samples, as JSON data.
+
+    Raises:
+        ConfigError: a run cannot be found.
+        StoreError: a run has no histograms.
+    """
+    samples = open_samples(config, base_dir)
+    histograms = [
+        [each.histogram, given.bias] for each, given in zip(samples, config.input.samples, strict=True)
+    ]
+    return {"samples": histograms, "shown_sample": shown_sample(config.input)}
