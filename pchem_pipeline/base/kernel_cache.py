@@ -172,10 +172,13 @@ class KernelCache:
         import numba
 
         function = self._function
+        code = function.__code__
         content = (
             source_state(function.__module__),
-            (function.__qualname__, function.__code__.co_firstlineno, values_of_closure(function)),
+            (function.__qualname__, code.co_firstlineno, code.co_code, code.co_names),
+            values_of_closure(function),
             [_description(each) for each in getattr(signature, "args", signature)],
+            str(getattr(signature, "return_type", None)),
             codegen.magic_tuple(),
             (sys.version_info[:3], numba.__version__, llvmlite.__version__),
         )

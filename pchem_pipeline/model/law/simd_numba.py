@@ -6,14 +6,21 @@ bits do not depend on how, or how often, it optimises; the vector instructions a
 
 In compiled functions a value of `Lanes` is an LLVM vector; in plain Python the same code runs on numpy arrays
 of eight. Operators are ``+ - * /`` of lanes with lanes or numbers; the functions are below.
+
+The compiler is taught the vector through parts of numba that may change. Where it cannot be taught, the same
+loops run on one number at a time: ``LANES`` is 1, sums are slower and other in the last bits.
 """
 
 from __future__ import annotations
 
+import functools
+import math
 import operator
+import warnings
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -22,13 +29,12 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 from numpy.typing import NDArray
 
-LANES = 8  # doubles in the widest vector register
-
 Lanes: TypeAlias = NDArray[np.float64]
 Value: TypeAlias = Lanes | float
 
-_DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
-_WORDS = ir.VectorType(ir.IntType(64), LANES)
+_WIDTH = 8  # doubles in the widest vector register
+_DOUBLES = ir.VectorType(ir.DoubleType(), _WIDTH)
+_WORDS = ir.VectorType(ir.IntType(64), _WIDTH)
 _MANTISSA = 0x000FFFFFFFFFFFFF
 _ONE = 0x3FF0000000000000
 _MANTISSA_BITS = 52
@@ -46,7 +52,6 @@ class _LanesType(types.Type):
 _LANES = _LanesType(name="Lanes")
 
 
-@register_model(_LanesType)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
     """A vector of the machine."""
 
@@ -55,17 +60,15 @@ class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _constant(kind: Any, value: float) -> Any:
-    return ir.Constant(kind, [ir.Constant(kind.element, value)] * LANES)
+    return ir.Constant(kind, [ir.Constant(kind.element, value)] * _WIDTH)
 
 
 def _splat(builder: Any, value: Any) -> Any:
     lane = ir.Constant(ir.IntType(32), 0)
     vector = builder.insert_element(ir.Constant(_DOUBLES, ir.Undefined), value, lane)
-    return builder.shuffle_vector(vector, vector, ir.Constant(ir.VectorType(ir.IntType(32), LANES), None))
+    return builder.shuffle_vector(vector, vector, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), None))
 
 
-@lower_cast(types.Float, _LanesType)
-@lower_cast(types.Integer, _LanesType)
 def _from_number(context: Any, builder: Any, kind: Any, _target: Any, value: Any) -> Any:
     return _splat(builder, context.cast(builder, value, kind, types.float64))
 
@@ -81,19 +84,20 @@ def _operator(function: Any, name: str) -> None:
     lower_builtin(function, _LanesType, _LanesType)(emit)
 
 
-for _function, _name in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _operator(_function, _name)
+def _teach_compiler() -> None:
+    """Teach the compiler the type, its operators, and that a number may stand for lanes of that number."""
+    register_model(_LanesType)(_LanesModel)
+    for kind in (types.Float, types.Integer):
+        lower_cast(kind, _LanesType)(_from_number)
+    operators = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+    for function, name in operators.items():
+        _operator(function, name)
 
 
 def _call(builder: Any, name: str, *arguments: Any) -> Any:
     """Call an LLVM intrinsic of doubles on vectors."""
     kind = ir.FunctionType(_DOUBLES, [_DOUBLES] * len(arguments))
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f64")
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{_WIDTH}f64")
     return builder.call(function, arguments)
 
 
@@ -170,7 +174,7 @@ def _scaled(_typing: Any, _x: Any, _power: Any) -> Any:
 @intrinsic
 def _counting(_typing: Any) -> Any:
     def emit(_context: Any, _builder: Any, _signature: Any, _arguments: Any) -> Any:
-        return ir.Constant(_DOUBLES, [ir.Constant(ir.DoubleType(), float(i)) for i in range(LANES)])
+        return ir.Constant(_DOUBLES, [ir.Constant(ir.DoubleType(), float(i)) for i in range(_WIDTH)])
 
     return signature(_LANES), emit
 
@@ -186,7 +190,7 @@ def _place(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
 @intrinsic
 def _load(_typing: Any, table: Any, _row: Any, _column: Any) -> Any:
     def emit(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return builder.load(_place(context, builder, sig, arguments), align=8)
+        return builder.load(_place(context, builder, sig, arguments), align=8, typ=_DOUBLES)
 
     return signature(_LANES, table, types.intp, types.intp), emit
 
@@ -210,7 +214,7 @@ def _part(builder: Any, vector: Any, first: int, size: int) -> Any:
 @intrinsic
 def _sum(_typing: Any, _x: Any) -> Any:
     def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        part, size = arguments[0], LANES
+        part, size = arguments[0], _WIDTH
         while size > 1:
             size //= 2
             low, high = (_part(builder, part, first, size) for first in (0, size))
@@ -279,18 +283,71 @@ def sum_lanes(x: Lanes) -> float:
     return float(parts[0])
 
 
-_COMPILED: tuple[tuple[Callable[..., Any], Callable[..., Any]], ...] = (
-    (fused, lambda x, y, z: lambda x, y, z: _fma(x, y, z)),
-    (nearest, lambda x: lambda x: _rint(x)),
-    (least, lambda x, y: lambda x, y: _smaller(x, y)),
-    (most, lambda x, y: lambda x, y: _larger(x, y)),
-    (exponent_of, lambda x: lambda x: _exponent_of(x)),
-    (fraction_of, lambda x: lambda x: _fraction_of(x)),
-    (scaled, lambda x, power: lambda x, power: _scaled(x, power)),
-    (counting, lambda: lambda: _counting()),
-    (load_lanes, lambda table, row, column: lambda table, row, column: _load(table, row, column)),
-    (store_lanes, lambda table, row, column, x: lambda table, row, column, x: _store(table, row, column, x)),
-    (sum_lanes, lambda x: lambda x: _sum(x)),
-)
-for _plain, _implementation in _COMPILED:
-    overload(_plain)(_implementation)
+_Choice: TypeAlias = Callable[..., Callable[..., Any]]  # of what is compiled, from the types of the arguments
+
+_VECTOR: dict[Callable[..., Any], _Choice] = {
+    fused: lambda x, y, z: lambda x, y, z: _fma(x, y, z),
+    nearest: lambda x: lambda x: _rint(x),
+    least: lambda x, y: lambda x, y: _smaller(x, y),
+    most: lambda x, y: lambda x, y: _larger(x, y),
+    exponent_of: lambda x: lambda x: _exponent_of(x),
+    fraction_of: lambda x: lambda x: _fraction_of(x),
+    scaled: lambda x, power: lambda x, power: _scaled(x, power),
+    counting: lambda: lambda: _counting(),
+    load_lanes: lambda table, row, column: lambda table, row, column: _load(table, row, column),
+    store_lanes: lambda table, row, column, x: lambda table, row, column, x: _store(table, row, column, x),
+    sum_lanes: lambda x: lambda x: _sum(x),
+}
+
+
+_SCALAR: dict[Callable[..., Any], _Choice] = {
+    fused: lambda x, y, z: lambda x, y, z: x * y + z,
+    nearest: lambda x: lambda x: np.rint(x),
+    least: lambda x, y: lambda x, y: min(float(x), float(y)),
+    most: lambda x, y: lambda x, y: max(float(x), float(y)),
+    exponent_of: lambda x: lambda x: math.frexp(x)[1] - 1.0,
+    fraction_of: lambda x: lambda x: 2.0 * math.frexp(x)[0],
+    scaled: lambda x, power: lambda x, power: math.ldexp(x, int(power)),
+    counting: lambda: lambda: 0.0,
+    load_lanes: lambda table, row, column: lambda table, row, column: table[row, column],
+    store_lanes: lambda table, row, column, x: (
+        lambda table, row, column, x: operator.setitem(table, (row, column), x)
+    ),
+    sum_lanes: lambda x: lambda x: x,
+}
+
+
+def _named(function: Callable[..., Any], choose: _Choice) -> _Choice:
+    """Return what chooses the implementation of a function; it bears the function's name in machine code.
+
+    Of two codes with one name only the first that is loaded is run; all lambdas have one.
+    """
+
+    @functools.wraps(choose)
+    def chosen(*kinds: Any) -> Callable[..., Any]:
+        implementation = choose(*kinds)
+        implementation.__qualname__ = f"compiled_{function.__name__}"
+        return implementation
+
+    return chosen
+
+
+def _lanes() -> int:
+    """Teach the compiler the functions above; return how many numbers lie side by side."""
+    try:
+        _teach_compiler()
+        lanes, compiled = _WIDTH, _VECTOR
+    except Exception as error:
+        warnings.warn(
+            f"numba {numba.__version__} cannot be taught vectors ({error}): the fit is several times slower; "
+            "install a version that pyproject.toml allows",
+            stacklevel=2,
+        )
+        lanes, compiled = 1, _SCALAR
+    for function, choose in compiled.items():
+        overload(function)(_named(function, choose))
+    return lanes
+
+
+#: Numbers side by side: 8, or 1 where the compiler cannot be taught vectors.
+LANES = _lanes()

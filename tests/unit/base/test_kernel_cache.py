@@ -139,3 +139,10 @@ def test_kernels_call_kernels_and_hand_on_their_errors():
     with pytest.raises(ValueError, match="negative"):
         _sum_of_roots(np.array([4.0, -9.0]))
     assert _checked(np.float64(9)) == 3  # and Python calls what other kernels call
+
+
+def test_functions_of_one_name_and_line_are_told_apart(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+    plus, minus = (kernel(function) for function in (lambda x: x + 1, lambda x: x - 1))
+    assert (plus(3), minus(3)) == (4, 2)
+    assert len(list(tmp_path.glob("*.nbc"))) == 2

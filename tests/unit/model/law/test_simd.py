@@ -1,0 +1,73 @@
+"""The vector of the fit's loops, and the scalar in its place where numba cannot be taught vectors."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pchem_pipeline
+
+SCRIPT = """
+import sys
+import numba.extending as hooks
+register = hooks.register_model
+if sys.argv[1] == "scalar":
+    def refuse(kind):
+        raise AttributeError("no such hook")
+    hooks.register_model = refuse
+import numpy as np
+from pchem_pipeline.base.kernel import kernel
+import pchem_pipeline.model.law.simd_numba
+hooks.register_model = register
+from pchem_pipeline.model.law import simd_math_numba as functions, simd_numba as simd
+from pchem_pipeline.model.law.simd_numba import (
+    counting, exponent_of, fraction_of, fused, least, load_lanes, most, nearest, scaled, store_lanes,
+    sum_lanes
+)
+LANES = simd.LANES
+exp, log = functions.lanes_exp, functions.lanes_log
+@kernel
+def fill(table):
+    total = counting() * 0.0
+    for i in range(0, table.shape[1], LANES):
+        x = load_lanes(table, 0, i)
+        store_lanes(table, 1, i, exp(x))
+        store_lanes(table, 2, i, log(exp(x)))
+        store_lanes(table, 3, i, most(least(x, 1.0), -2.0))
+        store_lanes(table, 4, i, fused(x, 2.0, 1.0) / 2 - nearest(x))
+        y = exp(x)
+        store_lanes(table, 5, i, scaled(fraction_of(y), exponent_of(y)) - y)
+        store_lanes(table, 6, i, counting() + float(i))
+        total = total + x
+    return sum_lanes(total)
+table = np.zeros((7, 1600))
+table[0] = np.random.default_rng(1).uniform(-100, 100, 1600)
+np.savez(sys.argv[2], table=table, total=fill(table), lanes=LANES)
+"""
+
+
+@pytest.mark.parametrize(("kind", "lanes"), [("vector", 8), ("scalar", 1)])
+def test_the_operations_are_what_they_are_named_after(tmp_path: Path, kind: str, lanes: int) -> None:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(Path(pchem_pipeline.__file__).parents[1]),
+        "NUMBA_CACHE_DIR": str(tmp_path),
+    }
+    (tmp_path / "script.py").write_text(SCRIPT)  # numba reads the source of what it compiles
+    command = [sys.executable, str(tmp_path / "script.py"), kind, str(tmp_path / "found.npz")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert ("cannot be taught vectors (no such hook)" in done.stderr) == (kind == "scalar")
+    with np.load(tmp_path / "found.npz") as found:
+        x, exponential, logarithm, clipped, left, zero, place = found["table"]
+        assert found["lanes"] == lanes
+        assert found["total"] == pytest.approx(x.sum(), abs=1e-9)
+    np.testing.assert_allclose(exponential, np.exp(x), rtol=3e-15)
+    np.testing.assert_allclose(logarithm, x, rtol=1e-14, atol=1e-14)
+    np.testing.assert_array_equal(clipped, np.clip(x, -2, 1))
+    np.testing.assert_allclose(left, x + 0.5 - np.rint(x), atol=1e-13)
+    np.testing.assert_array_equal(zero, 0.0)
+    np.testing.assert_array_equal(place, np.arange(1600))
