@@ -16,6 +16,7 @@ __all__ = [
     "VARIABLES",
     "Variable",
     "interval_names",
+    "variable_at",
     "variables_of",
 ]
 
@@ -367,6 +368,17 @@ _ALL: list[Variable] = [
     # where the model and the data disagree; axes: `score` as effects.evidence.SCORES, `channel` charge and
     # readout, `side` below and above, `statistic` as discrepancy.catalogue.STATISTICS
     *_discrepancy(),
+    # of each version of the run's model, in a group of its own: model/0002/added_exposure
+    Variable(
+        "model/added_exposure", ("added_level", *_MAP), "float64", "e-", "exposure that effects add to pixels"
+    ),
+    Variable(
+        "model/added_weight",
+        ("added_level", *_MAP),
+        "float64",
+        "1",
+        "part of the frames at each added exposure",
+    ),
     # other methods beside PCH-EM; the attribute `methods` of the estimates names the axis `method`
     Variable("methods/pixel_y", ("pixel",), "int32", "1", "row of the compared pixel"),
     Variable("methods/pixel_x", ("pixel",), "int32", "1", "column of the compared pixel"),
@@ -386,6 +398,15 @@ _ALL: list[Variable] = [
 ]
 
 VARIABLES: dict[str, Variable] = {variable.path: variable for variable in _ALL}
+
+
+def variable_at(path: str) -> Variable:
+    """Return the variable of an array's path; numbers in it, of versions, are no part of the name.
+
+    Raises:
+        KeyError: nothing like it is registered.
+    """
+    return VARIABLES["/".join(part for part in path.split("/") if not part.isdigit())]
 
 
 def variables_of(group: str) -> list[Variable]:

@@ -143,7 +143,8 @@ def discrepancy(
     refit: Annotated[
         bool,
         typer.Option(
-            "--refit/--no-refit", help="fit, maps, ensemble and report with the grown model at once"
+            "--refit/--no-refit",
+            help="add what is named to the model, and do fit, maps, ensemble and report with it",
         ),
     ] = True,
     roi: Annotated[
@@ -154,13 +155,13 @@ def discrepancy(
 ) -> None:
     """Find what the model is missing, name it, and add it to the model.
 
-    Simulates the fitted model many times and compares. What is named goes into model.effects of the YAML.
+    Simulates the fitted model many times and compares. What is named makes a new version of the model.
     """
-    from pchem_pipeline.commands.discrepancy import find_and_grow
+    from pchem_pipeline.commands.discrepancy import find_and_add
     from pchem_pipeline.run.target import find_run
 
     command = replace(command, options=replace(command.options, roi=region_of(roi)))
-    text = find_and_grow(find_run(target), command, refit=refit)
+    text = find_and_add(find_run(target), command, refit=refit)
     if text:
         typer.echo(text)
 
@@ -208,6 +209,27 @@ def status(
 
     terminal = sys.stdout.isatty()
     follow(find_run(target), typer.echo, follow=watch, as_json=as_json, terminal=terminal)
+
+
+@app.command()
+def model(
+    target: Target,
+    use: Annotated[int | None, typer.Option(min=1, help="put this version in force, in the YAML too")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one line of JSON, for machines")] = False,
+) -> None:
+    """List the versions of the model and what rests on each; go back to one.
+
+    A version is made from the section model of the YAML, or by a verdict of discrepancy.
+    """
+    from pchem_pipeline.commands.model import list_models, model_lines, models_json, use_model
+    from pchem_pipeline.run.target import find_run
+
+    run = find_run(target)
+    if use is not None:
+        typer.echo(use_model(run, use))
+    else:
+        models = list_models(run)
+        typer.echo(models_json(models) if as_json else "\n".join(model_lines(models)))
 
 
 @app.command()

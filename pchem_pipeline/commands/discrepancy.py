@@ -1,33 +1,42 @@
-"""``pchem discrepancy``: search for what is missing, then bring the rest of the run up to the grown model."""
+"""``pchem discrepancy``: search for what is missing, then bring the rest of the run up to the model found."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from pchem_pipeline.commands.model import adopt_verdict, yaml_of
+from pchem_pipeline.config.edit import check_writable
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
+from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import Command, run_stages, run_status
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["find_and_grow"]
+__all__ = ["find_and_add"]
 
 _BEFORE = ("ingest", "histogram")
 _AFTERWARDS = ("fit", "maps", "ensemble", "report")
 
 
-def find_and_grow(target: Target, command: Command, *, refit: bool) -> str:
-    """Run the stage, and the stages that the grown model makes stale; return the verdict in words.
+def find_and_add(target: Target, command: Command, *, refit: bool) -> str:
+    """Search, put what was named into the model, and fit with it; return the verdict in words.
 
     Args:
         target: the run.
         command: from the command line.
-        refit: bring fit, maps, ensemble and report up to date where they were done before.
+        refit: make the verdict's model a version, unless ``discrepancy.add`` is off, and bring fit, maps,
+            ensemble and report up to date where they were done before; else model and YAML stay.
 
     Raises:
         PchEmError: a stage cannot be done.
     """
+    add = refit and target.config.discrepancy.add
+    path = yaml_of(target) if add else None
+    if path is not None:
+        check_writable(path)
     missing = [s.stage for s in run_status(target) if s.stage in _BEFORE and s.state != "complete"]
     if "ingest" in missing:
         run_stages(target, ["ingest"], command)
@@ -35,15 +44,20 @@ def find_and_grow(target: Target, command: Command, *, refit: bool) -> str:
     run_stages(target, [*counted, "discrepancy"], command)
     if command.options.dry_run:
         return ""
-    grown = find_run(target.config_path or target.store)
+    if add:
+        target, version = adopt_verdict(target)
+        if version is not None:
+            words = f"model {version.number} is in force: {model_words(version.effects)}"
+            written = "" if path is None else f", and written in {path}"
+            Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words + written)
     if refit:
-        done = {s.stage for s in run_status(grown) if s.state != "missing"}
+        done = {s.stage for s in run_status(target) if s.state != "missing"}
         stages = [name for name in _AFTERWARDS if name in done]
         if stages:
-            run_stages(grown, stages, without_choice(command))
-    found = read_verdict(grown.store)
+            run_stages(target, stages, without_choice(command))
+    found = read_verdict(target.store)
     assert found is not None
-    return f"{verdict_text(found)}\n\n{grown.store / VERDICT_FILE}"
+    return f"{verdict_text(found)}\n\n{target.store / VERDICT_FILE}"
 
 
 def _of_histograms(target: Target) -> bool:

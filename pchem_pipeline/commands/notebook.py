@@ -28,6 +28,7 @@ from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.pixels import cell_tables, draw_cells, draw_pixels, has_fit
 from pchem_pipeline.report.style.style import COLUMN_MM, Look
 from pchem_pipeline.report.style.wording import measured, symbol
+from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target, find_run
@@ -98,6 +99,16 @@ class Run:
     def status(self) -> dict[str, str]:
         """Return how far each stage is, as ``pchem status`` says it."""
         return {state.stage: state.words() for state in run_status(self._target)}
+
+    @property
+    def model_versions(self) -> tuple[ModelVersion, ...]:
+        """The versions of the model that the run has, by number, with their effects and their sources."""
+        return model_versions(self._store)
+
+    @property
+    def model(self) -> ModelVersion | None:
+        """The version that the fit rests on; None without a fit."""
+        return model_of(self._store, "fit")
 
     # -- arrays -------------------------------------------------------------------------------
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.config.load import setting_of
 from pchem_pipeline.run.declaration import Stage, imported
+from pchem_pipeline.run.model_versions import model_of_content, model_versions, present_content
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["StageState", "differences", "fingerprint_content", "setting_values", "status"]
+__all__ = ["StageState", "differences", "fingerprint_content", "rests_on", "setting_values", "status"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class StageState:
         why: reason, for people.
         done: finished units.
         total: units of the complete stage (0 where not known yet).
+        model: number of the version of the model that its result rests on; None: of none.
     """
 
     stage: str
@@ -34,6 +37,7 @@ class StageState:
     why: str = ""
     done: int = 0
     total: int = 0
+    model: int | None = None
 
     def words(self) -> str:
         """Return the state as ``pchem status`` prints it."""
@@ -75,17 +79,41 @@ def status(stage: Stage, context: StageContext) -> StageState:
     if record is None:
         return StageState(stage.name, "missing")
     done = len(context.store.records.done(stage.name, record.fingerprint))
+    state, why = _state(stage, context, record, done)
+    return StageState(stage.name, state, why, done, record.keys, rests_on(record, context.store))
+
+
+def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) -> tuple[str, str]:
+    """Return the state of a stage that was begun, and why."""
     content = fingerprint_content(stage, context)
-    if fingerprint_of(content) != record.fingerprint and not _grew(content, record):
-        return StageState(
-            stage.name, "stale", "; ".join(differences(record.content, content)), done, record.keys
-        )
+    before = present_content(context.store, record.content)
+    same = fingerprint_of(content) in (record.fingerprint, fingerprint_of(before))
+    if not same and not _grew(content, replace(record, content=before)):
+        numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}
+        return "stale", "; ".join(differences(before, content, numbers))
     if done < record.keys or record.keys == 0:
         reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
-        return StageState(stage.name, "partial", reason, done, record.keys)
-    if not record.finished:
-        return StageState(stage.name, "partial", "interrupted", done, record.keys)
-    return StageState(stage.name, "complete", "", done, record.keys)
+        return "partial", reason
+    return ("complete", "") if record.finished else ("partial", "interrupted")
+
+
+def rests_on(record: StageRecord, store: RunStore) -> int | None:
+    """Return the number of the model that a result rests on; None where it rests on none, or on one unknown.
+
+    A stage that does not read the model rests on that of its upstream stages.
+    """
+    if record.model is not None:
+        return record.model
+    version = model_of_content(store, record.content)
+    if version is not None:
+        return version.number
+    for name, fingerprint in record.content.get("upstream", {}).items():
+        upstream = store.records.read(name)
+        if upstream is not None and _base(fingerprint) == upstream.fingerprint:
+            number = rests_on(upstream, store)
+            if number is not None:
+                return number
+    return None
 
 
 def _grew(content: dict[str, Any], record: StageRecord) -> bool:
@@ -103,8 +131,10 @@ def _base(fingerprint: str | None) -> str | None:
     return None if fingerprint is None else fingerprint.partition("+")[0]
 
 
-def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Say in words why two fingerprint contents differ."""
+def differences(
+    old: dict[str, Any], new: dict[str, Any], models: Mapping[Any, int] | None = None
+) -> list[str]:
+    """Say in words why two fingerprint contents differ; ``models`` are the numbers of models, by digest."""
     words: list[str] = []
     if old.get("version") != new["version"]:
         words.append(f"algorithm version {old.get('version')} -> {new['version']}")
@@ -115,16 +145,17 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
         if old.get("upstream", {}).get(name) != new["upstream"][name]:
             words.append(f"{name} was done again")
     if old.get("input") != new["input"]:
-        words += _input_changes(old.get("input"), new["input"])
+        words += _input_changes(old.get("input") or {}, new["input"] or {}, models or {})
     return words
 
 
-def _input_changes(old: Any, new: Any) -> list[str]:
+def _input_changes(old: Any, new: Any, models: Mapping[Any, int]) -> list[str]:
     """Say which facts of the input changed; digests are no words."""
-    facts = {**(old or {}), **(new or {})}
-    if "content" in facts:
+    if "content" in {**old, **new}:
         return ["the content of the input changed"]
-    return _changes("input", old or {}, new or {})
+    before, after = (models.get(facts.get("model"), "unknown") for facts in (old, new))
+    words = [] if old.get("model") == new.get("model") else [f"model {before} -> {after}"]
+    return words + _changes("input", {**old, "model": None}, {**new, "model": None})
 
 
 def _changes(key: str, old: Any, new: Any) -> list[str]:

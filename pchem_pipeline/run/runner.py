@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes
 from pchem_pipeline.run.declaration import Stage, imported
-from pchem_pipeline.run.fingerprint import StageState, fingerprint_content, status
+from pchem_pipeline.run.fingerprint import StageState, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
@@ -86,6 +86,7 @@ def _perform(
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         versions=_versions(),
     )
+    record = replace(record, model=rests_on(record, context.store))
     records.write(record)
     context.reporter.event("start", stage=stage.name, why=before.words())
     wall, cpu = clock

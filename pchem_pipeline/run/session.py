@@ -13,6 +13,7 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.run.compilation import announced, compiled_ahead
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
+from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest, stop_on_signals
@@ -147,6 +148,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         progress_file.show({"stage": ""})
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(target.config))
+        keep_in_force(store, model_in_force(store, target.config.model))
         write_json(store.path / ".pchem" / "location.json", _location(target))
         executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
         stack.callback(executor.close)
@@ -183,7 +185,7 @@ def run_status(target: Target) -> list[StageState]:
         state = status(stage, context)
         above = [upstream for upstream in (*stage.upstream, *stage.follows) if upstream in stale]
         if above and state.state in ("complete", "partial"):
-            state = StageState(name, "stale", f"{above[0]} is stale", state.done, state.total)
+            state = replace(state, state="stale", why=f"{above[0]} is stale")
         if state.state == "stale":
             stale.add(name)
         states.append(state)

@@ -24,6 +24,7 @@ from pchem_pipeline.base.errors import InputError, PchEmError, StoreError
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
@@ -157,6 +158,11 @@ class StageContext:
     def is_prepared(self) -> bool:
         """The arrays of the running stage were made beforehand, by a single pass over the input."""
         return self.stage in self.prepared
+
+    @functools.cached_property
+    def model(self) -> ModelVersion:
+        """The version of the model that the configuration means."""
+        return model_in_force(self.store, self.config.model)
 
     @property
     def sensor(self) -> SensorInfo:

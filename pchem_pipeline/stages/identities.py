@@ -6,19 +6,16 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.run.input_identity import known_identity
+from pchem_pipeline.run.model_versions import model_versions, present_content, with_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
 
 __all__ = [
     "adc_limits",
     "fit_inputs",
     "input_content",
     "integration_time",
-    "known_added_exposure",
     "other_samples",
     "search_start",
     "verdict",
@@ -65,23 +62,8 @@ def adc_limits(context: StageContext) -> dict[str, Any]:
 
 
 def fit_inputs(context: StageContext) -> dict[str, Any]:
-    """Return what the files say to the fit, and which exposure the effects of the model add to pixels."""
-    effects = [effect.model_dump(mode="json") for effect in context.config.model.effects]
-    digest = known_added_exposure(context.store, effects)
-    return {**adc_limits(context), **({} if digest is None else {"added_exposure": digest})}
-
-
-def known_added_exposure(store: RunStore, effects: Sequence[dict[str, Any]]) -> str | None:
-    """Return the digest of the exposure that effects add to pixels; None where none is known of them.
-
-    Args:
-        store: the run.
-        effects: of a model, as JSON data.
-    """
-    attributes = store.attributes("discrepancy/added_exposure")
-    if not attributes or any(effect not in effects for effect in attributes["effects"]):
-        return None
-    return str(attributes["digest"])
+    """Return what the files say to the fit, and the model."""
+    return {**adc_limits(context), "model": context.model.digest}
 
 
 def integration_time(context: StageContext) -> dict[str, Any]:
@@ -116,10 +98,15 @@ def other_samples(context: StageContext) -> dict[str, Any]:
 
 
 def search_start(context: StageContext) -> dict[str, Any]:
-    """Return the model that a search starts from: what it adds itself makes it no staler."""
-    name = "discrepancy"
-    present = [effect.model_dump(mode="json") for effect in context.config.model.effects]
-    kept = context.store.attributes(name) if context.store.has(name) else {}
-    if kept.get("model_after") == present:
-        present = kept["model_before"]
-    return {"model": present, "roi": list(context.options.roi or kept.get("roi") or ())}
+    """Return the model that a search starts from, and its region; what it adds itself makes it no staler.
+
+    Where the model in force came from a search that started as the one in the store did, it is the model
+    before. The region of a search stays that of the next one, unless this is to be done by force.
+    """
+    record, model = context.store.records.read("discrepancy"), context.model
+    kept = {} if record is None else present_content(context.store, record.content)["input"]
+    before = with_digest(model_versions(context.store), kept.get("model"))
+    own = model.source == "verdict" and before is not None and before.number == model.parent
+    start = before if own and before is not None else model
+    roi = context.options.roi or (() if context.options.force else kept.get("roi", ()))
+    return {"model": start.digest, "roi": list(roi)}

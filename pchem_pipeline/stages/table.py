@@ -92,7 +92,7 @@ _ALL = (
         "fit",
         version=5,
         upstream=("histogram",),
-        settings=("fit", "model", "run.tile"),
+        settings=("fit", "run.tile"),
         reads=("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),
         writes=("fit", "samples"),
         run=f"{_HERE}.fit.fit:run",

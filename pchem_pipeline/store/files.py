@@ -51,6 +51,8 @@ def is_fatal(error: BaseException) -> bool:
 def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
     """Write a small file, so that whoever reads it finds the old or the new one, whole.
 
+    A file that is there keeps its mode.
+
     An object of an object storage is put at once: it appears whole or not at all.
 
     Args:
@@ -96,6 +98,8 @@ def _put_in_place(path: Path, aside: Path, sync: bool) -> Iterator[Path]:
                 os.fsync(file.fileno())
         if path.is_dir():
             shutil.rmtree(path)
+        elif path.is_file() and aside.is_file():
+            shutil.copymode(path, aside)
         aside.replace(path)
     except OSError as error:
         raise storage_error(error, path) from error

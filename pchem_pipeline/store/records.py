@@ -37,6 +37,7 @@ class StageRecord:
         failed: key and reason of each unit that failed.
         notes: one-line remarks that the report repeats.
         versions: versions of Python and of the libraries.
+        model: number of the version of the run's model that the result rests on; None: of none.
     """
 
     stage: str
@@ -52,6 +53,7 @@ class StageRecord:
     failed: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
+    model: int | None = None
 
 
 class Records:

@@ -4,6 +4,7 @@
 run.zarr/
   zarr.json              schema version in the attributes
   frames/ histogram/ summary/ fit/ maps/ ensemble/ electrons/ truth/
+  model/                 0001.json ...: versions of the model, their arrays in groups; current.json
   report.html, report.json, figures/
   .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock,
                          progress.json while a command works on it
@@ -27,7 +28,7 @@ from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import LockedError, PchEmError, StoreError, quoted
-from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused, zarr_place
@@ -134,7 +135,7 @@ class RunStore:
         Raises:
             StoreError: the file system refused.
         """
-        variable = VARIABLES[name]
+        variable = variable_at(name)
         kind = np.dtype(variable.dtype if dtype is None else dtype)
         attrs = {"units": variable.unit, "long_name": variable.long_name}
         if variable.symbol:
@@ -155,7 +156,7 @@ class RunStore:
 
     def write_array(self, name: str, data: NDArray[Any], attributes: Mapping[str, Any] | None = None) -> None:
         """Make a small array and write it whole, in one chunk."""
-        dtype = data.dtype if VARIABLES[name].dtype == "*" else None
+        dtype = data.dtype if variable_at(name).dtype == "*" else None
         self.create_array(name, data.shape, chunks=data.shape, dtype=dtype, attributes=attributes)
         self.write(name, (slice(None),) * data.ndim, data)
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 
 import numpy as np
@@ -78,6 +79,32 @@ def test_the_fit_runs_with_the_grown_model_and_loses_its_bias(searched):
     assert abs(bias_after) < bias_before / 5
 
 
+def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tmp_path):
+    shell, _, before = searched
+    other = Shell(tmp_path / "copy", shell.environment)
+    shutil.copytree(shell.folder, other.folder)
+    status = [" ".join(line.split()) for line in other.ok("status", "run.yaml").stdout.splitlines()]
+    assert "fit complete model 2" in status
+    assert "discrepancy complete model 1" in status
+    listed = other.ok("model", "run.yaml").stdout.splitlines()
+    assert listed[1].split() == ["1", "config", "discrepancy", "PCD"]
+    assert listed[2].startswith("* 2 ")
+    assert "PCD + row_noise 1.2" in listed[2]
+    after, text = read(other, "fit/read_noise_dn"), (other.folder / "run.yaml").read_text()
+    words = other.ok("model", "run.yaml", "--use", "1").stdout
+    assert "stale: fit; to do them again: pchem run" in words
+    assert "row_noise" not in (other.folder / "run.yaml").read_text().split("model:")[1]
+    assert "fit         stale - model 2 -> 1  model 2" in other.ok("status", "run.yaml").stdout
+    other.ok("run", "run.yaml", "--until", "fit")
+    assert np.array_equal(read(other, "fit/read_noise_dn"), before, equal_nan=True)
+    # a search that is up to date is asked for what it named, and nothing is searched again
+    again = other.ok("discrepancy", "run.yaml")
+    assert "discrepancy: up to date" in again.stderr
+    assert "model 2 is in force" in again.stderr
+    assert (other.folder / "run.yaml").read_text() == text
+    assert np.array_equal(read(other, "fit/read_noise_dn"), after, equal_nan=True)
+
+
 def test_a_second_search_has_nothing_to_do(searched):
     shell, _, _ = searched
     again = shell.ok("discrepancy", "run.yaml", "--no-refit")
@@ -116,6 +143,7 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, tmp_path, moment)
     assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
     other.ok("discrepancy", "run.yaml", "--no-refit")
     assert verdict(other) == verdict(shell)
+    assert (tmp_path / "run.yaml").read_text() == CAMERA  # --no-refit leaves the model alone
 
 
 @pytest.mark.parametrize(
@@ -141,6 +169,8 @@ def test_without_add_the_model_stays(searched, tmp_path):
     text = CAMERA + "  add: false\n"
     (tmp_path / "run.yaml").write_text(text)
     other.ok("simulate", "run.yaml")
-    other.ok("discrepancy", "run.yaml")
+    for _ in range(2):
+        other.ok("discrepancy", "run.yaml")
     assert verdict(other)["effects"] == ["row_noise"]
     assert (tmp_path / "run.yaml").read_text() == text
+    assert [path.name for path in (tmp_path / "run.zarr/model").glob("0*")] == ["0001.json"]

@@ -87,7 +87,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
 def test_a_change_of_the_model_makes_the_fit_stale_and_nothing_before_it(both) -> None:
     path, before = both
     assert before["states"]["histogram"] == "complete"
-    assert before["states"]["fit"].startswith("stale - model.effects [] -> ")
+    assert before["states"]["fit"] == "stale - model 1 -> 2"
     for stage in ("maps", "ensemble"):
         assert before["states"][stage].startswith("stale")
     assert set(states(path).values()) == {"complete"}

@@ -48,6 +48,12 @@ def test_maps_are_lazy_and_know_their_units(run, store, finished):
     assert int(run.ensemble.counts.sum()) == int(store.read("ensemble/counts").sum())
 
 
+def test_the_model_is_told(run):
+    [first] = run.model_versions
+    assert (first.number, first.source, first.effects) == (1, "config", ())
+    assert run.model == first
+
+
 def test_masks_leave_out_what_is_not_to_be_believed(run, store):
     quality = store.read("maps/quality")
     assert 0 < (quality == 0).sum() < quality.size

@@ -16,6 +16,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.demo.comparison import COMPARED, compare
+from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import read_verdict
@@ -86,7 +87,7 @@ def run_hidden_demo(
     if not (output / _PLAIN_MAPS).exists():
         _run_plain(output, command)
     run_stages(find_run(output / _YAML), ["discrepancy"], command)
-    grown = find_run(output / _YAML)
+    grown, _ = adopt_verdict(find_run(output / _YAML))
     run_stages(grown, pipeline_of(grown.config), command)
     return _text(output, grown)
 

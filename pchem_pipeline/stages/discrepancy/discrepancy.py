@@ -1,4 +1,4 @@
-"""Stage ``discrepancy``: find what the model is missing, and put it into the run's model.
+"""Stage ``discrepancy``: find what the model is missing.
 
 It looks at the frames alone, never at the truth of a simulated run. Its units are simulated stacks; each
 leaves its statistics in its marker, so that a stopped search goes on where it was. It is not part of ``run``.
@@ -8,27 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
-from pchem_pipeline.config.grow import with_model_effects
-from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.fit.added_exposure import write_added_exposure
-from pchem_pipeline.store.files import write_atomic
 
 __all__ = ["Window", "choose_window", "run"]
 
@@ -97,20 +92,20 @@ def choose_window(
 
 
 def run(context: StageContext) -> None:
-    """Find discrepancies, write ``discrepancy.json`` and the arrays of its pictures, and grow the model.
+    """Find discrepancies; write ``discrepancy.json`` and the arrays of its pictures.
 
     Raises:
         InputError: the frames are too few, or there are none.
         StoreError: the store refuses.
     """
     settings, sensor = context.config.discrepancy, context.sensor
-    before = context.config.model.effects
+    before, roi = _start(context)
     if sensor.kind != "frames":
-        _run_histograms(context)
+        _run_histograms(context, before)
         return
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
-    window = choose_window(source.shape, settings.max_samples, settings.block_frames, context.options.roi)
+    window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi)
     found = find_discrepancies(
         read_window(source, window),
         window.numbers,
@@ -122,17 +117,22 @@ def run(context: StageContext) -> None:
         mapper=_Mapper(context),
     )
     found = replace(found, verdict=found.verdict.on_sensor(window.rows, window.columns))
-    _write(context, found, before)
-    write_added_exposure(context.store, found.added, found.model, window.rows, window.columns)
-    _grow(context, found, before)
+    _write(context, found)
+    write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 
 
-def _run_histograms(context: StageContext) -> None:
+def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] | None]:
+    """Return the effects of the model that this search starts from, and its region; see `identity`."""
+    record, model = context.store.records.read(_STAGE), model_of(context.store, _STAGE)
+    roi = () if record is None else record.content["input"]["roi"]
+    return (context.model if model is None else model).effects, tuple(roi) or None
+
+
+def _run_histograms(context: StageContext, before: Sequence[Effect]) -> None:
     """Do the same with ready-made histograms, in one unit."""
     if not context.store.has("histogram/counts"):
         place = quoted(context.store.path)
         raise StoreError(f"{_STAGE} of histograms needs them in the store; run: pchem histogram {place}")
-    before = context.config.model.effects
     counts = context.store.read("histogram/counts")
     found = find_in_histograms(
         counts.reshape(-1, counts.shape[2]),
@@ -140,8 +140,7 @@ def _run_histograms(context: StageContext) -> None:
         context.config.discrepancy,
         model=before,
     )
-    _write(context, found, before)
-    _grow(context, found, before)
+    _write(context, found)
     context.run_units([WHOLE], _nothing_left, by_tiles=False)
 
 
@@ -196,7 +195,7 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     return stack
 
 
-def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
+def _write(context: StageContext, found: Discrepancy) -> None:
     names, z_before, z_after = found.statistics
     arrays = evidence_arrays(
         found.evidence,
@@ -210,40 +209,5 @@ def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) 
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
     context.store.write_file(VERDICT_FILE, found.verdict.to_json().encode())
-    context.store.set_attributes(
-        _STAGE,
-        {
-            "model_before": _dump(before),
-            "model_after": _dump(found.model),
-            "roi": list(context.options.roi or ()),
-        },
-    )
     for tag, reason in found.verdict.left_out.items():
         context.note(f"effect {tag} left out: {reason}")
-
-
-def _grow(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
-    """Put what was found into the model of the run, if wanted."""
-    if context.config.discrepancy.add and found.model != tuple(before):
-        grow_model(context, found.model, found.verdict.set_aside)
-
-
-def grow_model(
-    context: StageContext,
-    effects: Sequence[Effect],
-    set_aside: tuple[tuple[float | None, float | None], ...] = (),
-) -> None:
-    """Put effects into the model of the run: in the store's copy of the YAML, and in the user's own file."""
-    set_aside = set_aside or context.config.model.set_aside_e
-    model = ModelSettings(effects=tuple(effects), set_aside_e=set_aside)
-    context.store.write_config(dump_config(context.config.model_copy(update={"model": model})))
-    path = context.config_path
-    if path is None or not path.exists():
-        return
-    text = path.read_text(encoding="utf-8")
-    write_atomic(path, with_model_effects(text, _dump(effects), str(path), set_aside).encode())
-    context.reporter.info(f"model.effects of {path}: {', '.join(e.tag for e in effects)}")
-
-
-def _dump(effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    return [effect.model_dump(mode="json") for effect in effects]

@@ -28,8 +28,7 @@ from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.ensemble.result import pixels_of, write_result
 from pchem_pipeline.stages.ensemble.tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
-from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_effects
+from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_added_exposure, fitted_effects
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
@@ -190,7 +189,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     lobes = None
     if job.effects:
         lobes = tuple(store.read(f"fit/{name}", rows) for name in FREE_LOBES)
-    added = fitted_added_exposure(store, job.effects, rows)
+    added = fitted_added_exposure(store, rows)
     covariance = None
     if store.has("fit/correlation"):
         stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)

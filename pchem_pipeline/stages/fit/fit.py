@@ -25,8 +25,8 @@ from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.fit.added_exposure import read_added_exposure
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
 from pchem_pipeline.stages.fit.samples import fit_samples
 from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
@@ -144,9 +144,10 @@ def run(context: StageContext) -> None:
     if context.sensor.samples:
         fit_samples(context)
         return
-    effects = context.config.model.effects
+    model = context.model.settings
+    effects = model.effects
     left_out = set(() if effects else FREE_LOBES)
-    settings, plain = context.config.fit, not (effects or context.config.model.set_aside_e)
+    settings, plain = context.config.fit, not (effects or model.set_aside_e)
     if settings.intervals == "normal" or not plain:
         left_out |= {path for name in INTERVALS for path in interval_names(name)}
     if not plain and (settings.intervals, settings.errors) != ("normal", "information"):
@@ -159,8 +160,7 @@ def run(context: StageContext) -> None:
         store=context.store.path,
         settings=context.config.fit,
         adc_limits=context.adc_limits,
-        effects=effects,
-        set_aside=context.config.model.set_aside_e,
+        model=context.model,
     )
     done = context.run_units(context.tiles(), task, needs="histogram")
     judge_sensor(context)
@@ -187,15 +187,14 @@ def _do_tile(
     store: Path,
     settings: FitSettings,
     adc_limits: tuple[int, int] | None,
-    effects: Sequence[Effect],
-    set_aside: Sequence[Interval],
+    model: ModelVersion,
 ) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels."""
     run_store = open_store(store)
     histogram = {name: run_store.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM}
     start = kept_fit(store, tile.region)
-    ny, nx = run_store.array("histogram/origin").shape
-    added = read_added_exposure(run_store, effects, (ny, nx), tile.region)
+    effects, set_aside = model.effects, model.settings.set_aside_e
+    added = read_added_exposure(run_store, model, tile.region)
     arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start, added)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
-from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.run.model_versions import Region, model_of, read_added_exposure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,18 +19,27 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["deciding_maps", "fitted_effects"]
+__all__ = ["deciding_maps", "fitted_added_exposure", "fitted_effects"]
 
 
 def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
     """Return the effects of the model of the stored fit, in their order; none without a fit.
 
     Raises:
-        pydantic.ValidationError: an effect came from a package that is no longer there.
+        ConfigError: an effect came from a package that is no longer there.
     """
-    record = store.records.read("fit")
-    settings = {} if record is None else record.content.get("settings", {}).get("model") or {}
-    return ModelSettings.model_validate(settings).effects
+    version = model_of(store, "fit")
+    return () if version is None else version.effects
+
+
+def fitted_added_exposure(store: RunStore, region: Region | None = None) -> AddedExposure | None:
+    """Return the exposure that the effects of the stored fit add to the pixels of a region; None: nothing.
+
+    Args:
+        store: the run.
+        region: of the sensor; None: all of it.
+    """
+    return read_added_exposure(store, model_of(store, "fit"), region)
 
 
 def deciding_maps(

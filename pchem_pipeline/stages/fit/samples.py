@@ -106,7 +106,7 @@ def fit_samples(context: StageContext) -> None:
         ConfigError: the model holds effects.
         StoreError: histograms of a sample are missing, or the store refuses.
     """
-    if context.config.model.effects or context.config.model.set_aside_e:
+    if context.model.effects or context.model.settings.set_aside_e:
         raise ConfigError("model: several samples are fitted with the plain model; remove model.effects")
     samples, tile, shape = context.sensor.samples, context.config.run.tile, context.sensor.shape
     create_fit_maps(context, {*FREE_LOBES, *(path for name in INTERVALS for path in interval_names(name))})

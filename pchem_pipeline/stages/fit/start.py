@@ -1,16 +1,22 @@
-"""The answer of an earlier fit, from which the fit of more frames of the same pixels starts."""
+"""The answer of an earlier fit, from which the fit of more frames of the same pixels starts.
+
+It is of the stage itself, kept when frames are appended and forgotten once it has been used: no other stage
+writes or reads it, so it lies among the private files of the run. It is no part of the fingerprint, since the
+maximum does not depend on where the climb to it starts.
+"""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.run.fingerprint import setting_values
+from pchem_pipeline.run.model_versions import present_content
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
@@ -34,8 +40,7 @@ def keep_fit(context: StageContext) -> None:
     """
     store = context.store
     record = store.records.read("fit")
-    settings = setting_values(STAGES["fit"], context)
-    if record is None or not record.finished or record.content["settings"] != settings:
+    if record is None or not record.finished or not _same_fit(record.content, context):
         drop_fit(store.path)
         return
     names = (*PARAMETERS, "likelihood_gap")
@@ -44,6 +49,14 @@ def keep_fit(context: StageContext) -> None:
     buffer = io.BytesIO()
     np.save(buffer, start)
     write_atomic(_place(store.path), buffer.getvalue())
+
+
+def _same_fit(content: dict[str, Any], context: StageContext) -> bool:
+    """Tell whether a fit was made with the present settings and model."""
+    content = present_content(context.store, content)
+    if content["settings"] != setting_values(STAGES["fit"], context):
+        return False
+    return bool(content["input"]["model"] == context.model.digest)
 
 
 def kept_fit(store: Path, region: tuple[slice, slice]) -> NDArray[np.float64] | None:

@@ -22,8 +22,7 @@ from pchem_pipeline.model.fit.grown import marginal_mass
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map
-from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_effects
+from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_added_exposure, fitted_effects
 from pchem_pipeline.stages.report.inspected_pixels import ChosenPixels, choose_inspected
 
 if TYPE_CHECKING:
@@ -262,7 +261,7 @@ def read_sample(
     deciding, masses = None, []
     if effects:
         columns = [store.read(f"maps/{name}").reshape(-1)[index] for name in PARAMETERS]
-        every = fitted_added_exposure(store, effects)
+        every = fitted_added_exposure(store)
         added = None if every is None else every.flat().of(index)
         known = np.isfinite(columns).all(axis=0)
         deciding = np.full((4, index.size), np.nan)

@@ -21,10 +21,10 @@ from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import read_discrepancy
-from pchem_pipeline.stages.fit.added_exposure import fitted_added_exposure
-from pchem_pipeline.stages.fit.fitted_model import fitted_effects
+from pchem_pipeline.stages.fit.fitted_model import fitted_added_exposure, fitted_effects
 from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
 from pchem_pipeline.stages.report.drawing import draw_by_workers
 from pchem_pipeline.stages.report.inspector import gather_inspector
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 __all__ = ["choose_pixels", "read_pixels", "report_tile", "run"]
 
+#: Where a version of the model comes from, in words.
+_SOURCES = {"config": "from the configuration", "verdict": "from the verdict on what the model is missing"}
 _FIT_MAPS = ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share")
 #: Maps that are no parameters.
 _NOT_SHOWN = ("quality", "goodness_q")
@@ -324,7 +326,7 @@ def _grown_mass(
         return None
     region = tuple(slice(i, i + 1) for i in place)
     lobes = tuple(store.read(f"fit/{name}", region).ravel() for name in FREE_LOBES)
-    added = fitted_added_exposure(store, effects, (region[0], region[1]))
+    added = fitted_added_exposure(store, (region[0], region[1]))
     model = marginal_model(effects, pixel_maps(columns, np.ones(1, bool)), added)
     mass: NDArray[np.float64] = marginal_mass(model, columns, codes, lobes=(lobes[0], lobes[1]))[0]
     return mass
@@ -341,9 +343,11 @@ def _run_facts(store: RunStore, config: RunConfig, sensor: SensorInfo) -> dict[s
     }
     if config.simulate is not None:
         facts["seed of the simulation"] = config.simulate.seed
-    effects = fitted_effects(store)
-    if effects:
-        facts["model"] = model_words(effects)
+    version = model_of(store, "fit")
+    if version is not None and version.effects:
+        facts["model"] = model_words(version.effects)
+    if version is not None:
+        facts["version of the model"] = f"{version.number} ({_SOURCES[version.source]})"
     if record is not None:
         facts["report made (UTC)"] = record.started
         facts["versions"] = record.versions

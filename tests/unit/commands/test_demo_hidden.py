@@ -170,13 +170,15 @@ def test_a_demonstration_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: p
     """Frames, key and the maps of the plain model are made once."""
     calls: list[list[str]] = []
     monkeypatch.setattr(hidden, "run_stages", lambda target, stages, command: calls.append([*stages]))
+    monkeypatch.setattr(hidden, "adopt_verdict", lambda target: (calls.append(["adopt"]), (target, None))[1])
     monkeypatch.setattr(hidden, "_maps", lambda target: {"quality": np.zeros(1)})
     monkeypatch.setattr(hidden, "_text", lambda output, target: "told")
     given: dict[str, Any] = {"hidden": RANDOM, "size": 8, "n_frames": 60, "seed": None}
     assert run_hidden_demo(tmp_path / "x", **given) == "told"
     key = (tmp_path / "x" / SEALED_KEY).read_bytes()
     plain = ["ingest", "histogram", "fit", "maps", "ensemble"]
-    assert calls == [plain, ["discrepancy"], [*plain, "report"]]
+    again = [["discrepancy"], ["adopt"], [*plain, "report"]]
+    assert calls == [plain, *again]
     run_hidden_demo(tmp_path / "x", **given)
-    assert calls[3:] == [["discrepancy"], [*plain, "report"]]
+    assert calls[4:] == again
     assert (tmp_path / "x" / SEALED_KEY).read_bytes() == key

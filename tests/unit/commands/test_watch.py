@@ -18,11 +18,11 @@ from pchem_pipeline.run.target import Target
 
 TARGET = Target(parse_config("input: {files: [a.tif]}\n"), Path("/x"), Path("/x/run.zarr"))
 PACE = {"stage": "fit", "unit": "tile", "done": 8, "total": 64, "rate": 2.0, "remaining": 28.0}
-DONE, PART = StageState("ingest", "complete"), StageState("fit", "partial", "", 8, 64)
+DONE, PART = StageState("ingest", "complete"), StageState("fit", "partial", "", 8, 64, 2)
 
 
 def test_rows_tell_rate_and_remaining_time() -> None:
-    assert rows([DONE, PART], None) == ["ingest      complete", "fit         partial 8 of 64"]
+    assert rows([DONE, PART], None) == ["ingest      complete", "fit         partial 8 of 64  model 2"]
     assert rows([DONE, PART], PACE)[1] == "fit         running 8 of 64 tiles, 2/s, 28 s left"
     both = {**PACE, "stage": "ingest and histogram", "unit": "MiB"}
     assert rows([PART], both)[1].strip() == "running (ingest and histogram) 8 of 64 MiB, 2/s, 28 s left"
@@ -77,7 +77,8 @@ def test_json_lines_and_ctrl_c(looks: list[float]) -> None:
     watch(TARGET, written.append, follow=True, as_json=True, sleep=stop)
     [content] = map(json.loads, written)
     assert content["progress"]["remaining"] == 28.0
-    assert content["stages"][1] == {"stage": "fit", "state": "partial", "why": "", "done": 8, "total": 64}
+    fit = {"stage": "fit", "state": "partial", "why": "", "done": 8, "total": 64, "model": 2}
+    assert content["stages"][1] == fit
 
 
 def test_the_command_looks_once_unless_asked(looks: list[float], monkeypatch: pytest.MonkeyPatch) -> None:

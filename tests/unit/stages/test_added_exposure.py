@@ -14,7 +14,15 @@ from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure, added_exposures
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.stages.fit.added_exposure import read_added_exposure, write_added_exposure
+from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.run.model_versions import (
+    AddedArrays,
+    keep_in_force,
+    model_in_force,
+    read_added_exposure,
+    verdict_version,
+    write_added_exposure,
+)
 from pchem_pipeline.store.run_store import RunStore
 
 MAPS = PixelMaps(*(np.full((6, 8), v) for v in (1.5, 0.1, 100.0, 3.0)), np.ones((6, 8), bool))
@@ -63,27 +71,41 @@ def test_an_effect_that_fails_is_named() -> None:
         added_exposures([Broken(row_noise_dn=1.0)], frames, np.arange(2), MAPS)
 
 
-def test_store_gives_it_back_to_the_model_that_it_belongs_to(tmp_path: Path) -> None:
+def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_take_it_over(
+    tmp_path: Path,
+) -> None:
     store = RunStore.create(tmp_path / "run.zarr")
+    store.create_array("histogram/origin", (8, 9), chunks=(8, 9))
     blinking, noise = DarkCurrentRts(fraction=0.1), RowNoise(row_noise_dn=1.0)
     exposure = np.zeros((2, 3, 4))
     exposure[1, 1, 2] = 0.8
     weight = np.stack([np.ones((3, 4)), np.zeros((3, 4))])
     weight[:, 1, 2] = 0.6, 0.4
-    kept = AddedExposure(exposure, weight)
-    write_added_exposure(store, kept, [noise, blinking], (2, 5), (3, 7))
-    whole = read_added_exposure(store, [blinking], (8, 9))
+    write_added_exposure(
+        store, "discrepancy", AddedExposure(exposure, weight), [noise, blinking], (2, 5), (3, 7)
+    )
+    plain = keep_in_force(store, model_in_force(store, ModelSettings()))
+    assert read_added_exposure(store, plain) is None
+    found = verdict_version(store, ModelSettings(effects=(blinking,)), plain, group="discrepancy")
+    found = keep_in_force(store, found)
+    store.delete("discrepancy")  # the version has its own
+    whole = read_added_exposure(store, found)
     assert whole is not None
     assert whole.exposure_e.shape == (2, 8, 9)
     assert np.argwhere(whole.exposure_e[1] > 0).tolist() == [[3, 5]]
     np.testing.assert_array_equal(whole.weight.sum(axis=0), 1.0)
-    part = read_added_exposure(store, [blinking, noise], (8, 9), (slice(3, 8), slice(4, 9)))
+    # a model by hand with the same effect and another one beside
+    both = keep_in_force(store, model_in_force(store, ModelSettings(effects=(blinking, noise))))
+    part = read_added_exposure(store, both, (slice(3, 8), slice(4, 9)))
     assert part is not None
     np.testing.assert_array_equal(part.exposure_e, whole.exposure_e[:, 3:8, 4:9])
     np.testing.assert_array_equal(part.weight, whole.weight[:, 3:8, 4:9])
+    assert both.number == 3
+    assert both.added is not None
+    assert both.added.group == "model/0002"
     # pixels that were not looked at, and models without the effect or with another of its kind
-    assert read_added_exposure(store, [blinking], (8, 9), (slice(5, 8), slice(None))) is None
-    assert read_added_exposure(store, [noise], (8, 9)) is None
-    assert read_added_exposure(store, [DarkCurrentRts(fraction=0.2)], (8, 9)) is None
-    write_added_exposure(store, None, [], (0, 8), (0, 9))
-    assert read_added_exposure(store, [blinking], (8, 9)) is None
+    assert read_added_exposure(store, both, (slice(5, 8), slice(None))) is None
+    for effect in (noise, DarkCurrentRts(fraction=0.2)):
+        assert model_in_force(store, ModelSettings(effects=(effect,))).added is None
+    write_added_exposure(store, "discrepancy", None, [], (0, 8), (0, 9))
+    assert AddedArrays.of_group(store, "discrepancy") is None

@@ -1,20 +1,9 @@
-"""Which part of a stack is looked at, and how the model grows in a YAML text."""
+"""Which part of a stack is looked at."""
 
 import numpy as np
 import pytest
 
-from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.config.grow import with_model_effects
-from pchem_pipeline.config.load import parse_config
 from pchem_pipeline.stages.discrepancy.discrepancy import choose_window, read_window
-
-TEXT = """# mine
-input: {files: [a.npy]}  # here
-fit:
-  # careful
-  tolerance: 1.0e-7
-"""
-ROW = {"tag": "row_noise", "row_noise_dn": 0.1}
 
 
 class Frames:
@@ -58,25 +47,3 @@ def test_frames_of_the_window_are_those_of_the_stack():
     window = type(window)(np.r_[0:40, 100:160], window.rows, window.columns)
     stack = read_window(source, window)
     assert np.array_equal(stack, source.values[window.numbers][:, 2:6, 3:8])
-
-
-def test_the_model_is_added_and_every_other_line_stays():
-    grown = with_model_effects(TEXT, [ROW], "a.yaml")
-    assert grown.startswith(TEXT)
-    assert [e.tag for e in parse_config(grown).model.effects] == ["row_noise"]
-    assert parse_config(grown).fit == parse_config(TEXT).fit
-
-
-def test_an_older_model_is_replaced():
-    first = with_model_effects(TEXT, [ROW], "a.yaml") + "run:\n  tile: 32\n"
-    second = with_model_effects(first, [{"tag": "clipping", "high": 900}, ROW], "a.yaml")
-    config = parse_config(second)
-    assert [e.tag for e in config.model.effects] == ["clipping", "row_noise"]
-    assert config.run.tile == 32
-    assert second.count("model:") == 1
-    assert with_model_effects(second, [], "a.yaml").count("tag") == 0
-
-
-def test_a_text_that_would_break_is_refused():
-    with pytest.raises(ConfigError):
-        with_model_effects("input: [", [ROW], "a.yaml")

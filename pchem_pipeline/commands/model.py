@@ -1,0 +1,218 @@
+"""``pchem model``: the versions of a run's model, which of them is in force, and what rests on each."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.config.edit import write_model
+from pchem_pipeline.config.load import dump_config, load_config
+from pchem_pipeline.discrepancy.verdict import parameters_of, read_verdict
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.run.model_versions import (
+    ModelVersion,
+    keep_in_force,
+    model_in_force,
+    model_of,
+    model_versions,
+    verdict_version,
+    version_with,
+)
+from pchem_pipeline.run.session import run_status
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.remote_path import place_of
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = [
+    "ListedModel",
+    "adopt_verdict",
+    "list_models",
+    "model_lines",
+    "models_json",
+    "use_model",
+    "yaml_of",
+]
+
+_SEARCH = "discrepancy"
+
+
+@dataclass(frozen=True)
+class ListedModel:
+    """A version of the model as it is listed.
+
+    Attributes:
+        version: of the model.
+        current: whether it is in force.
+        results: stages whose results rest on it.
+    """
+
+    version: ModelVersion
+    current: bool
+    results: tuple[str, ...]
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as JSON data."""
+        version = self.version
+        return {
+            "number": version.number,
+            "current": self.current,
+            "model": version.model,
+            "source": version.source,
+            "parent": version.parent,
+            "closed_fraction": version.closed_fraction,
+            "made": version.made,
+            "digest": version.digest,
+            "results": list(self.results),
+        }
+
+
+def list_models(target: Target) -> list[ListedModel]:
+    """Return the versions of the model of a run; one that is in the YAML but not in the run yet comes last.
+
+    Raises:
+        StoreError: there is no run, or it is damaged.
+    """
+    store = RunStore.open(target.store)
+    current = model_in_force(store, target.config.model)
+    versions = {version.number: version for version in (*model_versions(store), current)}
+    states = run_status(target)
+    return [
+        ListedModel(
+            version, number == current.number, tuple(state.stage for state in states if state.model == number)
+        )
+        for number, version in versions.items()
+    ]
+
+
+def model_lines(models: Sequence[ListedModel]) -> list[str]:
+    """Return a table of the versions of a model."""
+    rows = [("model", "source", "gap closed", "results", "effects")]
+    for each in models:
+        version = each.version
+        closed = "" if version.closed_fraction is None else f"{100 * version.closed_fraction:.1f} %"
+        source = f"verdict on {version.parent}" if version.source == "verdict" else version.source
+        results = ", ".join(each.results) or "-"
+        number = f"{'*' if each.current else ' '} {version.number}"
+        rows.append((number, source, closed, results, _words(version)))
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
+    return ["  ".join([*map(str.ljust, row, widths), row[-1]]) for row in rows]
+
+
+def _words(version: ModelVersion) -> str:
+    """Return the model in words, with the strengths of its effects."""
+    try:
+        effects = version.effects
+    except ConfigError:
+        return ", ".join(str(effect.get("tag")) for effect in version.model["effects"])
+    aside = [f"without {len(version.settings.set_aside_e)} intervals"] if version.settings.set_aside_e else []
+    return " + ".join(["PCD", *map(_effect_words, effects), *aside])
+
+
+def _effect_words(effect: Effect) -> str:
+    if not effect.strength:
+        return effect.tag
+    strength = parameters_of(effect, math.nan)[effect.strength]
+    return f"{effect.tag} {strength.value:.4g} {strength.unit}".rstrip()
+
+
+def use_model(target: Target, number: int) -> str:
+    """Put a version of the model in force, in store and YAML; return in words what is stale thereby.
+
+    Args:
+        target: the run.
+        number: of the version.
+
+    Raises:
+        ConfigError: there is no such version, or the YAML cannot be edited.
+        LockedError: another process works on the run.
+        StoreError: there is no run, or it or the YAML cannot be written.
+    """
+    store = RunStore.open(target.store, writable=True)
+    with store.locked():
+        before = _kept(store, target)
+        version = version_with(store, number)
+        changed = _put_in_force(store, target, version)
+    what = "is in force" if before.number != number else "was in force already"
+    return "\n".join([f"model {number} {what}: {_words(version)}", *_stale_lines(changed)])
+
+
+def _stale_lines(target: Target) -> list[str]:
+    """Say which results are stale, and what does them again."""
+    stale = [state.stage for state in run_status(target) if state.state == "stale"]
+    place = quoted(yaml_of(target) or target.store)
+    usual = [name for name in stale if not STAGES[name].on_demand]
+    lines = [f"stale: {', '.join(usual)}; to do them again: pchem run {place}"] if usual else []
+    lines += [f"stale: {name}; to do it again: pchem {name} {place}" for name in stale if name not in usual]
+    return lines or ["nothing is stale"]
+
+
+def yaml_of(target: Target) -> Path | None:
+    """Return the YAML of a run, where it is there and is of this run: that of a copy names the first one's.
+
+    Raises:
+        ConfigError: it is no configuration.
+    """
+    path = target.config_path
+    if path is None or not path.exists():
+        return None
+    written = place_of(load_config(path).run.store, path.parent)
+    return path if written.resolve() == place_of(target.store).resolve() else None
+
+
+def _kept(store: RunStore, target: Target) -> ModelVersion:
+    """Return the version in force; what stands in the YAML and no command has seen yet becomes one, too."""
+    path = yaml_of(target)
+    if path is not None:
+        keep_in_force(store, model_in_force(store, load_config(path).model))
+    return keep_in_force(store, model_in_force(store, target.config.model))
+
+
+def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> Target:
+    """Put a version in force; the YAML first, which may be refused."""
+    settings, path = version.settings, yaml_of(target)
+    if path is not None:
+        write_model(path, settings)
+    config = target.config.model_copy(update={"model": settings})
+    store.write_config(dump_config(config))
+    keep_in_force(store, version)
+    return replace(target, config=config)
+
+
+def adopt_verdict(target: Target) -> tuple[Target, ModelVersion | None]:
+    """Make the model of a run's verdict a version, and put it in force, in the store and in the YAML.
+
+    Args:
+        target: a run whose search is complete.
+
+    Returns:
+        The run with that model; the version, None where the verdict leaves the model as it is.
+
+    Raises:
+        ConfigError: the YAML cannot be edited.
+        LockedError: another process works on the run.
+        StoreError: the store or the YAML cannot be written.
+    """
+    store = RunStore.open(target.store, writable=True)
+    with store.locked():
+        before = _kept(store, target)
+        start, found = model_of(store, _SEARCH), read_verdict(store.path)
+        if start is None or found is None:
+            return target, None
+        aside = found.set_aside or start.model["set_aside_e"]
+        settings = ModelSettings.model_validate({"effects": found.model_effects, "set_aside_e": aside})
+        closed = found.gap.closed_fraction if math.isfinite(found.gap.closed_fraction) else None
+        version = verdict_version(store, settings, start, group=_SEARCH, closed_fraction=closed)
+        if version.digest == before.digest:
+            return target, None
+        return _put_in_force(store, target, version), version
+
+
+def models_json(models: Sequence[ListedModel]) -> str:
+    """Return the versions of a model as one line of JSON."""
+    return json.dumps({"models": [each.to_json() for each in models]})

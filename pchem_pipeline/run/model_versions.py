@@ -1,0 +1,413 @@
+"""The model of a run as an artefact: numbered versions, of which one is in force.
+
+A version is made from the section ``model`` of the YAML, or by a verdict of the search for a discrepancy. It
+lies in the store, ``model/0002.json``, with the arrays that belong to it in the group ``model/0002``; it is
+written whole and never changed, and the same model makes no second one. ``model/current.json`` names the
+version in force. The stages read it and nothing that a later stage wrote; what they make of it names it in
+its fingerprint by its digest, in its record by its number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.store.files import read_json, write_json
+from pchem_pipeline.store.records import fingerprint_of
+
+if TYPE_CHECKING:
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = [
+    "AddedArrays",
+    "ModelVersion",
+    "keep_in_force",
+    "model_in_force",
+    "model_of",
+    "model_of_content",
+    "model_versions",
+    "present_content",
+    "read_added_exposure",
+    "verdict_version",
+    "version_with",
+    "with_digest",
+    "write_added_exposure",
+]
+
+_GROUP = "model"
+_EXPOSURE, _WEIGHT = "added_exposure", "added_weight"
+Region = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class AddedArrays:
+    """Where the exposure lies that effects of a model add to single pixels.
+
+    Attributes:
+        group: of the store, with ``added_exposure`` and ``added_weight``.
+        rows: of the window that they cover, first and end.
+        columns: likewise.
+        effects: those that add it, as JSON data: it counts for nothing under a model without them.
+        digest: of the arrays.
+    """
+
+    group: str
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    effects: tuple[dict[str, Any], ...]
+    digest: str
+
+    @classmethod
+    def of_group(cls, store: RunStore, group: str) -> AddedArrays | None:
+        """Return those of a group; None where it has none."""
+        values = store.attributes(f"{group}/{_EXPOSURE}")
+        if not values:
+            return None
+        rows, columns = (tuple(values[name]) for name in ("rows", "columns"))
+        return cls(group, rows, columns, tuple(values["effects"]), values["digest"])
+
+
+@dataclass(frozen=True)
+class ModelVersion:
+    """One version of the model.
+
+    Attributes:
+        number: from 1.
+        model: the section of the YAML, as JSON data.
+        digest: of the section and of the arrays.
+        source: config | verdict.
+        parent: number of the version in force before; of a verdict, the one that the search started from.
+        closed_fraction: of a verdict, the fraction of the gap that it closed.
+        made: UTC time, ISO 8601; empty while it is not in the store.
+        added: exposure that the effects add to pixels; None: it counts as part of H.
+    """
+
+    number: int
+    model: dict[str, Any]
+    digest: str
+    source: str = "config"
+    parent: int | None = None
+    closed_fraction: float | None = None
+    made: str = ""
+    added: AddedArrays | None = None
+
+    @property
+    def settings(self) -> ModelSettings:
+        """The section of the YAML.
+
+        Raises:
+            ConfigError: an effect came from a package that is no longer there.
+        """
+        try:
+            return ModelSettings.model_validate(self.model)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+            raise ConfigError(
+                f"model {self.number} of the run: {reason}; install what it needs, or take another one with: "
+                "pchem model --use"
+            ) from error
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Its effects, in their order."""
+        return self.settings.effects
+
+    def holds(self, settings: ModelSettings) -> bool:
+        """Tell whether it is the model of these settings, whatever they were written with."""
+        if self.model == settings.model_dump(mode="json"):
+            return True
+        try:
+            return self.settings == settings
+        except ConfigError:
+            return False
+
+
+def _version(number: int, settings: ModelSettings, added: AddedArrays | None, **facts: Any) -> ModelVersion:
+    return _version_of(number, settings.model_dump(mode="json"), added, **facts)
+
+
+def _version_of(number: int, model: dict[str, Any], added: AddedArrays | None, **facts: Any) -> ModelVersion:
+    digest = _digest(model, None if added is None else added.digest)
+    return ModelVersion(number, model, digest, added=added, **facts)
+
+
+def _digest(model: Mapping[str, Any], added: str | None) -> str:
+    return fingerprint_of({"model": model, "added_exposure": added})
+
+
+def model_versions(store: RunStore) -> tuple[ModelVersion, ...]:
+    """Return the versions of a run, by number; of a run of 0.1 those that its records tell of.
+
+    Raises:
+        StoreError: a version is damaged.
+    """
+    folder = store.path / _GROUP
+    places = sorted(folder.glob("[0-9]*.json")) if folder.is_dir() else []
+    found = []
+    for place in places:
+        content: Any = read_json(place)
+        try:
+            added = content["added"]
+            found.append(
+                ModelVersion(**{**content, "added": None if added is None else AddedArrays(**added)})
+            )
+        except (KeyError, TypeError) as error:
+            raise StoreError(
+                f"{place} is damaged ({error}); delete it: the model is taken from the YAML"
+            ) from error
+    return tuple(found) or _versions_of_0_1(store)
+
+
+def version_with(store: RunStore, number: int) -> ModelVersion:
+    """Return a version of a run.
+
+    Raises:
+        ConfigError: there is no such version.
+    """
+    versions = model_versions(store)
+    for version in versions:
+        if version.number == number:
+            return version
+    have = ", ".join(str(version.number) for version in versions) or "none"
+    raise ConfigError(f"{store.path} has no model {number}; it has: {have}")
+
+
+def with_digest(versions: Sequence[ModelVersion], digest: str | None) -> ModelVersion | None:
+    """Return the version with a digest; None where there is none."""
+    return next((version for version in versions if version.digest == digest), None)
+
+
+def model_in_force(store: RunStore, settings: ModelSettings) -> ModelVersion:
+    """Return the version that the section ``model`` of a configuration means; reads only.
+
+    It is the current one where that is what the section says, else the latest that is; else a new one, which
+    takes over what the latest version knows of the exposure that the same effects add.
+
+    Args:
+        store: the run.
+        settings: the section.
+    """
+    versions = model_versions(store)
+    number = (read_json(store.path / _GROUP / "current.json") or {}).get("number")
+    fitting = [version for version in versions if version.holds(settings)]
+    for version in fitting:
+        if version.number == number:
+            return version
+    if fitting:
+        return fitting[-1]
+    effects = [effect.model_dump(mode="json") for effect in settings.effects]
+    known = [v.added for v in versions if v.added is not None and all(e in effects for e in v.added.effects)]
+    return _version(_next(versions), settings, known[-1] if known else None, parent=number)
+
+
+def _next(versions: Sequence[ModelVersion]) -> int:
+    return versions[-1].number + 1 if versions else 1
+
+
+def verdict_version(
+    store: RunStore,
+    settings: ModelSettings,
+    start: ModelVersion,
+    *,
+    group: str = "",
+    closed_fraction: float | None = None,
+) -> ModelVersion:
+    """Return the version that a verdict makes: one that is there, or a new one; reads only.
+
+    Args:
+        store: the run.
+        settings: the model of the verdict.
+        start: the version that the search started from.
+        group: of the store, where the search left what the effects add to pixels.
+        closed_fraction: of the gap.
+    """
+    versions = model_versions(store)
+    added = AddedArrays.of_group(store, group) if group else None
+    facts = {"source": "verdict", "parent": start.number, "closed_fraction": closed_fraction}
+    new = _version(_next(versions), settings, added, **facts)
+    return with_digest(versions, new.digest) or new
+
+
+def keep_in_force(store: RunStore, version: ModelVersion) -> ModelVersion:
+    """Put a version in force, and into the store where it is not there yet; return it as it is there.
+
+    Raises:
+        StoreError: the store refuses.
+    """
+    found = {each.number: each for each in (*model_versions(store), version)}
+    found = {number: each if each.made else _keep(store, each) for number, each in found.items()}
+    place = store.path / _GROUP / "current.json"
+    if read_json(place) != {"number": version.number}:
+        write_json(place, {"number": version.number})
+    return found[version.number]
+
+
+def _keep(store: RunStore, version: ModelVersion) -> ModelVersion:
+    """Write a version: its arrays, then what makes it one."""
+    name = f"{_GROUP}/{version.number:04}"
+    store.delete(name)  # what a command that was killed may have left
+    if version.added is not None and not version.added.group.startswith(f"{_GROUP}/"):
+        for array in (_WEIGHT, _EXPOSURE):
+            values = store.read(f"{version.added.group}/{array}")
+            store.write_array(f"{name}/{array}", values, _attributes(version.added))
+        version = replace(version, added=replace(version.added, group=name))
+    version = replace(version, made=datetime.now(UTC).isoformat(timespec="seconds"))
+    write_json(store.path / f"{name}.json", asdict(version))
+    return version
+
+
+def _attributes(added: AddedArrays) -> dict[str, Any]:
+    return {
+        "rows": list(added.rows),
+        "columns": list(added.columns),
+        "effects": list(added.effects),
+        "digest": added.digest,
+    }
+
+
+# -- what results rest on ------------------------------------------------------------------------
+
+
+def model_of(store: RunStore, stage: str) -> ModelVersion | None:
+    """Return the version that the stored result of a stage which reads the model rests on.
+
+    That is the model of its maps, whatever the configuration says by now.
+    """
+    record = store.records.read(stage)
+    return None if record is None else model_of_content(store, record.content)
+
+
+def model_of_content(store: RunStore, content: dict[str, Any]) -> ModelVersion | None:
+    """Return the version that stands in what decided a result; None where none does."""
+    given = present_content(store, content).get("input") or {}
+    return with_digest(model_versions(store), given["model"]) if "model" in given else None
+
+
+def present_content(store: RunStore, content: dict[str, Any]) -> dict[str, Any]:
+    """Return what decided a result as this version of the program says it: 0.1 had no versions of the model.
+
+    There the fit read the section of the YAML and the digest of the arrays, the search a list of effects.
+    """
+    given = dict(content.get("input") or {})
+    settings = dict(content.get("settings") or {})
+    if content.get("stage") == "fit" and "model" in settings:
+        given["model"] = _digest(_section(settings.pop("model")), given.pop("added_exposure", None))
+        return {**content, "settings": settings, "input": given}
+    if isinstance(given.get("model"), list):
+        found = [v for v in model_versions(store) if v.model["effects"] == given["model"]]
+        return {**content, "input": {**given, "model": found[0].digest if found else None}}
+    return content
+
+
+def _section(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the JSON data of a section as it would be written now."""
+    try:
+        return ModelSettings.model_validate(model).model_dump(mode="json")
+    except ValidationError:
+        return dict(model)
+
+
+def _versions_of_0_1(store: RunStore) -> tuple[ModelVersion, ...]:
+    """Return the models that a run of 0.1 had: before its verdict, after it, and that of its fit."""
+    record = store.records.read("fit")
+    fit = {} if record is None else dict(record.content)
+    fitted = (fit.get("settings") or {}).get("model")
+    kept = store.attributes("discrepancy")
+    found: list[ModelVersion] = []
+    arrays = AddedArrays.of_group(store, "discrepancy")
+    aside = (fitted or {}).get("set_aside_e", [])
+    told: list[tuple[dict[str, Any], AddedArrays | None, dict[str, Any]]] = []
+    if "model_before" in kept:
+        told.append(({"effects": kept["model_before"], "set_aside_e": aside}, None, {}))
+        facts = {"source": "verdict", "parent": 1}
+        told.append(({"effects": kept["model_after"], "set_aside_e": aside}, arrays, facts))
+    if fitted is not None:
+        taken = (fit.get("input") or {}).get("added_exposure")
+        told.append((fitted, arrays if arrays is not None and arrays.digest == taken else None, {}))
+    for model, added, facts in told:
+        version = _version_of(_next(found), _section(model), added, **facts)
+        if with_digest(found, version.digest) is None:
+            found.append(version)
+    return tuple(found)
+
+
+# -- exposure that effects add to single pixels ---------------------------------------------------
+
+
+def write_added_exposure(
+    store: RunStore,
+    group: str,
+    added: AddedExposure | None,
+    effects: Sequence[Effect],
+    rows: tuple[int, int],
+    columns: tuple[int, int],
+) -> None:
+    """Keep what effects add in a window of the sensor, or that they add nothing.
+
+    Args:
+        store: the run.
+        group: where to keep it.
+        added: (j, y, x) of the window; None: nothing.
+        effects: of the model.
+        rows: of the window, first and end.
+        columns: likewise.
+    """
+    for name in (_EXPOSURE, _WEIGHT):
+        store.delete(f"{group}/{name}")
+    if added is None:
+        return
+    arrays = [np.ascontiguousarray(values, np.float64) for values in added]
+    digest = hashlib.sha256(b"".join(values.tobytes() for values in arrays)).hexdigest()
+    adding = tuple(e.model_dump(mode="json") for e in effects if _adds(e))
+    store.write_array(f"{group}/{_WEIGHT}", arrays[1])
+    facts = AddedArrays(group, rows, columns, adding, digest)
+    store.write_array(f"{group}/{_EXPOSURE}", arrays[0], _attributes(facts))
+
+
+def _adds(effect: Effect) -> bool:
+    return type(effect).added_exposure is not Effect.added_exposure
+
+
+def read_added_exposure(
+    store: RunStore, version: ModelVersion | None, region: Region | None = None
+) -> AddedExposure | None:
+    """Return what the effects of a model add to the pixels of a region, or None where that is nothing.
+
+    Args:
+        store: the run.
+        version: of the model; None: a plain one.
+        region: of the sensor; None: all of it.
+    """
+    if version is None or version.added is None:
+        return None
+    shape = store.array("histogram/origin").shape
+    window = [slice(*version.added.rows), slice(*version.added.columns)]
+    wanted = [
+        slice(*part.indices(n)[:2])
+        for part, n in zip(region or (slice(None), slice(None)), shape, strict=True)
+    ]
+    common = [slice(max(w.start, p.start), min(w.stop, p.stop)) for w, p in zip(window, wanted, strict=True)]
+    if any(c.start >= c.stop for c in common):
+        return None
+    inside = tuple(slice(c.start - w.start, c.stop - w.start) for c, w in zip(common, window, strict=True))
+    place = tuple(slice(c.start - p.start, c.stop - p.start) for c, p in zip(common, wanted, strict=True))
+    found: list[NDArray[np.float64]] = []
+    for name in (_EXPOSURE, _WEIGHT):
+        part = store.read(f"{version.added.group}/{name}", (slice(None), *inside))
+        whole = np.zeros((part.shape[0], *(p.stop - p.start for p in wanted)))
+        if name == _WEIGHT:
+            whole[0] = 1.0
+        whole[(slice(None), *place)] = part
+        found.append(whole)
+    return AddedExposure(found[0], found[1])
