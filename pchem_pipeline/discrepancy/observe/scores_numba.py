@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.discrepancy.observe.law_numba import N_COLUMNS, N_NUISANCE, N_TESTS
+from pchem_pipeline.discrepancy.observe.law_numba import N_COLUMNS, N_NUISANCE, N_TESTS, fill_zeros
 
 __all__ = ["pixel_scores", "whiten"]
 
@@ -39,7 +39,7 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
     Returns:
         False if the parameters cannot be told apart.
     """
-    gram[:] = 0.0
+    fill_zeros(gram)
     for x in range(law.shape[0]):
         row, scale = law[x], inverse[x]
         for i in range(N_NUISANCE):
@@ -69,7 +69,7 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
 @kernel
 def _fit_covariance(gram: FloatArray, covariance: FloatArray, inverse: FloatArray) -> None:
     """Fill the covariance of the fit, times n, along C1, He1, He1 C1, He2 from the triangular factor."""
-    inverse[:] = 0.0
+    fill_zeros(inverse)
     for j in range(_N_DIRECTIONS):
         inverse[j, j] = 1.0 / gram[j + 1, j + 1]
         for i in range(j - 1, -1, -1):
@@ -149,4 +149,5 @@ def pixel_scores(
             out[1, i] = third[i] / (variance * math.sqrt(variance * n))
             out[2, i] = (fourth[i] / (variance * variance) - 3.0) / n
         else:
-            out[:, i] = math.nan
+            for row in range(out.shape[0]):
+                out[row, i] = math.nan

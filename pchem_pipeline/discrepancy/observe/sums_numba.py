@@ -148,6 +148,15 @@ def _add_neighbours(
 
 
 @kernel
+def _keep_last(values: Float32Array, size: int) -> None:
+    """Move the last frames of a chunk to where the next chunk looks for those before it."""
+    for j in range(LAGS):
+        for y in range(values.shape[1]):
+            for x in range(values.shape[2]):
+                values[j, y, x] = values[size + j, y, x]
+
+
+@kernel
 def sum_block(
     frames: NDArray[Any],
     support: NDArray[np.int32],
@@ -211,9 +220,8 @@ def sum_block(
             if y < ny - 1:
                 _add_neighbours(charge, readout, y, 1, 0, size, below)
         done += size
-        for j in range(LAGS):
-            charge[j] = charge[size + j]
-            readout[j] = readout[size + j]
+        _keep_last(charge, size)
+        _keep_last(readout, size)
 
 
 @kernel

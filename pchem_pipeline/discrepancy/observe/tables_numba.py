@@ -33,6 +33,14 @@ _FOLD = 16
 
 
 @kernel
+def _total(values: NDArray[Any]) -> float:
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+@kernel
 def _goodness(
     law: FloatArray, seen: FloatArray, expected: FloatArray, n: float, smallest: float
 ) -> tuple[float, float, float]:
@@ -172,7 +180,8 @@ def _count(
     counts: NDArray[Any], origin: int, first: int, seen: FloatArray, axis: int, codes: FloatArray
 ) -> tuple[float, float]:
     """Spread a histogram over the support; return how many samples lie below and above it."""
-    seen[:] = 0.0
+    for x in range(seen.size):
+        seen[x] = 0.0
     low = high = 0.0
     for b in range(counts.size):
         c = float(counts[b])
@@ -280,7 +289,7 @@ def summarise_pixels(
         exposure, step, bias, width = parameters[p]
         full = np.empty((window[p, 1] - window[p, 0] + 1, N_COLUMNS))
         fill_law(exposure, step, bias - window[p, 0], width, electrons[p, 0], electrons[p, 1], full)
-        n = outside[p, 0] + outside[p, 1] + counts[p].sum()
+        n = outside[p, 0] + outside[p, 1] + _total(counts[p])
         low, high, below, above = within(full, n, allowed)
         law, first = full[low : high + 1], window[p, 0] + low
         size = high - low + 1
@@ -301,7 +310,7 @@ def summarise_pixels(
                 codes[1, at] += expected[x - low] if low <= x <= high else n * full[x, 0]
         pixel_scores(law, inverse, seen, gram, exposure, scores[p])
         out = moments[p]
-        inside = seen.sum()
+        inside = _total(seen)
         out[CHI2], out[CHI2_MEAN], out[CHI2_VARIANCE] = _goodness(law, seen, expected, inside, 5.0)
         out[EXPECTED_LOW], out[EXPECTED_HIGH] = below, above
         out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
