@@ -68,7 +68,13 @@ class FrameStream:
     """
 
     def __init__(
-        self, source: FrameSource, bands: Sequence[Rows], step: int, *, first: int = 0, threads: int = 1
+        self,
+        source: FrameSource,
+        bands: Sequence[Rows],
+        step: int,
+        *,
+        frames: tuple[int, int] | None = None,
+        threads: int = 1,
     ) -> None:
         """Take the memory, two blocks; nothing is read yet.
 
@@ -76,16 +82,17 @@ class FrameStream:
             source: the frames.
             bands: the rows that are wanted, by bands.
             step: frames in a block; blocks end at multiples of it, the last one may be shorter.
-            first: frame to begin with.
+            frames: first frame and end of those that are wanted; None: all.
             threads: threads that share the reading of a block (coded files cost time to decode).
         """
         self.bands = bands
         self._source, self._threads = source, threads
-        self._n_frames, _, columns = source.shape
-        self._step = min(step, self._n_frames)
-        self._first, self._skipped = first, first // self._step
+        n_frames, _, columns = source.shape
+        self._first, self._end = frames or (0, n_frames)
+        self._step, self._skipped = step, self._first // step
+        longest = min(step, self._end - self._first)
         self._buffers = [
-            [np.empty((self._step, y1 - y0, columns), source.dtype) for y0, y1 in bands] for _ in range(2)
+            [np.empty((longest, y1 - y0, columns), source.dtype) for y0, y1 in bands] for _ in range(2)
         ]
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="read")
 
@@ -100,7 +107,7 @@ class FrameStream:
     @property
     def n_blocks(self) -> int:
         """Number of blocks."""
-        return -(-self._n_frames // self._step) - self._skipped
+        return -(-self._end // self._step) - self._skipped if self._end > self._first else 0
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks; each is overwritten after the next one was asked for."""
@@ -120,7 +127,7 @@ class FrameStream:
     def _frames(self, number: int) -> tuple[int, int]:
         """Return the first frame of a block, and its end."""
         start = (number + self._skipped) * self._step
-        return max(start, self._first), min(start + self._step, self._n_frames)
+        return max(start, self._first), min(start + self._step, self._end)
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
         """Read frames t0..t1 into the parts, one for each band."""
@@ -141,7 +148,7 @@ class HashedFrameStream(FrameStream):
 
     def __init__(
         self,
-        frames: FrameSequence,
+        stack: FrameSequence,
         bands: Sequence[Rows],
         step: int,
         *,
@@ -153,7 +160,7 @@ class HashedFrameStream(FrameStream):
         """Take the memory; nothing is read yet.
 
         Args:
-            frames: the stack.
+            stack: the frames.
             bands: bands that cover all rows, from top to bottom.
             step: see `FrameStream`.
             files: all files that decide what is read, in reading order; among them those of the frames from
@@ -162,8 +169,8 @@ class HashedFrameStream(FrameStream):
             threads: threads that decode, where there is something to decode.
             advance: told of the number of bytes that were hashed.
         """
-        super().__init__(frames, bands, step, first=first, threads=threads)
-        self._stack = frames
+        super().__init__(stack, bands, step, frames=(first, stack.shape[0]), threads=threads)
+        self._stack = stack
         self._hashers = {path: FileHasher(path, advance) for path in files}
         self._sizes: dict[Path, int] = {}
 

@@ -19,7 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.frames.stream import FrameSource
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
@@ -181,17 +181,15 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     """Return the frames of a window, (frame, y, x), DN."""
     (y0, y1), (x0, x1) = window.rows, window.columns
     stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
+    # not more at once than a few dozen megabytes, whatever the width of the sensor
+    step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
     breaks = np.flatnonzero(np.diff(window.numbers) != 1) + 1
-    at = 0
-    for run_ in np.split(window.numbers, breaks):
-        # not more at once than a few dozen megabytes, whatever the width of the sensor
-        step = max(1, (1 << 24) // ((y1 - y0) * source.shape[2]))
-        for first in range(int(run_[0]), int(run_[-1]) + 1, step):
-            last = min(first + step, int(run_[-1]) + 1)
-            block = np.empty((last - first, y1 - y0, source.shape[2]), source.dtype)
-            source.read_into(block, first, last, y0, y1)
-            stack[at : at + last - first] = block[:, :, x0:x1]
-            at += last - first
+    for part in np.split(np.arange(window.numbers.size), breaks):
+        frames = int(window.numbers[part[0]]), int(window.numbers[part[-1]]) + 1
+        with FrameStream(source, [window.rows], step, frames=frames) as stream:
+            for first, (block,) in stream:
+                at = int(part[0]) + first - frames[0]
+                stack[at : at + block.shape[0]] = block[:, :, x0:x1]
     return stack
 
 

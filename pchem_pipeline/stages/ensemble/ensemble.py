@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS
+from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers, electron_numbers
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.errors.fisher import covariance_from
@@ -222,16 +222,10 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     return {}
 
 
-def _blocks(job: _Job, band: Band, frames: tuple[int, int]) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield first frame and frames of each block of a band; each is overwritten by the next."""
+def _stream(job: _Job, band: Band, frames: tuple[int, int]) -> FrameStream:
+    """Open the stream of the frames of a band."""
     assert job.source is not None
-    first, end = frames
-    shape = (min(_BLOCK_FRAMES, end - first), band.y1 - band.y0, job.source.shape[2])
-    buffer = np.empty(shape, dtype=job.source.dtype)
-    for t in range(first, end, _BLOCK_FRAMES):
-        block = buffer[: min(_BLOCK_FRAMES, end - t)]
-        job.source.read_into(block, t, t + block.shape[0], band.y0, band.y1)
-        yield t, block
+    return FrameStream(job.source, [(band.y0, band.y1)], _BLOCK_FRAMES, frames=frames)
 
 
 def _count(
@@ -241,8 +235,9 @@ def _count(
     assert job.frames is not None
     counts = np.zeros_like(like)
     under, over = np.zeros((2, *origin.shape), dtype=np.uint32)
-    for _, block in _blocks(job, band, job.frames):
-        count_frames(block, origin, counts, under, over)
+    with _stream(job, band, job.frames) as stream:
+        for _, (block,) in stream:
+            count_frames(block, origin, counts, under, over)
     return counts, under + over
 
 
@@ -254,14 +249,17 @@ def _compare(job: _Job, band: Band, maps: tuple[NDArray[np.float64], ...]) -> di
     first, end = job.frames or (0, job.source.shape[0])
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}
+    if known <= first:
+        return found
     columns = slice(x0, x0 + job.source.shape[2])
-    for t, block in _blocks(job, band, (first, known)) if known > first else ():
-        times = slice(t0 + t, t0 + t + block.shape[0])
-        true = store.read("truth/electron_number", (times, slice(y0 + band.y0, y0 + band.y1), columns))
-        numbers = electron_numbers(block, *maps)
-        for key in band.keys:
-            tile = job.tiles[key][1]
-            part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
-            tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
-            found[key] = found[key] + tally if key in found else tally
+    with _stream(job, band, (first, known)) as stream:
+        for t, (block,) in stream:
+            times = slice(t0 + t, t0 + t + block.shape[0])
+            true = store.read("truth/electron_number", (times, slice(y0 + band.y0, y0 + band.y1), columns))
+            numbers = electron_numbers(block, *maps)
+            for key in band.keys:
+                tile = job.tiles[key][1]
+                part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
+                tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
+                found[key] = found[key] + tally if key in found else tally
     return found

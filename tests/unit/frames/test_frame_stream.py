@@ -31,24 +31,25 @@ FRAMES = np.arange(21 * 7 * 3, dtype=np.uint16).reshape(21, 7, 3)
 
 @given(
     step=st.integers(1, 30),
-    first=st.integers(0, 20),
+    frames=st.tuples(st.integers(0, 21), st.integers(0, 21)).map(sorted).map(tuple),
     threads=st.integers(1, 4),
     cuts=st.lists(st.integers(0, 7), min_size=2, unique=True).map(sorted),
 )
-def test_every_frame_of_every_band_comes_once(step, first, threads, cuts):
+def test_every_frame_of_every_band_comes_once(step, frames, threads, cuts):
     bands = list(pairwise(cuts))
-    with FrameStream(_Source(FRAMES), bands, step, first=first, threads=threads) as stream:
+    with FrameStream(_Source(FRAMES), bands, step, frames=frames, threads=threads) as stream:
         assert stream.bands == bands
         blocks = [(t0, [part.copy() for part in parts]) for t0, parts in stream]
         assert len(blocks) == stream.n_blocks
-    t = first
+        assert all(part.shape[0] for _, parts in blocks for part in parts)
+    t, last = frames
     for t0, parts in blocks:
         assert t0 == t
-        end = min(t0 - t0 % step + step, 21)  # blocks end at multiples of the step
+        end = min(t0 - t0 % step + step, last)  # blocks end at multiples of the step
         for rows, part in zip(bands, parts, strict=True):
             np.testing.assert_array_equal(part, FRAMES[t0:end, slice(*rows)])
         t = end
-    assert t == 21
+    assert t == last
 
 
 def test_the_next_block_is_read_while_one_is_used():
