@@ -28,11 +28,12 @@ from pchem_pipeline.model.histogram.count_numba import (
 __all__ = [
     "MINIMUM_BINS",
     "HistogramAccumulator",
-    "RangeAccumulator",
     "RowHistograms",
     "choose_bins",
     "counts_dtype",
     "histogram_frames",
+    "most_bins",
+    "pixels_by_range",
 ]
 
 #: Smallest number of bins.
@@ -152,35 +153,33 @@ class HistogramAccumulator:
         )
 
 
-class RangeAccumulator:
-    """How many pixels need how wide a window, from the first frames of a stack."""
-
-    def __init__(self, shape: tuple[int, int], dtype: np.dtype[Any], n_frames: int) -> None:
-        """Begin with no frames.
-
-        Args:
-            shape: rows and columns.
-            dtype: type of the frames.
-            n_frames: number of frames to come; the more, the more glitches are left out.
-        """
-        depth = 1 + min(_TRIM, n_frames // _FRAMES_PER_TRIM)
-        self._low = np.full((depth, *shape), np.iinfo(dtype).max, dtype)
-        self._high = np.zeros((depth, *shape), dtype)
-
-    def add(self, frames: _Frames) -> None:
-        """Look at a block of frames, (frame, y, x)."""
-        update_extremes(frames, self._low, self._high)
-
-    def finish(self, max_bins: int) -> NDArray[np.int64]:
-        """Return the number of pixels by range in DN; the last element is for all above ``max_bins``.
-
-        The sum over all rows of the sensor goes to `choose_bins`; its order does not matter.
-        """
-        widths = self._high[-1].astype(np.int64) - self._low[-1].astype(np.int64) + 1
-        return np.bincount(np.clip(widths, 1, max_bins + 1).ravel(), minlength=max_bins + 2)
+def most_bins(max_bins: int, dtype: np.dtype[Any]) -> int:
+    """Return the largest number of bins that pixels of a type may get, at most ``max_bins``."""
+    return min(max_bins, 1 << (8 * dtype.itemsize))
 
 
-def choose_bins(pixels_by_range: NDArray[np.int64], max_bins: int) -> int:
+def pixels_by_range(frames: _Frames, max_bins: int) -> NDArray[np.int64]:
+    """Return how many pixels have which range of DN in the first frames of a stack, glitches left out.
+
+    Of each pixel the most extreme samples are left out, the more the more frames there are. The sum over all
+    rows of the sensor goes to `choose_bins`.
+
+    Args:
+        frames: the first frames, (frame, y, x).
+        max_bins: upper limit of the bins.
+
+    Returns:
+        Number of pixels by range in DN, (max_bins + 2,); the last element is for all above ``max_bins``.
+    """
+    depth = 1 + min(_TRIM, frames.shape[0] // _FRAMES_PER_TRIM)
+    low = np.full((depth, *frames.shape[1:]), np.iinfo(frames.dtype).max, frames.dtype)
+    high = np.zeros_like(low)
+    update_extremes(frames, low, high)
+    widths = high[-1].astype(np.int64) - low[-1].astype(np.int64) + 1
+    return np.bincount(np.clip(widths, 1, max_bins + 1).ravel(), minlength=max_bins + 2)
+
+
+def choose_bins(pixels: NDArray[np.int64], max_bins: int) -> int:
     """Return the number of bins that suits a sensor: the typical pixels, and the hot ones within reason.
 
     A pixel of range r in the first frames needs ``2 r + 16`` bins: of the range of some hundred frames, its
@@ -188,18 +187,18 @@ def choose_bins(pixels_by_range: NDArray[np.int64], max_bins: int) -> int:
     not the wild ones: above ``max_bins``, or above both 512 and four times the need of the median pixel.
 
     Args:
-        pixels_by_range: number of pixels by range in DN, (max_bins + 2,), see `RangeAccumulator.finish`.
+        pixels: number of pixels by range in DN, (max_bins + 2,), see `pixels_by_range`.
         max_bins: upper limit.
 
     Returns:
         A multiple of 16, from 32 to ``max_bins``.
     """
-    needs = [_needed(width) for width in range(pixels_by_range.size)]
-    median = int(np.searchsorted(np.cumsum(pixels_by_range), 0.5 * pixels_by_range.sum()))
+    needs = [_needed(width) for width in range(pixels.size)]
+    median = int(np.searchsorted(np.cumsum(pixels), 0.5 * pixels.sum()))
     limit = min(max_bins, max(_GENEROUS_BINS, _HOT_FACTOR * needs[median]))
     if needs[median] > limit:
         return max_bins
-    return max(needs[width] for width in np.flatnonzero(pixels_by_range).tolist() if needs[width] <= limit)
+    return max(needs[width] for width in np.flatnonzero(pixels).tolist() if needs[width] <= limit)
 
 
 def _needed(width: int) -> int:
@@ -223,9 +222,7 @@ def histogram_frames(
     n_frames, *shape = frames.shape
     head = frames[:window_frames]
     if bins is None:
-        ranges = RangeAccumulator((shape[0], shape[1]), frames.dtype, head.shape[0])
-        ranges.add(head)
-        bins = choose_bins(ranges.finish(max_bins), max_bins)
+        bins = choose_bins(pixels_by_range(head, max_bins), max_bins)
     histograms = HistogramAccumulator((shape[0], shape[1]), bins, n_frames)
     for t in range(0, n_frames, window_frames):
         histograms.add(frames[t : t + window_frames])

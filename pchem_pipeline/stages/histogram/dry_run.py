@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.frames.histogram_files import is_histogram_input
-from pchem_pipeline.model.histogram.count import HistogramAccumulator, RangeAccumulator, choose_bins
+from pchem_pipeline.model.histogram.count import HistogramAccumulator, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
 from pchem_pipeline.stages.histogram.memory import (
     BASE_BYTES,
@@ -160,7 +160,7 @@ def _first_frames(config: RunConfig, frames: FrameReader) -> tuple[int, float, N
     """Return the bins of the sensor, the seconds to read a sample, and the first frames of some rows."""
     n, ny, nx = frames.shape
     window = min(config.histogram.window_frames, n)
-    limit = min(config.histogram.max_bins, 1 << (8 * frames.dtype.itemsize))
+    limit = most_bins(config.histogram.max_bins, frames.dtype)
     ranges = np.zeros(limit + 2, np.int64)
     spent = 0.0
     step = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
@@ -168,9 +168,7 @@ def _first_frames(config: RunConfig, frames: FrameReader) -> tuple[int, float, N
         start = time.perf_counter()
         block = frames.read(0, window, y0, min(y0 + step, ny))
         spent += time.perf_counter() - start
-        accumulator = RangeAccumulator(block.shape[1:], block.dtype, window)
-        accumulator.add(block)
-        ranges += accumulator.finish(limit)
+        ranges += pixels_by_range(block, limit)
     return choose_bins(ranges, limit), spent / (window * ny * nx), block[:, :ROW_GROUP]
 
 

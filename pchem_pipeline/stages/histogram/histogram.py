@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-from pchem_pipeline.model.histogram.count import RangeAccumulator, RowHistograms, choose_bins
+from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import CovarianceMaps, frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
@@ -147,7 +147,7 @@ def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:
     """Return the number of bins of the sensor, from its first frames."""
-    limit = min(context.config.histogram.max_bins, 1 << (8 * source.dtype.itemsize))
+    limit = most_bins(context.config.histogram.max_bins, source.dtype)
     settings = context.config.histogram
     task = functools.partial(_ranges_of_band, source=source, frames=settings.window_frames, max_bins=limit)
     outcomes: list[Outcome] = []
@@ -173,9 +173,7 @@ def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: i
     frames = min(frames, n_frames)
     block = np.empty((frames, band.y1 - band.y0, columns), source.dtype)
     source.read_into(block, 0, frames, band.y0, band.y1)
-    ranges = RangeAccumulator(block.shape[1:], source.dtype, frames)
-    ranges.add(block)
-    return ranges.finish(max_bins)
+    return pixels_by_range(block, max_bins)
 
 
 def _do_band(band: Band, *, job: CountJob, source: FrameSource, threads: int) -> None:

@@ -27,7 +27,7 @@ from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.frames.stream import HashedFrameStream
-from pchem_pipeline.model.histogram.count import RangeAccumulator, choose_bins
+from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.run.input_identity import identity_is_new, keep_identity
 from pchem_pipeline.run.stage import Prepared, StageContext
 from pchem_pipeline.stages import ingest
@@ -158,15 +158,9 @@ def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStre
 
 def _choose_bins(context: StageContext, parts: Sequence[NDArray[Any]]) -> int:
     """Return the number of bins of the sensor, from its first frames."""
-    dtype = parts[0].dtype
-    limit = min(context.config.histogram.max_bins, 1 << (8 * dtype.itemsize))
-
-    def ranges(part: NDArray[Any]) -> NDArray[np.int64]:
-        accumulator = RangeAccumulator(part.shape[1:], dtype, part.shape[0])
-        accumulator.add(part)
-        return accumulator.finish(limit)
-
-    found = call_all([functools.partial(ranges, part) for part in parts], context.executor.workers)
+    limit = most_bins(context.config.histogram.max_bins, parts[0].dtype)
+    tasks = [functools.partial(pixels_by_range, part, limit) for part in parts]
+    found = call_all(tasks, context.executor.workers)
     return choose_bins(np.sum(found, axis=0), limit)
 
 

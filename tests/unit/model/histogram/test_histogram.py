@@ -10,11 +10,11 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.model.histogram import count, count_numba
 from pchem_pipeline.model.histogram.count import (
     HistogramAccumulator,
-    RangeAccumulator,
     RowHistograms,
     choose_bins,
     counts_dtype,
     histogram_frames,
+    pixels_by_range,
 )
 
 
@@ -175,30 +175,21 @@ class TestChoiceOfBins:
 
     def test_single_glitches_are_left_out_but_hot_pixels_are_not(self):
         frames = pcd_like(7, (256, 4, 4))
-        plain = RangeAccumulator((4, 4), frames.dtype, 256)
-        plain.add(frames)
+        plain = choose_bins(pixels_by_range(frames, 1024), 1024)
         frames[3, 1, 1], frames[90, 1, 1], frames[100, 2, 2] = 4000, 0, 65535
-        glitched = RangeAccumulator((4, 4), frames.dtype, 256)
-        glitched.add(frames[:100])
-        glitched.add(frames[100:])
-        assert choose_bins(glitched.finish(1024), 1024) == choose_bins(plain.finish(1024), 1024)
+        assert choose_bins(pixels_by_range(frames, 1024), 1024) == plain
         frames[::20, 3, 3] += 60
-        hot = RangeAccumulator((4, 4), frames.dtype, 256)
-        hot.add(frames)
-        assert choose_bins(hot.finish(1024), 1024) > choose_bins(plain.finish(1024), 1024)
+        assert choose_bins(pixels_by_range(frames, 1024), 1024) > plain
 
     def test_trimmed_range_is_that_of_the_sorted_samples(self):
         frames = pcd_like(8, (256, 3, 5))
-        ranges = RangeAccumulator((3, 5), frames.dtype, 256)
-        ranges.add(frames)
         ordered = np.sort(frames.astype(int), axis=0)
         expected = np.bincount((ordered[-4] - ordered[3] + 1).ravel(), minlength=1026)
-        np.testing.assert_array_equal(ranges.finish(1024), expected)
+        np.testing.assert_array_equal(pixels_by_range(frames, 1024), expected)
 
     def test_one_frame(self):
-        ranges = RangeAccumulator((2, 2), np.dtype(np.uint16), 1)
-        ranges.add(np.full((1, 2, 2), 9, np.uint16))
-        assert choose_bins(ranges.finish(1024), 1024) == 32
+        one = np.full((1, 2, 2), 9, np.uint16)
+        assert choose_bins(pixels_by_range(one, 1024), 1024) == 32
 
     def test_typical_window_leaves_room_for_a_hundred_times_more_frames(self):
         frames = pcd_like(9, (25_600, 3, 3))
@@ -236,9 +227,7 @@ class TestCompiledEqualsPlain:
         frames = pcd_like(12, (70, 2, 3))
         results = []
         for _ in range(2):
-            ranges = RangeAccumulator((2, 3), frames.dtype, 300)
-            ranges.add(frames)
-            results.append(ranges.finish(1024))
+            results.append(pixels_by_range(frames, 1024))
             monkeypatch.setattr(count, "update_extremes", count_numba.update_extremes.py_func)
         np.testing.assert_array_equal(*results)
 
