@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from pchem_pipeline.model.electrons.electrons import electron_numbers, thresholds
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, nuced_axis
+from pchem_pipeline.model.ensemble.totals import EnsembleAxes
 from pchem_pipeline.model.maps.maps import display_transform
 from pchem_pipeline.model.maps.pixels import PixelParameters
-from pchem_pipeline.stages.ensemble.tile import EnsembleAxes, PixelHistograms, ensemble_tile
+from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
 
 RNG = np.random.default_rng(21)
 N = 40

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,23 +18,34 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS
+from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers, electron_numbers
+from pchem_pipeline.model.electrons.error_rates import error_rates
+from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.ensemble.curves import components, curves
+from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
+from pchem_pipeline.model.ensemble.moments import moment_rows
+from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
-from pchem_pipeline.stages.ensemble.result import pixels_of, write_result
-from pchem_pipeline.stages.ensemble.tile import ERROR_SIZES, EnsembleAxes, PixelHistograms, ensemble_tile
+from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
 from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_added_exposure, fitted_effects
+from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.frames.stream import FrameSource
+    from pchem_pipeline.model.ensemble.settings import EnsembleSettings
+    from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.bands import Band
+    from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
 __all__ = ["ensemble_tile", "run"]
@@ -67,6 +79,73 @@ class _Job:
     effects: tuple[Effect, ...]
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """What the fit and the histograms of some tiles hold, of the pixels with a value.
+
+    Attributes:
+        pixels: their parameters.
+        mask: which pixels of the tiles have a value.
+        origin: DN of bin 0.
+        low: smallest DN.
+        high: largest DN.
+        bins: bins of a histogram.
+    """
+
+    pixels: PixelParameters
+    mask: NDArray[np.bool_]
+    origin: NDArray[np.int32]
+    low: NDArray[np.int32]
+    high: NDArray[np.int32]
+    bins: int
+
+    @classmethod
+    def read(cls, store: RunStore, tiles: list[Tile]) -> _Fitted:
+        """Read them from the run."""
+        bins = store.array("histogram/counts").shape[2]
+        paths = [
+            *(f"fit/{n}" for n in PARAMETERS),
+            *(f"histogram/{n}" for n in ("origin", "minimum", "maximum")),
+        ]
+        *maps, origin, low, high = (_pixels_of(store, path, tiles) for path in paths)
+        pixels, mask = PixelParameters.from_maps(maps)
+        return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
+
+    def axes(self, settings: EnsembleSettings, *, grown: bool) -> EnsembleAxes | None:
+        """Choose the axes of the ensemble; None where no pixel has a value."""
+        if len(self.pixels) == 0:
+            return None
+        start = int(np.maximum(self.low, self.origin).min())
+        end = int(np.minimum(self.high, self.origin + self.bins - 1).max()) + 1
+        dn = DnAxis(start, end - start)
+        nuced = nuced_axis(self.pixels, dn, width=settings.nuced_bin_width, steps=settings.nuced_bin_steps)
+        largest = min(float(self.pixels.quanta_exposure.max()), 60_000.0)
+        mass = electron_pmf(self.pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
+        n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
+        return EnsembleAxes(dn, nuced, n_k, grown)
+
+
+def _pixels_of(
+    store: RunStore, name: str, tiles: list[Tile], region: tuple[slice, slice] | None = None
+) -> NDArray[Any]:
+    """Return the pixels of a map that lie in some tiles, in the order of the map.
+
+    Args:
+        store: the run.
+        name: an array whose first dimensions are (y, x).
+        tiles: the tiles.
+        region: part of the array that is the sensor; None: all of it.
+
+    Returns:
+        The values, pixels along the first axis.
+    """
+    whole = store.read(name, region)
+    inside = np.zeros(whole.shape[:2], dtype=bool)
+    for tile in tiles:
+        inside[tile.region] = True
+    return np.asarray(whole[inside])
+
+
 def run(context: StageContext) -> None:
     """Predict the ensemble and compare it with the data.
 
@@ -75,40 +154,51 @@ def run(context: StageContext) -> None:
         InputError: the camera files vanished or changed.
         StoreError: an upstream stage is missing, or the store refuses.
     """
-    tiles = context.tiles()
-    frames = _chosen_frames(context)
-    truth = _place_in_truth(context) if frames is not None else None
-    everything = frames == (0, context.sensor.n_frames)
+    store, sensor, settings = context.store, context.sensor, context.config.ensemble
+    tiles, ready, effects = context.tiles(), context.tiles_done("fit"), fitted_effects(context.store)
+    frames = _chosen_frames(sensor, settings)
+    truth = None if frames is None else _place_in_truth(store, context.config, sensor.shape)
+    everything = frames == (0, sensor.n_frames)
     source = open_source(context) if frames is not None and (truth or not everything) else None
-    if context.sensor.kind == "histograms":
+    fitted = _Fitted.read(store, [tile for tile in tiles if tile.key in ready])
+    axes = fitted.axes(settings, grown=bool(effects))
+    if sensor.kind == "histograms":
         context.note(
             "the input is histograms: the ensemble is of all samples, every channel counting the same"
         )
-    ready = context.tiles_done("fit")
-    axes = _axes(context, [tile for tile in tiles if tile.key in ready])
     if axes is None:
         if ready:
             context.note("no pixel has a value, so there is no ensemble; fit_status says why for each")
         context.run_units(tiles, _leave_out, needs="fit")
         return
     _create(context, axes, len(tiles))
-    job = _Job(
-        context.store.path,
-        axes,
-        {tile.key: (number, tile) for number, tile in enumerate(tiles)},
-        None if everything else frames,
-        source,
-        truth,
-        fitted_effects(context.store),
-    )
-    bins = context.store.array("histogram/counts").shape[2]
-    rows = max(1, _BAND_BYTES // (context.sensor.nx * bins * 4))
+    numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
+    job = _Job(store.path, axes, numbered, None if everything else frames, source, truth, effects)
+    rows = max(1, _BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tile_bands(context, "fit", rows, 1 if source is None else source.rows_per_read)
     done = context.run_units(bands, functools.partial(_do_band, job=job), unit_name="band", needs="fit")
     finished = [tile for tile in tiles if tile.key in done]
     if finished:
-        numbers = [number for key, (number, _) in job.tiles.items() if key in done]
-        write_result(context, axes, finished, numbers, frames, truth)
+        made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
+        totals = _totals(store, axes, [numbered[tile.key][0] for tile in finished], frames, sensor.n_frames)
+        _write_result(store, totals, finished, _Asked(context.config, frames, truth, sensor), effects, made)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the ensemble is of.
+
+    Attributes:
+        config: of the run.
+        frames: first and end of the chosen frames, or None where there are none to choose from.
+        truth: row, column and frame of the input's origin in the simulation, or None.
+        sensor: the input.
+    """
+
+    config: RunConfig
+    frames: tuple[int, int] | None
+    truth: tuple[int, int, int] | None
+    sensor: SensorInfo
 
 
 def _leave_out(tile: Tile) -> dict[str, Any]:
@@ -116,9 +206,8 @@ def _leave_out(tile: Tile) -> dict[str, Any]:
     return {}
 
 
-def _chosen_frames(context: StageContext) -> tuple[int, int] | None:
+def _chosen_frames(sensor: SensorInfo, settings: EnsembleSettings) -> tuple[int, int] | None:
     """Return first and end of the chosen frames, or None where the input has none."""
-    sensor, settings = context.sensor, context.config.ensemble
     if sensor.kind != "frames":
         return None
     if settings.frames == "all":
@@ -131,36 +220,17 @@ def _chosen_frames(context: StageContext) -> tuple[int, int] | None:
     return first, min(first + settings.frames, sensor.n_frames)
 
 
-def _place_in_truth(context: StageContext) -> tuple[int, int, int] | None:
+def _place_in_truth(
+    store: RunStore, config: RunConfig, shape: tuple[int, int]
+) -> tuple[int, int, int] | None:
     """Return row, column and frame of the input's origin in the true electron numbers, where they exist."""
-    store, settings = context.store, context.config.input
-    if context.config.simulate is None or not store.has("truth/electron_number"):
+    if config.simulate is None or not store.has("truth/electron_number"):
         return None
     _, ny, nx = store.array("truth/electron_number").shape
-    y0, y1, x0, x1 = settings.roi or (0, ny, 0, nx)
-    if (min(y1, ny) - y0, min(x1, nx) - x0) != context.sensor.shape:
+    y0, y1, x0, x1 = config.input.roi or (0, ny, 0, nx)
+    if (min(y1, ny) - y0, min(x1, nx) - x0) != shape:
         return None  # other files than the simulated ones
-    return y0, x0, settings.frame_range[0] if settings.frame_range else 0
-
-
-def _axes(context: StageContext, tiles: list[Tile]) -> EnsembleAxes | None:
-    """Choose the axes from the maps of all finished tiles; None where no pixel has a value."""
-    store, settings = context.store, context.config.ensemble
-    pixels, mask = PixelParameters.from_maps([pixels_of(store, f"fit/{name}", tiles) for name in PARAMETERS])
-    if len(pixels) == 0:
-        return None
-    bins = store.array("histogram/counts").shape[2]
-    origin, low, high = (
-        pixels_of(store, f"histogram/{name}", tiles)[mask] for name in ("origin", "minimum", "maximum")
-    )
-    start = int(np.maximum(low, origin).min())
-    end = int(np.minimum(high, origin + bins - 1).max()) + 1
-    dn = DnAxis(start, end - start)
-    nuced = nuced_axis(pixels, dn, width=settings.nuced_bin_width, steps=settings.nuced_bin_steps)
-    largest = min(float(pixels.quanta_exposure.max()), 60_000.0)
-    mass = electron_pmf(pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
-    n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
-    return EnsembleAxes(dn, nuced, n_k, bool(fitted_effects(store)))
+    return y0, x0, config.input.frame_range[0] if config.input.frame_range else 0
 
 
 def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
@@ -263,3 +333,105 @@ def _compare(job: _Job, band: Band, maps: tuple[NDArray[np.float64], ...]) -> di
                 tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
                 found[key] = found[key] + tally if key in found else tally
     return found
+
+
+def _totals(
+    store: RunStore, axes: EnsembleAxes, rows: list[int], frames: tuple[int, int] | None, n_frames: int
+) -> EnsembleTotals:
+    """Add the rows of the finished tiles.
+
+    Args:
+        store: the run.
+        axes: axes of the ensemble.
+        rows: of the finished tiles in the sums.
+        frames: first and end of the chosen frames, or None where every pixel counts the same.
+        n_frames: frames of the run.
+    """
+    samples = (1, 1) if frames is None else (frames[1] - frames[0], n_frames)
+    integers, floats = (
+        sum(store.read(f"ensemble_tiles/{name}", (number, slice(None))) for number in rows) for name in _SUMS
+    )
+    return EnsembleTotals(axes, np.asarray(integers), np.asarray(floats), samples)
+
+
+def _write_result(
+    store: RunStore,
+    totals: EnsembleTotals,
+    tiles: list[Tile],
+    asked: _Asked,
+    effects: Sequence[Effect],
+    facts: dict[str, Any],
+) -> None:
+    """Write the arrays of the group ``ensemble`` and its numbers (attributes of the group).
+
+    The attributes are the facts (``rmse``, counts, error rates), ``moments`` (rows of Appendix A),
+    ``component_cases`` (parameters held constant, a list for each row of ``component_variance``) and
+    ``missing`` (part to reason).
+
+    Args:
+        store: the run.
+        totals: sums over the tiles.
+        tiles: the finished tiles.
+        asked: what the ensemble is of.
+        effects: with which the maps were fitted.
+        facts: further attributes.
+    """
+    missing, settings, frames = _missing(asked, totals), asked.config.ensemble, asked.frames
+    fitted = _Fitted.read(store, tiles)
+    pixels = fitted.pixels
+    per_pixel: int | NDArray[Any] = totals.samples[0]
+    if frames is None:
+        counts = _pixels_of(store, "histogram/counts", tiles)
+        per_pixel = counts.sum(axis=1, dtype=np.int64)[fitted.mask]
+    true = _true_pixels(store, asked, tiles, fitted.mask)
+    arrays, found = curves(totals, pixels, settings)
+    numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
+    arrays |= numbers | components(pixels, numbers["electron_pmf"])
+    n, n_all = totals.samples
+    found |= electron_facts | error_rates(totals, pixels, true)
+    found |= {
+        "n_frames": None if frames is None else n,
+        "n_frames_all": None if frames is None else n_all,
+        "first_frame": None if frames is None else frames[0],
+        "n_pixels": totals.count("pixels"),
+        "n_pixels_without_value": totals.count("excluded"),
+        "moments": moment_rows(totals, pixels, per_pixel),
+        "component_cases": COMPONENT_CASES,
+        "missing": missing,
+    }
+    if effects:
+        found["model"] = model_words(effects)
+    for name, values in arrays.items():
+        store.write_array(f"ensemble/{name}", values)
+    store.set_attributes("ensemble", without_nan(found | facts))
+
+
+def _true_pixels(
+    store: RunStore, asked: _Asked, tiles: list[Tile], mask: NDArray[np.bool_]
+) -> PixelParameters | None:
+    """Return the true parameters of the pixels with a value, if they are all that made the frames."""
+    simulated = asked.config.simulate
+    if asked.truth is None or simulated is None or simulated.effects:
+        return None
+    y0, x0, _ = asked.truth
+    ny, nx = asked.sensor.shape
+    region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
+    maps = [_pixels_of(store, f"truth/{name}", tiles, region)[mask] for name in PARAMETERS]
+    true, known = PixelParameters.from_maps(maps)
+    return true if known.all() else None
+
+
+def _missing(asked: _Asked, totals: EnsembleTotals) -> dict[str, str]:
+    """Say which parts of the ensemble this run does not have, and why."""
+    missing: dict[str, str] = {}
+    if asked.frames is None:
+        missing["frames"] = (
+            f"the input is {asked.sensor.kind}: no choice of frames; the ensemble is of all samples"
+        )
+    if totals.count("compared") == 0:
+        missing["truth"] = (
+            "the true electron numbers are not known"
+            if asked.config.simulate is None
+            else "no true electron numbers were kept for these frames"
+        )
+    return missing

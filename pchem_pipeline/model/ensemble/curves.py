@@ -17,7 +17,6 @@ from pchem_pipeline.model.checks.residuals import (
     normalised_residuals,
     rmse,
 )
-from pchem_pipeline.model.electrons.electrons import cell_probabilities
 from pchem_pipeline.model.ensemble.components import component_widths
 from pchem_pipeline.model.ensemble.ensemble import electron_pmf
 from pchem_pipeline.model.ensemble.ensemble_binned import (
@@ -29,10 +28,10 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     nuced_independent,
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
+from pchem_pipeline.model.ensemble.totals import EnsembleTotals
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
-from pchem_pipeline.stages.ensemble.tile import EnsembleTotals
 
-__all__ = ["components", "curves", "electron_numbers", "error_rates"]
+__all__ = ["components", "curves", "electron_numbers"]
 
 #: Components are shown up to the electron number whose mass is above this.
 _SMALLEST_COMPONENT = 1e-4
@@ -161,45 +160,6 @@ def electron_numbers(
         "electrons_beyond": totals.count("electrons_beyond"),
         "electron_rmse": errors | {"noise_floor": noise_floor(mass * (1.0 - mass) / n_samples)},
     }
-
-
-def error_rates(
-    totals: EnsembleTotals, pixels: PixelParameters, true: PixelParameters | None
-) -> dict[str, Any]:
-    """Return how often the electron numbers are wrong, where the true ones are known.
-
-    What one should expect follows from the fitted parameters alone (``expected_error_rate``) or, better, from
-    data of the true parameters cut at the thresholds of the fitted ones; the least possible rate has the
-    thresholds of the true parameters. Frames that the fit has seen err slightly less than new ones.
-
-    Args:
-        totals: the sums over all tiles.
-        pixels: fitted parameters of all pixels with a value.
-        true: true parameters of the same pixels, or None where they are not known or not all there is.
-
-    Returns:
-        Numbers for the attributes of the group; none where nothing was compared.
-    """
-    compared = totals.count("compared")
-    if not compared:
-        return {}
-    sizes = totals.counts("error_sizes")
-    frames = compared / totals.count("pixels")
-    facts: dict[str, Any] = {
-        "error_rate": 1.0 - int(sizes[0]) / compared,
-        "error_rate_stderr": math.sqrt(float(totals.variance("error_variance")[0]) / frames),
-        "error_sizes": [int(n) for n in sizes],
-        "mean_error": totals.count("signed_error") / compared,
-        "samples_compared": compared,
-    }
-    if true is not None:
-        error = cell_probabilities(true, 1, pixels).error
-        facts |= {
-            "expected_error_rate_from_truth": float(error.mean()),
-            "error_rate_stderr": math.sqrt(float(np.mean(error * (1.0 - error))) / compared),
-            "least_error_rate": float(cell_probabilities(true, 1).error.mean()),
-        }
-    return facts
 
 
 def components(pixels: PixelParameters, mass: FloatArray) -> Arrays:

@@ -1,0 +1,94 @@
+"""The moments of the ensemble (Appendix A), predicted and observed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.ensemble.components import EnsembleMoments, moment_errors, predicted_moments
+from pchem_pipeline.model.ensemble.totals import EnsembleTotals
+from pchem_pipeline.model.maps.pixels import PixelParameters
+
+__all__ = ["moment_rows"]
+
+
+def moment_rows(
+    totals: EnsembleTotals, pixels: PixelParameters, per_pixel: int | NDArray[Any]
+) -> list[dict[str, Any]]:
+    """Return the moments of Appendix A, from the maps and from the data.
+
+    Under a grown model mean and variance are those of its masses, and what its effects add to the variance
+    that the parameters explain is a term of its own.
+
+    Args:
+        totals: the sums.
+        pixels: the pixels.
+        per_pixel: samples of each pixel.
+
+    Returns:
+        Rows ``{name, quantity, unit, predicted, observed, stderr}``; terms have nothing to be observed.
+    """
+    plain_ones, errors = predicted_moments(pixels), moment_errors(pixels, per_pixel)
+    expected = _grown_moments(totals, plain_ones) if totals.axes.grown else plain_ones
+    share, dn = totals.mean("share"), totals.axes.dn.dn
+    mean = float(share @ dn / share.sum())
+    variance = float(share @ (dn - mean) ** 2 / share.sum())
+    nuced_mean, nuced_square = (
+        float(totals.mean(name)[0] / share.sum()) for name in ("nuced_sum", "nuced_sum_square")
+    )
+    rows: list[tuple[str, str, str, float, float | None, float | None]] = [
+        ("mean", "mean of the raw ensemble", "DN", expected.mean, mean, errors.mean),
+        ("variance", "variance of the raw ensemble", "DN2", expected.variance, variance, errors.variance),
+        ("variance_of_bias", "of which variance of the bias", "DN2", expected.variance_of_bias, None, None),
+        ("variance_of_signal", "of which variance of H/g", "DN2", expected.variance_of_signal, None, None),
+        ("mean_read_variance", "of which read noise", "DN2", expected.mean_read_variance, None, None),
+        ("mean_shot_variance", "of which shot noise", "DN2", expected.mean_shot_variance, None, None),
+        (
+            "bias_signal_covariance",
+            "of which twice the covariance of bias and H/g",
+            "DN2",
+            2.0 * expected.bias_signal_covariance,
+            None,
+            None,
+        ),
+        (
+            "nuced_mean",
+            "mean of the NUCed ensemble",
+            "e-",
+            expected.nuced_mean,
+            nuced_mean,
+            errors.nuced_mean,
+        ),
+        (
+            "nuced_variance",
+            "variance of the NUCed ensemble",
+            "e-2",
+            expected.nuced_variance,
+            nuced_square - nuced_mean**2,
+            errors.nuced_variance,
+        ),
+    ]
+    if totals.axes.grown:
+        added = expected.variance - plain_ones.variance
+        rows.insert(7, ("effects", "of which the effects of the model", "DN2", added, None, None))
+    names = ("name", "quantity", "unit", "predicted", "observed", "stderr")
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _grown_moments(totals: EnsembleTotals, plain_ones: EnsembleMoments) -> EnsembleMoments:
+    """Return the moments with those replaced that the effects of the model change."""
+    mass, dn = totals.mean("pcd"), totals.axes.dn.dn
+    whole = mass.sum()
+    mean = float(mass @ dn / whole)
+    nuced_mean, nuced_square = (
+        float(totals.mean(f"nuced_predicted_{name}")[0] / whole) for name in ("sum", "sum_square")
+    )
+    return replace(
+        plain_ones,
+        mean=mean,
+        variance=float(mass @ (dn - mean) ** 2 / whole),
+        nuced_mean=nuced_mean,
+        nuced_variance=nuced_square - nuced_mean**2,
+    )
