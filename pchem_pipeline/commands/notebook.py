@@ -32,7 +32,8 @@ from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_vers
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target, find_run
-from pchem_pipeline.stages.report.report import read_pixels
+from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
+from pchem_pipeline.stages.report.stored import read_histograms, read_model
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -218,7 +219,14 @@ class Run:
         )
         fit = self._arrays("fit", ["fit_status", "goodness_p"])
         chosen = [("", int(y), int(x)) for y, x in places]
-        return [Pixel(each) for each in read_pixels(self._store, chosen, self._sensor, maps, fit)]
+        index = pixel_index(chosen, self.shape)
+        model = read_model(self._store)
+        histograms = read_histograms(self._store, index, self.shape, model)
+        channel = self._sensor.kind == "histograms"
+        columns = [np.array([float(maps[name][y, x]) for _, y, x in chosen]) for name in PARAMETERS]
+        masses = bin_masses(columns, histograms, model.at(index))
+        found = pixel_fits(chosen, maps, fit, histograms, masses, channel=channel)
+        return [Pixel(each) for each in found]
 
     def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
         """Return arrays of the store that read the pixels asked for alone."""

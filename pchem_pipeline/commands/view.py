@@ -25,11 +25,13 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.report.inspector.inspector import served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.stages.report.inspected_pixels import ChosenPixels
-from pchem_pipeline.stages.report.inspector import Listed, listed_maps, packed_map, read_sample
+from pchem_pipeline.stages.report.inspector import Listed, deciding_parameters, listed_maps, packed_map
+from pchem_pipeline.stages.report.pixels import bin_masses
+from pchem_pipeline.stages.report.stored import read_histograms, read_model
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["Answer", "RunView", "make_server", "serve"]
@@ -134,15 +136,20 @@ class RunView:
         if y >= ny or x >= nx:
             return _text(HTTPStatus.NOT_FOUND, f"there is no such pixel; the sensor has {ny} x {nx}")
         region = (slice(y, y + 1), slice(x, x + 1))
-        chosen = ChosenPixels(np.array([y * nx + x]), ())
-        sample = read_sample(self.store, chosen, (), self._shape)
-        counts, mass = sample.counts[0], sample.masses[0] if sample.masses else None
+        index = np.array([y * nx + x])
+        model = read_model(self.store)
+        histograms = read_histograms(self.store, index, self._shape, model)
+        names = PARAMETERS if model.effects else ()
+        columns = [self.store.read(f"maps/{name}", region).ravel() for name in names]
+        masses = bin_masses(columns, histograms, model.at(index))
+        deciding = deciding_parameters(columns, model.at(index))
+        counts, mass = histograms.counts[0], masses[0] if masses else None
         occupied = np.flatnonzero(counts)
         kept = slice(occupied[0], occupied[-1] + 1) if occupied.size else slice(0, 0)
         content = {
-            "origin": int(sample.origin[0]) + int(kept.start),
+            "origin": int(histograms.origin[0]) + int(kept.start),
             "counts": counts[kept].tolist(),
-            "deciding": None if sample.deciding is None else _floats(sample.deciding[:, 0]),
+            "deciding": None if deciding is None else _floats(deciding[:, 0]),
             "mass": None if mass is None or not np.isfinite(mass).all() else _floats(mass[kept]),
             "values": {path: _floats(self.store.read(path, region))[0] for path in self._maps},
         }

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from helpers.report_material import draw_dn, report_data
@@ -13,11 +14,14 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelSample
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.stages.report.inspector import gather_inspector
+from pchem_pipeline.stages.report.inspector import inspector_data, read_maps
+from pchem_pipeline.stages.report.pixels import choose_inspected
+from pchem_pipeline.stages.report.stored import FittedModel, read_histograms
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -44,14 +48,21 @@ def write_run(folder: Path, data: ReportData, *, n_frames: int = 400) -> RunStor
     return store
 
 
+def inspector_of(
+    store: RunStore, maps: Mapping[str, Any], fit: Mapping[str, Any], shown: Sequence[tuple[int, int]] = ()
+) -> InspectorData:
+    """Return the inspector of a run that was fitted with the PCD."""
+    shape, chosen = maps["bias"].shape, choose_inspected(maps, fit, shown)
+    entries, exact = read_maps(store, shape, chosen.index)
+    held = read_histograms(store, chosen.index, shape, FittedModel())
+    sample = PixelSample(chosen.index, exact, held.origin, held.counts, reasons=chosen.reasons)
+    return inspector_data(store.path.name, shape, entries, sample)
+
+
 def inspected(store: RunStore, data: ReportData) -> ReportData:
     """Return the same report with its inspector."""
-    shown = [(0, 0)]
-    return replace(
-        data,
-        inspector=gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, shown),
-        pixels=data.pixels[:1],
-    )
+    inspector = inspector_of(store, data.maps, data.fit, [(0, 0)])
+    return replace(data, inspector=inspector, pixels=data.pixels[:1])
 
 
 def page_without_pictures(data: ReportData) -> str:

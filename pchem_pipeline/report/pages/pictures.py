@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import COLUMN_MM, Look, drawing_bytes, small_png
+from pchem_pipeline.report.style.style import COLUMN_MM, Look, drawing_bytes, small_png, without_collector
 
 #: SVG files beyond this size are embedded as PNG, which is drawn once more.
 _LARGEST_SVG = 260_000
@@ -44,6 +44,7 @@ class Picture:
 DrawAll = Callable[[Sequence[Figure], ReportSettings], Mapping[str, Drawn]]
 
 
+@without_collector()
 def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
     """Draw a figure with its files; pure.
 

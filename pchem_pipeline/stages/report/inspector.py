@@ -16,35 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import quoted
-from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS, VARIABLES, Variable
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
-from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.base.variables import VARIABLES, Variable
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_added_exposure, fitted_effects
-from pchem_pipeline.stages.report.inspected_pixels import ChosenPixels, choose_inspected
+from pchem_pipeline.stages.fit.fitted_model import deciding_maps
+from pchem_pipeline.stages.report.stored import FittedModel
 
 if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = [
-    "Listed",
-    "gather_inspector",
-    "grown_masses",
-    "listed_maps",
-    "map_entry",
-    "packed_map",
-    "read_sample",
-]
-
-#: Sensors with fewer pixels have all of them in the file.
-_ALL_PIXELS = 4096
-#: Pixels in full in the file of a larger sensor, and how many of them with the mass of a model with effects.
-_SOME_PIXELS, _SOME_MASSES = 2400, 300
 #: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9.
 _MAPS_BUDGET, _MAPS_POWER = 2.8e6, 0.9
 _PAPER_PIXELS = 512 * 512
@@ -144,34 +125,33 @@ def _flag_words(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
     return {int(n): text.replace("_", " ") for n, text in zip(attributes[key], texts, strict=False)}
 
 
-def gather_inspector(
-    store: RunStore,
-    sensor: SensorInfo,
-    maps: Mapping[str, NDArray[Any]],
-    fit: Mapping[str, NDArray[Any]],
-    shown: Sequence[tuple[int, int]],
-    suspects: Sequence[tuple[int, int]] = (),
-) -> InspectorData:
-    """Pack the maps that fit and read the pixels that are shown in full.
+def read_maps(
+    store: RunStore, shape: tuple[int, int], index: NDArray[np.int64]
+) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
+    """Read every stored map: packed as far as they fit into the page, and exact for some pixels.
 
     Args:
         store: the run.
-        sensor: its input.
-        maps: group ``maps``, (y, x).
-        fit: ``fit_status`` and ``goodness_p``, (y, x).
-        shown: pixels (y, x) that the report draws.
-        suspects: pixels (y, x) to which the discrepancy verdict points.
+        shape: of the sensor.
+        index: ``y * nx + x`` of the pixels that are held in full.
+
+    Returns:
+        The maps, in the order of the list, and by path of those that fit their values, shape (n,).
 
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    listed = listed_maps(store, sensor.shape)
-    entries = _packed(store, listed, sensor.shape)
-    chosen = choose_inspected(maps, fit, shown, suspects, everything=_ALL_PIXELS, most=_SOME_PIXELS)
+    entries = _packed(store, listed_maps(store, shape), shape)
     here = [entry.path for entry in entries if entry.packed is not None or entry.same_as is not None]
-    sample = read_sample(store, chosen, here, sensor.shape)
-    kept_to = "a quarter" if sensor.ny * sensor.nx > _COARSE_PIXELS else "a sixteenth"
-    return InspectorData(tuple(entries), sample, kept_to, f"pchem view {quoted(Path(store.path.name))}")
+    return entries, {path: store.read(path).reshape(-1)[index].astype(np.float64) for path in here}
+
+
+def inspector_data(
+    name: str, shape: tuple[int, int], maps: Sequence[MapEntry], sample: PixelSample
+) -> InspectorData:
+    """Return all that the inspector of a run holds."""
+    kept_to = "a quarter" if shape[0] * shape[1] > _COARSE_PIXELS else "a sixteenth"
+    return InspectorData(tuple(maps), sample, kept_to, f"pchem view {quoted(Path(name))}")
 
 
 def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
@@ -240,87 +220,20 @@ def _multiple_of_exposure(store: RunStore, variable: Variable) -> tuple[str, flo
     return (other, factor) if same else None
 
 
-def read_sample(
-    store: RunStore, chosen: ChosenPixels, paths: Sequence[str], shape: tuple[int, int]
-) -> PixelSample:
-    """Read pixels in full: values of the maps, histogram, and their mass under a model with effects.
+def deciding_parameters(
+    columns: Sequence[NDArray[np.float64]], model: FittedModel
+) -> NDArray[np.float64] | None:
+    """Return the parameters that decide electron numbers, (4, n); None where these are the fitted ones.
 
     Args:
-        store: the run.
-        chosen: the pixels and why.
-        paths: maps whose values are kept.
-        shape: of the sensor.
-
-    Raises:
-        StoreError: an array is missing or corrupt.
+        columns: (H, g, mu, sigma) of n pixels, NaN without parameters.
+        model: of these pixels.
     """
-    index = chosen.index
-    exact = {path: store.read(path).reshape(-1)[index].astype(np.float64) for path in paths}
-    origin, counts = _histograms(store, index, shape)
-    effects = fitted_effects(store)
-    deciding, masses = None, []
-    if effects:
-        columns = [store.read(f"maps/{name}").reshape(-1)[index] for name in PARAMETERS]
-        every = fitted_added_exposure(store)
-        added = None if every is None else every.flat().of(index)
-        known = np.isfinite(columns).all(axis=0)
-        deciding = np.full((4, index.size), np.nan)
-        if known.any():
-            own = None if added is None else added.of(np.flatnonzero(known))
-            deciding[:, known] = deciding_maps([column[known] for column in columns], effects, own)
-        some = slice(0, _SOME_MASSES)
-        lobes = [store.read(f"fit/{name}").reshape(-1)[index][some] for name in FREE_LOBES]
-        first = None if added is None else added.of(some)
-        masses = grown_masses(effects, [c[some] for c in columns], lobes, origin[some], counts[some], first)
-    return PixelSample(index, exact, origin, counts, deciding, masses, chosen.reasons)
-
-
-def grown_masses(
-    effects: Sequence[Effect],
-    columns: Sequence[NDArray[np.float64]],
-    lobes: Sequence[NDArray[np.float64]],
-    origin: NDArray[np.integer[Any]],
-    counts: Sequence[NDArray[np.integer[Any]]],
-    added: AddedExposure | None = None,
-) -> list[NDArray[np.float64]]:
-    """Return the probability of each bin of each pixel under a model with effects; NaN without parameters.
-
-    Args:
-        effects: of the model.
-        columns: (H, g, mu, sigma) of n pixels.
-        lobes: amplitude (e-) and weight of their free levels.
-        origin: DN of the first bin of each.
-        counts: their histograms, all of one length.
-        added: exposure that the effects add to them, (j, n); None: nothing.
-    """
-    if not counts:
-        return []
-    n_bins = counts[0].size
-    found = np.full((len(counts), n_bins), np.nan)
-    known = np.isfinite(columns).all(axis=0)
-    if known.any():
-        kept = [column[known] for column in columns]
-        own = None if added is None else added.of(np.flatnonzero(known))
-        model = marginal_model(effects, pixel_maps(kept, np.ones(kept[0].size, bool)), own)
-        codes = origin[known][:, None] + np.arange(n_bins)
-        found[known] = marginal_mass(model, kept, codes, lobes=(lobes[0][known], lobes[1][known]))
-    return list(found)
-
-
-def _histograms(
-    store: RunStore, index: NDArray[np.int64], shape: tuple[int, int]
-) -> tuple[NDArray[np.int64], list[NDArray[np.integer[Any]]]]:
-    """Read the histograms of pixels, chunk by chunk."""
-    y, x = np.divmod(index, shape[1])
-    origin = store.read("histogram/origin").reshape(-1)[index].astype(np.int64)
-    high, wide = store.array("histogram/counts").chunks[:2]
-    chunk = (y // high) * (shape[1] // wide + 1) + x // wide
-    counts: list[NDArray[np.integer[Any]]] = [np.empty(0, np.int64)] * index.size
-    for each in np.unique(chunk):
-        here = np.flatnonzero(chunk == each)
-        y0, x0 = int(y[here[0]] // high * high), int(x[here[0]] // wide * wide)
-        region = (slice(y0, y0 + high), slice(x0, x0 + wide), slice(None))
-        block = store.read("histogram/counts", region)
-        for i in here:
-            counts[i] = block[y[i] - y0, x[i] - x0].copy()
-    return origin, counts
+    if not model.effects:
+        return None
+    known = np.flatnonzero(np.isfinite(columns).all(axis=0))
+    deciding = np.full((4, columns[0].size), np.nan)
+    if known.size:
+        some = model.at(known)
+        deciding[:, known] = deciding_maps([column[known] for column in columns], some.effects, some.added)
+    return deciding

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.inspector_material import page_without_pictures, write_run
+from helpers.inspector_material import inspector_of, page_without_pictures, write_run
 from helpers.report_material import report_data
 
 from pchem_pipeline.base import variables
@@ -18,10 +18,9 @@ from pchem_pipeline.report.inspector.inspector import embedded
 from pchem_pipeline.report.pages import sections
 from pchem_pipeline.report.pages.sections import Section
 from pchem_pipeline.report.pages.summary import answers
-from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report import inspector
-from pchem_pipeline.stages.report.inspected_pixels import choose_inspected
-from pchem_pipeline.stages.report.inspector import gather_inspector, listed_maps, map_entry
+from pchem_pipeline.stages.report.inspector import listed_maps, map_entry
+from pchem_pipeline.stages.report.pixels import choose_inspected
 from pchem_pipeline.store.run_store import RunStore
 
 SHAPE = (12, 16)
@@ -57,7 +56,7 @@ def test_a_new_array_appears_by_itself(
     new = Variable(f"{group}/far_share", ("y", "x"), "float64", "DN", "share of samples far away")
     monkeypatch.setitem(variables.VARIABLES, new.path, new)
     store.write_array(new.path, np.full(SHAPE, 0.25))
-    shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
+    shown = inspector_of(store, data.maps, data.fit)
     entry = next(each for each in shown.maps if each.path == new.path)
     assert (entry.label, entry.unit, entry.sentence) == ("far share", "DN", "share of samples far away")
     assert entry.packed is not None
@@ -81,7 +80,7 @@ def test_what_does_not_fit_is_left_to_the_server(
     store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inspector, "_MAPS_BUDGET", 1500.0)
-    shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
+    shown = inspector_of(store, data.maps, data.fit)
     here = [each.path for each in shown.maps if each.packed is not None]
     assert 4 * sum(len(each.packed.data) for each in shown.maps if each.packed) / 3 <= 1500
     assert here[-1] == "fit/fit_status"
@@ -93,7 +92,7 @@ def test_what_does_not_fit_is_left_to_the_server(
 
 
 def test_the_dark_current_costs_nothing(store: RunStore, data: ReportData) -> None:
-    shown = gather_inspector(store, SensorInfo.read(store), data.maps, data.fit, [])
+    shown = inspector_of(store, data.maps, data.fit)
     entry = next(each for each in shown.maps if each.path == "maps/dark_current")
     assert entry.packed is None
     assert entry.same_as == ("maps/quanta_exposure", pytest.approx(1 / 4.87))
@@ -117,8 +116,7 @@ def test_a_sensor_of_the_papers_size_takes_three_to_four_megabytes(tmp_path: Pat
     store.create_array("histogram/counts", (*shape, 128), chunks=(64, 64, 128), dtype=np.uint16)
     for y, x in ((0, 0), (256, 320)):
         store.write("histogram/counts", (slice(y, y + 64), slice(x, x + 64)), np.tile(counts, (8, 8, 1)))
-    sensor = replace(SensorInfo.read(store), ny=512, nx=512)
-    shown = gather_inspector(store, sensor, maps, fit, [(1, 1)])
+    shown = inspector_of(store, maps, fit, [(1, 1)])
     size = sum(len(text) for _, text in embedded(replace(base, shape=shape, inspector=shown)).blobs)  # type: ignore[union-attr]
     assert 2.5e6 < size < 4.2e6
     assert shown.sample.index.size == 2400

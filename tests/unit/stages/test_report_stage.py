@@ -24,7 +24,8 @@ from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.report import report
-from pchem_pipeline.stages.report.report import choose_pixels, gather
+from pchem_pipeline.stages.report.pixels import choose_pixels
+from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore

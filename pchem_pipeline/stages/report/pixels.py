@@ -1,0 +1,266 @@
+"""Single pixels of a report: which are shown, which are held in full, and what their fits expect.
+
+Held in full are the shown, flagged, worst and extreme ones, and an even sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.fit.status import MEANINGS, describe
+from pchem_pipeline.report.data import MAP_NAMES, PixelFit
+from pchem_pipeline.report.style.wording import symbol
+from pchem_pipeline.stages.report.stored import FittedModel, PixelHistograms
+
+#: Pixels for each reason: a flag, a poor fit, an extreme value, a large standard error.
+_FLAGGED, _POOR, _EXTREME, _UNSURE = 40, 60, 12, 8
+_SEED = 20_231
+#: Sensors with fewer pixels have all of them in the file; of a larger one so many.
+_ALL_PIXELS, _SOME_PIXELS = 4096, 2400
+
+#: Labels of the four shown pixels, and the ranks of read noise and quanta exposure at which they lie.
+_CORNERS = (
+    ("low read noise, low exposure", 0.1, 0.1),
+    ("low read noise, high exposure", 0.1, 0.9),
+    ("high read noise, low exposure", 0.9, 0.1),
+    ("high read noise, high exposure", 0.9, 0.9),
+)
+
+#: Label, y and x of a pixel.
+Chosen = tuple[str, int, int]
+
+
+def choose_pixels(
+    read_noise_e: NDArray[np.float64], quanta_exposure: NDArray[np.float64], fit_status: NDArray[Any]
+) -> list[Chosen]:
+    """Choose four pixels at low and high read noise and low and high exposure (fig:plot_per_pixel_fits).
+
+    Ranks are taken among the pixels with a good fit (with any value, if fewer than four are good); the
+    pixel nearest to the 10 or 90 % rank of both is taken, each once. Where no pixel has a value, one of each
+    reason for it is shown, the most frequent reasons first.
+
+    Args:
+        read_noise_e: sigma_e-, e-, shape (ny, nx), NaN where there is no value.
+        quanta_exposure: H, e-, shape (ny, nx).
+        fit_status: status words, shape (ny, nx).
+
+    Returns:
+        Label, y and x of each; at most four.
+    """
+    known = np.isfinite(read_noise_e) & np.isfinite(quanta_exposure)
+    if not known.any():
+        words, first, counts = np.unique(fit_status, return_index=True, return_counts=True)
+        order = np.argsort(-counts, kind="stable")[:4]
+        places = [divmod(int(first[i]), fit_status.shape[1]) for i in order]
+        return [("no fit", y, x) for (y, x), _ in zip(places, words[order], strict=True)]
+    good = known & (fit_status == 0)
+    where = np.argwhere(good if good.sum() >= len(_CORNERS) else known)
+    noise, exposure = (_ranks(values[tuple(where.T)]) for values in (read_noise_e, quanta_exposure))
+    chosen: list[Chosen] = []
+    free = np.ones(len(where), dtype=bool)
+    for label, at_noise, at_exposure in _CORNERS[: len(where)]:
+        distance = (noise - at_noise) ** 2 + (exposure - at_exposure) ** 2
+        best = int(np.argmin(np.where(free, distance, np.inf)))
+        free[best] = False
+        chosen.append((label, int(where[best, 0]), int(where[best, 1])))
+    return chosen
+
+
+def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    ranks = np.empty(values.size)
+    ranks[np.argsort(values, kind="stable")] = (np.arange(values.size) + 0.5) / values.size
+    return ranks
+
+
+def pixel_index(chosen: Sequence[Chosen], shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return ``y * nx + x`` of chosen pixels."""
+    return np.array([y * shape[1] + x for _, y, x in chosen], dtype=np.int64)
+
+
+def pixel_fits(
+    chosen: Sequence[Chosen],
+    maps: Mapping[str, Any],
+    fit: Mapping[str, Any],
+    histograms: PixelHistograms,
+    masses: Sequence[NDArray[np.float64]],
+    *,
+    channel: bool = False,
+) -> list[PixelFit]:
+    """Return histograms and fits of chosen pixels.
+
+    Args:
+        chosen: label, y and x of each.
+        maps: parameters and standard errors, (y, x); anything that is indexed so.
+        fit: ``fit_status`` and ``goodness_p``, likewise.
+        histograms: of these pixels.
+        masses: of :func:`bin_masses`.
+        channel: whether they are channels of ready-made histograms.
+    """
+    names = (*PARAMETERS, "read_noise_e")
+    found = []
+    for i, (label, y, x) in enumerate(chosen):
+        word, mass = int(fit["fit_status"][y, x]), masses[i] if masses else None
+        found.append(
+            PixelFit(
+                label=label,
+                y=y,
+                x=x,
+                origin=int(histograms.origin[i]),
+                counts=histograms.counts[i],
+                parameters={name: float(maps[name][y, x]) for name in names},
+                stderr={name: float(maps[f"{name}_stderr"][y, x]) for name in names},
+                status=describe(word) if word else "",
+                goodness_p=float(fit["goodness_p"][y, x]) if "goodness_p" in fit else float("nan"),
+                channel=channel,
+                mass=None if mass is None or not np.isfinite(mass).all() else mass,
+            )
+        )
+    return found
+
+
+def bin_masses(
+    columns: Sequence[NDArray[np.float64]], histograms: PixelHistograms, model: FittedModel
+) -> list[NDArray[np.float64]]:
+    """Return the probability of each bin of n pixels under a model with effects; NaN without parameters.
+
+    None are returned under a model without effects, whose law is the PCD.
+
+    Args:
+        columns: (H, g, mu, sigma), shape (n,) each.
+        histograms: of these pixels.
+        model: of these pixels.
+    """
+    counts = histograms.counts
+    if not counts or not model.effects:
+        return []
+    found = np.full((len(counts), counts[0].size), np.nan)
+    known = np.flatnonzero(np.isfinite(columns).all(axis=0))
+    if known.size:
+        kept = [column[known] for column in columns]
+        law = marginal_model(
+            model.effects, pixel_maps(kept, np.ones(known.size, bool)), model.at(known).added
+        )
+        codes = histograms.origin[known][:, None] + np.arange(counts[0].size)
+        amplitude, weight = histograms.satellites[:, known]
+        found[known] = marginal_mass(law, kept, codes, lobes=(amplitude, weight))
+    return list(found)
+
+
+@dataclass(frozen=True)
+class ChosenPixels:
+    """Pixels and why they were chosen.
+
+    Attributes:
+        index: ``y * nx + x`` of each, each once, the most telling first; shape (n,).
+        reasons: words and indices; the even sample is not among them.
+    """
+
+    index: NDArray[np.int64]
+    reasons: tuple[tuple[str, tuple[int, ...]], ...]
+
+
+def choose_inspected(
+    maps: Mapping[str, NDArray[Any]],
+    fit: Mapping[str, NDArray[Any]],
+    shown: Sequence[tuple[int, int]],
+    suspects: Sequence[tuple[int, int]] = (),
+    *,
+    everything: int = _ALL_PIXELS,
+    most: int = _SOME_PIXELS,
+) -> ChosenPixels:
+    """Choose the pixels that are in the report in full.
+
+    Args:
+        maps: parameters and standard errors, (y, x), NaN where there is no value.
+        fit: ``fit_status``, and ``goodness_p`` where it is known, (y, x).
+        shown: pixels (y, x) that the report draws.
+        suspects: pixels (y, x) to which the discrepancy verdict points.
+        everything: a sensor of at most so many pixels is taken whole.
+        most: number of pixels of a larger one.
+    """
+    status = np.asarray(fit["fit_status"])
+    ny, nx = status.shape
+    rng = np.random.default_rng(_SEED)
+    reasons = [
+        ("shown in the report", _places(shown, nx)),
+        ("named by the discrepancy verdict", _places(suspects, nx)),
+        *_poor(fit, status),
+        *_flagged(status, rng),
+        *_extreme(maps),
+    ]
+    kept = [(words, where) for words, where in reasons if where.size]
+    first = np.concatenate([where for _, where in kept]) if kept else np.empty(0, np.int64)
+    rest = np.arange(status.size) if status.size <= everything else _even(ny, nx, most, rng)
+    index = _once(np.concatenate([first, rest]))
+    if status.size > everything:
+        index = index[:most]
+    there = set(index.tolist())
+    listed = ((words, tuple(i for i in where.tolist() if i in there)) for words, where in kept)
+    return ChosenPixels(index, tuple((words, where) for words, where in listed if where))
+
+
+def _places(pixels: Sequence[tuple[int, int]], nx: int) -> NDArray[np.int64]:
+    return np.array([y * nx + x for y, x in pixels], dtype=np.int64)
+
+
+def _once(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return each index once, where it comes first."""
+    _, first = np.unique(index, return_index=True)
+    return index[np.sort(first)]
+
+
+def _poor(fit: Mapping[str, NDArray[Any]], status: NDArray[Any]) -> list[tuple[str, NDArray[np.int64]]]:
+    p = np.asarray(fit.get("goodness_p", np.full(status.shape, np.nan)), dtype=np.float64).ravel()
+    return [("poorest goodness of fit", _smallest(p, _POOR))]
+
+
+def _smallest(values: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    known = np.flatnonzero(np.isfinite(values))
+    order = np.argsort(values[known], kind="stable")[:n]
+    return np.asarray(known[order], dtype=np.int64)
+
+
+def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, NDArray[np.int64]]]:
+    """Return some pixels of each reason for caution or failure, drawn at random, in their order."""
+    found = []
+    for bit, words in MEANINGS.items():
+        where = np.flatnonzero(status.ravel() & int(bit))
+        if where.size > _FLAGGED:
+            where = np.sort(rng.choice(where, _FLAGGED, replace=False))
+        found.append((words, where.astype(np.int64)))
+    return found
+
+
+def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, NDArray[np.int64]]]:
+    found = []
+    for name in MAP_NAMES:
+        if name not in maps:
+            continue
+        words = symbol(name)[1]
+        values = np.asarray(maps[name], dtype=np.float64).ravel()
+        found += [
+            (f"largest {words}", _smallest(-values, _EXTREME)),
+            (f"smallest {words}", _smallest(values, _EXTREME)),
+        ]
+        if f"{name}_stderr" in maps:
+            errors = np.asarray(maps[f"{name}_stderr"], dtype=np.float64).ravel()
+            found.append((f"largest standard error of the {words}", _smallest(-errors, _UNSURE)))
+    return found
+
+
+def _even(ny: int, nx: int, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return about ``n`` pixels, one at random in each cell of a grid, in random order."""
+    rows = int(np.clip(round((n * ny / nx) ** 0.5), 1, ny))
+    columns = int(np.clip(round(n / rows), 1, nx))
+    edges_y, edges_x = np.linspace(0, ny, rows + 1), np.linspace(0, nx, columns + 1)
+    y = np.minimum(edges_y[:-1, None] + rng.random((rows, columns)) * (ny / rows), ny - 1).astype(np.int64)
+    x = np.minimum(edges_x[None, :-1] + rng.random((rows, columns)) * (nx / columns), nx - 1).astype(np.int64)
+    return rng.permutation((y * nx + x).ravel())

@@ -1,0 +1,187 @@
+"""What the store says of a run, read into plain data: for the report, ``pchem view`` and notebooks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.run.model_versions import model_of, read_added_exposure
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.discrepancy.result import read_discrepancy
+from pchem_pipeline.stages.methods.result import read_methods
+from pchem_pipeline.stages.report.samples import read_samples
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+    from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.frames.settings import InputSettings
+    from pchem_pipeline.report.data import DiscrepancyData, Samples
+    from pchem_pipeline.run.model_versions import ModelVersion
+    from pchem_pipeline.store.records import StageRecord
+    from pchem_pipeline.store.run_store import RunStore
+
+_FIT_MAPS = ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share")
+_TRUTH = (*PARAMETERS, "read_noise_e")
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """The model with which the pixels of a run were fitted; without effects the PCD.
+
+    Attributes:
+        effects: in their order.
+        added: exposure that they add to single pixels, (j, n), the pixels in one axis; None: nothing.
+        version: of the run's model; None without a fit.
+    """
+
+    effects: tuple[Effect, ...] = ()
+    added: AddedExposure | None = None
+    version: ModelVersion | None = None
+
+    def at(self, index: NDArray[np.int64]) -> FittedModel:
+        """Return the model of some pixels."""
+        return replace(self, added=None if self.added is None else self.added.of(index))
+
+
+@dataclass(frozen=True)
+class PixelHistograms:
+    """Histograms of n pixels.
+
+    Attributes:
+        origin: DN of the first bin of each.
+        counts: frames in each bin, all of one length.
+        satellites: amplitude (e-) and weight of the satellite levels that their fits left free; (2, n).
+    """
+
+    origin: NDArray[np.int64]
+    counts: list[NDArray[np.integer[Any]]]
+    satellites: NDArray[np.float64]
+
+    def of(self, part: slice) -> PixelHistograms:
+        """Return the histograms of successive pixels."""
+        return PixelHistograms(self.origin[part], self.counts[part], self.satellites[:, part])
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """All of a run but its histograms.
+
+    Attributes:
+        name: of the store.
+        sensor: its input.
+        maps: group ``maps`` but the ends of intervals, (y, x).
+        fit: ``fit_status``, and of pixels with a value ``goodness_p``, ... (y, x).
+        intervals: by quantity the ends of its profile intervals.
+        ensemble: group ``ensemble``.
+        truth: true maps of simulated data.
+        facts: group to its attributes, of ``maps`` and ``ensemble``.
+        model: of the fit.
+        discrepancy: the verdict, or None.
+        methods: content of ``methods.json``, or None.
+        samples: the exposures, where there are several, or None.
+        record: of the report that is being made, or None.
+    """
+
+    name: str
+    sensor: SensorInfo
+    maps: Mapping[str, NDArray[Any]]
+    fit: Mapping[str, NDArray[Any]]
+    intervals: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
+    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    truth: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    facts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    model: FittedModel = field(default_factory=FittedModel)
+    discrepancy: DiscrepancyData | None = None
+    methods: Mapping[str, Any] | None = None
+    samples: Samples | None = None
+    record: StageRecord | None = None
+
+
+def read_run(store: RunStore, settings: InputSettings) -> StoredRun:
+    """Read all of a run but its histograms.
+
+    Args:
+        store: the run.
+        settings: its section ``input``.
+
+    Raises:
+        StoreError: an array is missing or corrupt.
+    """
+    model, discrepancy, methods = read_model(store), read_discrepancy(store), read_methods(store)
+    sensor = SensorInfo.read(store)
+    samples = read_samples(store, settings, sensor)
+    arrays = {
+        variable.path: store.read(variable.path)
+        for group in ("maps", "ensemble")
+        for variable in variables_of(group)
+        if store.has(variable.path)
+    }
+    paths = (*(f"fit/{name}" for name in _FIT_MAPS), *(f"truth/{name}" for name in _TRUTH))
+    arrays |= {path: store.read(path) for path in paths if store.has(path)}
+    facts = {group: store.attributes(group) for group in ("maps", "ensemble")}
+    groups: dict[str, dict[str, NDArray[Any]]] = {name: {} for name in ("maps", "fit", "ensemble", "truth")}
+    for path, values in arrays.items():
+        group, name = path.split("/", 1)
+        groups[group][name] = values
+    maps, fit = groups.pop("maps"), groups["fit"]
+    if "goodness_q" in maps:
+        fit["goodness_q"] = maps["goodness_q"]
+    if "fit_status" in fit:
+        # only what has a value can agree with its model or not
+        failed = (fit["fit_status"] & int(FAILED)) != 0
+        fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
+    ends = {name: interval_names(name) for name in (*INTERVALS, "dark_current")}
+    found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
+    shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}
+    record = store.records.read("report")
+    return StoredRun(
+        store.path.name, sensor, shown, intervals=found, facts=facts, model=model, discrepancy=discrepancy,
+        methods=methods, samples=samples, record=record, **groups,
+    )  # fmt: skip
+
+
+def read_model(store: RunStore) -> FittedModel:
+    """Read the model with which a run was fitted."""
+    version = model_of(store, "fit")
+    added = None if version is None else read_added_exposure(store, version, None)
+    effects = () if version is None else version.effects
+    return FittedModel(effects, None if added is None else added.flat(), version)
+
+
+def read_histograms(
+    store: RunStore, index: NDArray[np.int64], shape: tuple[int, int], model: FittedModel
+) -> PixelHistograms:
+    """Read the histograms of pixels, chunk by chunk.
+
+    Args:
+        store: the run.
+        index: ``y * nx + x`` of each.
+        shape: of the sensor.
+        model: of the fit; without effects there are no satellite levels.
+
+    Raises:
+        StoreError: an array is missing or corrupt.
+    """
+    y, x = np.divmod(index, shape[1])
+    origin = store.read("histogram/origin").reshape(-1)[index].astype(np.int64)
+    high, wide = store.array("histogram/counts").chunks[:2]
+    chunk = (y // high) * (shape[1] // wide + 1) + x // wide
+    counts: list[NDArray[np.integer[Any]]] = [np.empty(0, np.int64)] * index.size
+    for each in np.unique(chunk):
+        here = np.flatnonzero(chunk == each)
+        y0, x0 = int(y[here[0]] // high * high), int(x[here[0]] // wide * wide)
+        region = (slice(y0, y0 + high), slice(x0, x0 + wide), slice(None))
+        block = store.read("histogram/counts", region)
+        for i in here:
+            counts[i] = block[y[i] - y0, x[i] - x0].copy()
+    free = [f"fit/{name}" for name in FREE_LOBES]
+    satellites = [
+        store.read(path).reshape(-1)[index] if store.has(path) else np.zeros(index.size) for path in free
+    ]
+    return PixelHistograms(origin, counts, np.array(satellites, np.float64).reshape(2, index.size))
