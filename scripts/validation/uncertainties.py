@@ -52,7 +52,9 @@ GUARD_OFF = FitSettings(tail_guard=0)
 
 def judge_together(fit: FitResult) -> FitResult:
     """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
-    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, fit.covariance)
+    of_gain, of_sigma = np.sqrt(fit.covariance[:, 1, 1]), np.sqrt(fit.covariance[:, 3, 3])
+    together = fit.covariance[:, 1, 3] / (of_gain * of_sigma)
+    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, of_gain, of_sigma, together)
     pixels = Judged(noise, stderr, fit.likelihood_gap)
     pool = NoisePool.of(pixels)
     if pool is None:

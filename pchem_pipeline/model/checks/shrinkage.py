@@ -21,7 +21,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.errors.fisher import propagate
 from pchem_pipeline.model.fit.settings import FitSettings
 
 __all__ = ["LOOSEST", "Judged", "NoisePool", "noise_of"]
@@ -156,15 +155,23 @@ def _slope(pixels: Judged, centre: float) -> float:
     return min(0.0, max(slope, -8.0 * np.pi**2 * centre))
 
 
-def noise_of(gain: FloatArray, sigma: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def noise_of(
+    gain: FloatArray,
+    sigma: FloatArray,
+    gain_stderr: FloatArray,
+    sigma_stderr: FloatArray,
+    correlation: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Return s_e = g sigma and its standard error by the delta method, e-, shape (n,).
 
     Args:
         gain: g, e-/DN, shape (n,).
-        sigma: DN, shape (n,).
-        covariance: of (H, g, mu, sigma), shape (n, 4, 4).
+        sigma: DN.
+        gain_stderr: standard error of g, e-/DN.
+        sigma_stderr: standard error of sigma, DN.
+        correlation: of the two estimates.
     """
-    nothing = np.zeros_like(gain)
+    by_gain, by_sigma = sigma * gain_stderr, gain * sigma_stderr
     with np.errstate(invalid="ignore"):
-        stderr = propagate(covariance, np.stack([nothing, sigma, nothing, gain], axis=-1))
-    return gain * sigma, stderr
+        variance = by_gain**2 + by_sigma**2 + 2.0 * correlation * by_gain * by_sigma
+        return gain * sigma, np.sqrt(np.maximum(variance, 0.0))

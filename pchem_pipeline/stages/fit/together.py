@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool
+from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.run.stage import StageContext
@@ -72,7 +72,4 @@ def _judged(store: RunStore, band: _Region) -> Judged:
         )
     )  # fmt: skip
     together = store.read("fit/correlation", (*band, slice(_PAIR, _PAIR + 1))).ravel()
-    by_gain, by_sigma = sigma * of_gain, gain * of_sigma
-    with np.errstate(invalid="ignore"):
-        stderr = np.sqrt(np.maximum(by_gain**2 + by_sigma**2 + 2.0 * together * by_gain * by_sigma, 0.0))
-    return Judged(gain * sigma, stderr, gap)
+    return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), gap)

@@ -82,9 +82,8 @@ def test_pixels_all_alike_do_no_harm() -> None:
 
 
 def test_noise_in_electrons_by_the_delta_method() -> None:
-    covariance = np.diag([1.0, 4e-6, 1.0, 0.01])[None]
-    covariance[0, 1, 3] = covariance[0, 3, 1] = -1e-4
-    noise, error = noise_of(np.array([0.1]), np.array([3.0]), covariance)
+    values = (0.1, 3.0, 2e-3, 0.1, -0.5)
+    noise, error = noise_of(*(np.array([value]) for value in values))
     assert noise[0] == pytest.approx(0.3)
     assert error[0] == pytest.approx(np.sqrt(9 * 4e-6 + 0.01 * 0.01 - 2 * 0.3 * 1e-4))
 
