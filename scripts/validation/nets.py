@@ -42,7 +42,7 @@ PAGES = ("report.json", "discrepancy.json", "methods.json")
 
 #: Names that arrays got since the first net: old name, or its beginning, to what may stand in its place.
 RENAMED: Mapping[str, tuple[str, ...]] = {
-    "joint/": ("samples/", "fit/"),
+    "joint/": ("samples/", "fit/", "maps/"),
     "fit/lobe_": ("fit/satellite_",),
     "discrepancy/code_grown": ("discrepancy/code_extended",),
 }

@@ -33,12 +33,14 @@ def shell(tmp_path, kernels):
 
 
 @pytest.fixture(scope="session")
-def camera(tmp_path_factory, kernels):
+def camera(make_once, kernels):
     """A folder with ``frames/*.tif``, four files of 300 frames of 20 x 28 pixels, and ``truth.zarr``."""
-    folder = tmp_path_factory.mktemp("camera")
-    (folder / "camera.yaml").write_text(CAMERA)
-    Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("simulate", "camera.yaml")
-    return folder
+
+    def simulate(folder):
+        (folder / "camera.yaml").write_text(CAMERA)
+        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("simulate", "camera.yaml")
+
+    return make_once("camera", simulate)
 
 
 @pytest.fixture
@@ -49,10 +51,12 @@ def frames(shell, camera):
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory, camera, kernels):
+def finished(make_once, camera, kernels):
     """An uninterrupted run of the camera's frames, tiles of 8 pixels; do not change it."""
-    folder = tmp_path_factory.mktemp("finished")
-    shutil.copytree(camera / "frames", folder / "frames")
-    (folder / "run.yaml").write_text(RUN)
-    Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml")
-    return folder / "run.zarr"
+
+    def run(folder):
+        shutil.copytree(camera / "frames", folder / "frames")
+        (folder / "run.yaml").write_text(RUN)
+        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml")
+
+    return make_once("finished", run) / "run.zarr"

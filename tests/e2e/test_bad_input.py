@@ -14,6 +14,12 @@ from pchem_pipeline.store.run_store import RunStore
 
 GOOD = np.random.default_rng(2).integers(90, 130, (40, 8, 9), dtype=np.uint16)
 
+OF_ONE_FILE = """
+run: {store: run.zarr}
+input: {files: [a.npy]}
+report: {figure_formats: [], dpi: 72}
+"""
+
 
 def tiff(path, data=GOOD, **options):
     tifffile.imwrite(path, data, photometric=options.pop("photometric", "minisblack"), **options)
@@ -114,7 +120,8 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     stack = np.rint(rng.poisson(2, (2000, 8, 8)) * 10 + rng.normal(100, 3, (2000, 8, 8))).astype(np.uint16)
     stack[:, :3] = 100
     np.save(shell.folder / "a.npy", stack)
-    result = shell("run", "a.npy")
+    (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
+    result = shell("run", "run.yaml")
     assert result.code == 3
     assert "24 of 64 pixels have no value" in result.last
     assert (shell.folder / "run.zarr" / "report.html").exists()
@@ -122,7 +129,8 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
 
 def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
     np.save(shell.folder / "a.npy", np.full((100, 8, 8), 100, np.uint16))
-    result = shell("run", "a.npy")
+    (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
+    result = shell("run", "run.yaml")
     assert result.code == 3
     assert "64 of 64 pixels have no value" in result.last
     assert "again" not in result.stderr

@@ -23,17 +23,33 @@ discrepancy:   # quick
   replicates: 20
   grown_replicates: 12
   candidates: [row_noise, frame_noise]
+report: {figure_formats: [], dpi: 72}
 """
 
 
 @pytest.fixture(scope="module")
-def searched(tmp_path_factory, kernels):
-    """A run whose search was not interrupted; do not change it."""
-    shell = Shell(tmp_path_factory.mktemp("searched"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
+def fitted(tmp_path_factory, kernels):
+    """A run that is fitted with the plain model; copy it."""
+    shell = Shell(tmp_path_factory.mktemp("fitted"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
     (shell.folder / "run.yaml").write_text(CAMERA)
     shell.ok("simulate", "run.yaml")
     for stage in ("ingest", "histogram", "fit"):
         shell.ok(stage, "run.yaml")
+    return shell
+
+
+def copy_of(shell, folder, text=None):
+    """Copy a run, with another YAML if it is given."""
+    shutil.copytree(shell.folder, folder, dirs_exist_ok=True)
+    if text is not None:
+        (folder / "run.yaml").write_text(text)
+    return Shell(folder, shell.environment)
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory, fitted):
+    """A run whose search was not interrupted; do not change it."""
+    shell = copy_of(fitted, tmp_path_factory.mktemp("searched"))
     before = read(shell, "fit/read_noise_dn")
     return shell, shell.ok("discrepancy", "run.yaml"), before
 
@@ -114,13 +130,10 @@ def test_a_second_search_has_nothing_to_do(searched):
     assert "nothing to do" in dry.stderr
 
 
-def test_an_effect_that_the_model_has_is_not_added_twice(searched, tmp_path):
-    shell, _, _ = searched
-    other = Shell(tmp_path, shell.environment)
-    text = (shell.folder / "run.yaml").read_text()
-    (tmp_path / "run.yaml").write_text(text)
-    for stage in ("simulate", "ingest", "discrepancy"):
-        other.ok(stage, "run.yaml")
+def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_path):
+    text = (searched[0].folder / "run.yaml").read_text()
+    other = copy_of(fitted, tmp_path, text)
+    other.ok("discrepancy", "run.yaml")
     found = verdict(other)
     assert found["verdict"] == "consistent"
     assert [e["tag"] for e in found["model_effects"]] == ["row_noise"]
@@ -128,12 +141,9 @@ def test_an_effect_that_the_model_has_is_not_added_twice(searched, tmp_path):
 
 
 @pytest.mark.parametrize("moment", [0.8, 2.0])
-def test_a_killed_search_goes_on_to_the_same_verdict(searched, tmp_path, moment):
+def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path, moment):
     shell, _, _ = searched
-    other = Shell(tmp_path, shell.environment)
-    (tmp_path / "run.yaml").write_text(CAMERA)
-    other.ok("simulate", "run.yaml")
-    other.ok("ingest", "run.yaml")
+    other = copy_of(fitted, tmp_path)
     with other.start("discrepancy", "run.yaml", "--no-refit") as process:
         markers = tmp_path / "run.zarr" / ".pchem" / "done" / "discrepancy"
         wanted = int(12 * moment)
@@ -154,8 +164,8 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, tmp_path, moment)
         ("shape: [16, 16]", "shape: [4, 4]", "fewer than 32"),
     ],
 )
-def test_what_cannot_be_searched_is_one_clear_line(searched, tmp_path, old, new, message):
-    other = Shell(tmp_path, searched[0].environment)
+def test_what_cannot_be_searched_is_one_clear_line(kernels, tmp_path, old, new, message):
+    other = Shell(tmp_path, {**os.environ, "NUMBA_CACHE_DIR": kernels})
     (tmp_path / "run.yaml").write_text(CAMERA.replace(old, new))
     other.ok("simulate", "run.yaml")
     result = other("discrepancy", "run.yaml")
@@ -164,11 +174,9 @@ def test_what_cannot_be_searched_is_one_clear_line(searched, tmp_path, old, new,
     assert "Traceback" not in result.stderr
 
 
-def test_without_add_the_model_stays(searched, tmp_path):
-    other = Shell(tmp_path, searched[0].environment)
-    text = CAMERA + "  add: false\n"
-    (tmp_path / "run.yaml").write_text(text)
-    other.ok("simulate", "run.yaml")
+def test_without_add_the_model_stays(fitted, tmp_path):
+    text = CAMERA.replace("# quick\n", "# quick\n  add: false\n")
+    other = copy_of(fitted, tmp_path, text)
     for _ in range(2):
         other.ok("discrepancy", "run.yaml")
     assert verdict(other)["effects"] == ["row_noise"]

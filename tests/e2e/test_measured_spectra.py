@@ -71,11 +71,11 @@ def test_the_search_names_what_physics_says_and_describes_the_rest(measured):
     assert {"row_noise", "interpixel_capacitance", "bias_drift"} <= set(found["untestable"])
     assert "left unexplained:" in result.stdout
     # the picture shows both: the tail, which the plain model lacks, is there with branching
-    arrays = {n: store.read(f"discrepancy/code_{n}") for n in ("dn", "observed", "expected", "grown")}
+    arrays = {n: store.read(f"discrepancy/code_{n}") for n in ("dn", "observed", "expected", "extended")}
     far = arrays["dn"] >= 300
-    observed, plain, grown = (arrays[n][far].sum() for n in ("observed", "expected", "grown"))
+    observed, plain, extended = (arrays[n][far].sum() for n in ("observed", "expected", "extended"))
     assert plain < observed / 10
-    assert observed / 2 < grown < 2 * observed
+    assert observed / 2 < extended < 2 * observed
     # the fit that follows has the effects: one sigma no longer stands for peaks that widen
     shell.ok("fit", "sipm.yaml")
     after = store.read("fit/read_noise_dn")

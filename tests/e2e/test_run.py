@@ -173,7 +173,8 @@ def test_electron_numbers_are_mostly_the_true_ones(shell, camera, frames, finish
 
 
 def test_json_log_and_quiet(shell, frames):
-    result = shell.ok("run", "frames", "--quiet", "--log-json", "log.jsonl")
+    (shell.folder / "run.yaml").write_text(RUN)
+    result = shell.ok("run", "run.yaml", "--quiet", "--log-json", "log.jsonl")
     assert not [line for line in result.stderr.splitlines() if "units in" in line]
     events = [json.loads(line) for line in (shell.folder / "log.jsonl").read_text().splitlines()]
     assert [event["stage"] for event in events if event["event"] == "start"] == STAGES
