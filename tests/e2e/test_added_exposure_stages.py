@@ -36,6 +36,7 @@ def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None
             "grown_replicates": 12,
             "candidates": ["dark_current_rts", "exposure_flicker"],
         },
+        "report": {"figure_formats": [], "dpi": 72},
         "compute": {"backend": "serial"},
     }
     path = tmp_path / "run.yaml"

@@ -13,12 +13,21 @@ from pchem_pipeline.store.run_store import RunStore
 
 SPECTRA = sorted(SIPM.glob("*.csv"))
 
+YAML = """
+run: {store: sipm.zarr}
+report: {figure_formats: [], dpi: 72}
+input:
+  files:
+"""
+
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory, kernels):
     """The spectra, run through every stage."""
     shell = Shell(tmp_path_factory.mktemp("measured"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
-    return shell, shell.ok("run", *SPECTRA, "--store", "sipm.zarr")
+    files = "".join(f"    - {path}\n" for path in SPECTRA)
+    (shell.folder / "sipm.yaml").write_text(YAML + files)
+    return shell, shell.ok("run", "sipm.yaml")
 
 
 def test_ready_made_histograms_go_through_every_stage(measured):
