@@ -1,1 +1,1 @@
-"""Who does the work: serial, threads, processes or a cluster, behind one small interface."""
+"""Executors behind one small interface: serial, threads, processes, a dask cluster."""

@@ -1,4 +1,4 @@
-"""The doors of this room: from the settings to one reader over all files."""
+"""Open the camera files of the section ``input`` as one stack."""
 
 from __future__ import annotations
 

@@ -183,7 +183,7 @@ def _storage(protocol: str) -> Any:
 
 
 def zarr_place(path: Path, *, writable: bool) -> Any:
-    """Return what zarr opens."""
+    """Return what zarr opens: a path of the disk, or its store on top of fsspec."""
     if not isinstance(path, RemotePath):
         return str(path)
     from zarr.storage import FsspecStore

@@ -320,7 +320,7 @@ def _words(region: _Region) -> str:
 
 
 def _compressors(name: str, dtype: np.dtype[Any]) -> list[Any]:
-    """Fast for frames, small for the rest; a checksum, so that a corrupt chunk is never silent."""
+    """Return the codecs of an array: fast for frames, small for the rest; a checksum finds corrupt chunks."""
     from zarr.codecs import BloscCodec, Crc32cCodec
 
     cname: Literal["lz4", "zstd"] = "lz4" if name == "frames/dn" else "zstd"
