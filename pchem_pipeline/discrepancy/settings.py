@@ -65,5 +65,8 @@ class DiscrepancySettings(Section):
         default=None, description="effects (tags) to consider; null: all that are known, plug-ins included"
     )
     exclude: tuple[str, ...] = Field(default=(), description="effects (tags) to leave out")
-    add: bool = Field(default=True, description="put the named effects into model.effects of the run's YAML")
+    add: bool = Field(
+        default=True,
+        description="make a new version of the model with the named effects, also in the run's YAML",
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="root of the replicates' random numbers")
