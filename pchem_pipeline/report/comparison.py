@@ -44,7 +44,7 @@ class RunFacts:
     pixels: tuple[int, int, int] = (0, 0, 0)
 
     @property
-    def words(self) -> str:
+    def title(self) -> str:
         """Label and name."""
         return f"{self.label} ({self.name})"
 
@@ -106,7 +106,7 @@ class Pair:
         settings: settings that differ.
         versions: versions of programs and algorithms that differ.
         changed: whether anything changed.
-        words: what, one sentence each.
+        changes: what changed, one sentence each.
     """
 
     one: RunFacts
@@ -119,7 +119,7 @@ class Pair:
     settings: Sequence[Setting] = ()
     versions: Sequence[Setting] = ()
     changed: bool = False
-    words: Sequence[str] = ()
+    changes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ def method_table(exposure: float, options: argparse.Namespace) -> None:
     """Print errors, biases, failures and times at one exposure."""
     from pchem_pipeline.methods.base import Settings
     from pchem_pipeline.methods.study import StudyPoint, study_point
-    from pchem_pipeline.report.figures.methods import crossing_words
+    from pchem_pipeline.report.figures.methods import crossing_text
 
     points = [
         study_point(
@@ -54,7 +54,7 @@ def method_table(exposure: float, options: argparse.Namespace) -> None:
     for name in gain:
         times = [p["methods"][name]["seconds_per_pixel"] for p in points]
         print(f"{name:<34}" + "".join(f"{1e6 * t:>10.0f}" for t in times))
-    print(f"\n{crossing_words(points)}")
+    print(f"\n{crossing_text(points)}")
 
 
 def percent(value: float | None) -> str:

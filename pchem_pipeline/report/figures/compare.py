@@ -74,7 +74,7 @@ def ensembles_figures(runs: Sequence[RunFacts]) -> list[Figure]:
     if len(runs) < 2:
         return []
     highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
-    peaks = ", ".join(f"{run.words}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
+    peaks = ", ".join(f"{run.title}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
     tables = ensemble_tables(runs)
     return [
         Figure(
@@ -101,7 +101,7 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
         if not all(axis in run.ensemble and np.sum(run.ensemble[f"{prefix}counts"]) > 0 for run in runs):
             continue
         curves = [_curve(run, axis, prefix) for run in runs]
-        names = np.concatenate([[run.words] * x.size for run, (x, _, _) in zip(runs, curves, strict=True)])
+        names = np.concatenate([[run.title] * x.size for run, (x, _, _) in zip(runs, curves, strict=True)])
         x, density, error = (np.concatenate(each) for each in zip(*curves, strict=True))
         stored = unit.replace("e⁻", "e-")
         units = {"signal": stored, "density": f"1/{stored}", "standard error": f"1/{stored}"}

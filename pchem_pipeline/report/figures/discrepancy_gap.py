@@ -83,9 +83,9 @@ def pull_figures(data: DiscrepancyData) -> list[Figure]:
         Figure(
             "discrepancy_pulls",
             "shown",
-            "The most telling statistics, before and after",
+            "The statistics farthest from chance, before and after",
             _PULLS_CAPTION,
-            f"Standard deviations of chance. {_pull_words(rows)}.",
+            f"Standard deviations of chance. {_pull_text(rows)}.",
             (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
             partial(draw_pulls, rows=rows),
             PAGE_MM,
@@ -99,7 +99,7 @@ def gap_tables(found: Verdict) -> tuple[DataTable, ...]:
     if not bars:
         return ()
     columns: dict[str, Sequence[Any]] = {
-        "model": [bar.words for bar in bars],
+        "model": [bar.label for bar in bars],
         "role": [bar.role for bar in bars],
         "gap": [bar.gap for bar in bars],
         "low": [bar.low for bar in bars],
@@ -143,7 +143,7 @@ def largest_pulls(data: DiscrepancyData) -> list[Pull]:
     return sorted(rows.values(), key=far, reverse=True)[:_MOST_PULLS]
 
 
-def _pull_words(rows: Sequence[Pull]) -> str:
+def _pull_text(rows: Sequence[Pull]) -> str:
     words = []
     for row in rows[:6]:
         after = f", after {row.after:+.1f}" if math.isfinite(row.after) else ""
@@ -154,23 +154,23 @@ def _pull_words(rows: Sequence[Pull]) -> str:
 
 def _gap_alt(found: Verdict) -> str:
     words = [
-        f"{bar.words} {short(bar.gap)}"
+        f"{bar.label} {short(bar.gap)}"
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
         for bar in gap_bars(found)
     ]
-    return "; ".join([*words, f"floor {gap_words(found.gap.floor)}"])
+    return "; ".join([*words, f"floor {gap_text(found.gap.floor)}"])
 
 
-def gap_words(gap: float) -> str:
+def gap_text(gap: float) -> str:
     """Return a gap in 10⁻⁶ nats, without the unit."""
     return short(MICRO * gap) if math.isfinite(gap) else "not known"
 
 
 @dataclass(frozen=True)
 class GapBar:
-    """One line of the gap's figure: its words, the gap and interval in 1e-6 nats, and its role."""
+    """One line of the gap's figure: its label, the gap and interval in 1e-6 nats, and its role."""
 
-    words: str
+    label: str
     gap: float
     low: float
     high: float
@@ -288,7 +288,7 @@ def _gap_lines(axes: Axes, bars: Sequence[GapBar], floor: float, left: float) ->
         if math.isfinite(bar.low) and math.isfinite(bar.high):
             axes.plot([max(bar.low, left), max(bar.high, left)], [y, y], color=colour, linewidth=1.6)
         _point(axes, bar.gap, y, left, colour, marker)
-    axes.set_yticks(range(len(bars)), [plain(textwrap.fill(bar.words, 24)) for bar in bars])
+    axes.set_yticks(range(len(bars)), [plain(textwrap.fill(bar.label, 24)) for bar in bars])
     axes.set_ylim(len(bars) - 0.5, -0.6)
 
 

@@ -66,10 +66,10 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
     for each in maps:
         known = finite(each.z)
         words.append(
-            f"{each.words}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} (by chance 0 "
+            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} (by chance 0 "
             f"and 1), {count(each.outliers, 'pixel')} beyond 5"
         )
-    columns = {each.words: each.z for each in maps}
+    columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
     return [
         Figure(
@@ -92,7 +92,7 @@ def line_figures(data: DiscrepancyData) -> list[Figure]:
     tables = line_tables(data.arrays, origin)
     if not tables:
         return []
-    words = [_line_words(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
+    words = [_line_text(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
     return [
         Figure(
             "discrepancy_lines",
@@ -138,7 +138,7 @@ def line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> 
     return tuple(tables)
 
 
-def _line_words(line: str, rms: np.ndarray[Any, Any]) -> str:
+def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
     found = []
     for channel, values in zip(CHANNELS, rms, strict=False):
         known = finite(values)
@@ -152,14 +152,14 @@ class PixelMap:
     """One quantity of every pixel in standard deviations of chance, with how far it is from chance.
 
     Attributes:
-        words: what it is.
+        title: what it is.
         z: map (y, x), NaN where there is no value.
         far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
             the mean square, and of the number of pixels beyond 5.
         outliers: pixels beyond 5.
     """
 
-    words: str
+    title: str
     z: FloatArray
     far: float
     outliers: int
@@ -245,7 +245,7 @@ def draw_sensor(
         else:
             _draw_map(figure, top, each, limit, flagged, origin)
         _draw_distribution(bottom, each)
-        top.set_title(textwrap.fill(each.words, 26), fontsize=7.0)
+        top.set_title(textwrap.fill(each.title, 26), fontsize=7.0)
     return figure
 
 

@@ -224,7 +224,7 @@ def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str,
     axes.set_xlim(shown.low, shown.high)
     if not shown.logarithmic:
         axes.xaxis.set_major_locator(MaxNLocator(5))
-    words = f"; {shown.words()}" if shown.words() else ""
+    words = f"; {shown.remark()}" if shown.remark() else ""
     axes.set_title(f"median {short(median)} {unit}{words}", fontsize=6.5, color=colours.faint)
     return shown
 
@@ -300,9 +300,9 @@ def _draw_channels(
     if missing.size:
         axes.plot(missing, np.full(missing.size, 0.03), "x", color=colours.vermilion, markersize=4,
                   transform=axes.get_xaxis_transform())  # fmt: skip
-    if shown.words():
+    if shown.remark():
         cross = " (×)" if missing.size else ""
-        note(axes, shown.words() + cross)
+        note(axes, shown.remark() + cross)
     return figure
 
 

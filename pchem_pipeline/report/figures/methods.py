@@ -51,7 +51,7 @@ def method_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         f"{method['title']}: {percent_text(method['errors']['conversion_gain'].get('rmse'))} %"
         for method in known
     ]
-    crossing = f" {crossing_words(result['study'])}." if result["study"] else ""
+    crossing = f" {crossing_text(result['study'])}." if result["study"] else ""
     return [
         Figure(
             "methods_gain_error",
@@ -245,7 +245,7 @@ def _crossing(
     return None
 
 
-def crossing_words(study: Sequence[Mapping[str, Any]]) -> str:
+def crossing_text(study: Sequence[Mapping[str, Any]]) -> str:
     """Say up to which read noise one-sample PCH-EM beats photon transfer with as many frames."""
     expected, measured = bound_crossing(study), measured_crossing(study)
     if expected is None and measured is None:

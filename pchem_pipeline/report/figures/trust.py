@@ -229,7 +229,7 @@ def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Dra
     # nothing is white, a single sample is seen
     shown = np.where(samples > 0, samples, np.nan)
     top = max(float(np.nanmax(shown, initial=1.0)), 1.0)
-    image = show_map(right, shown, cmap="viridis_r", vmin=0.0, vmax=top)
+    image = show_map(right, shown, cmap=colours.from_paper, vmin=0.0, vmax=top)
     right.set_facecolor(colours.paper)
     bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
     bar.set_label(label)

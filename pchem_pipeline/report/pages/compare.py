@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from pchem_pipeline.model.checks.run_differences import FAR
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, Setting
@@ -16,6 +13,7 @@ from pchem_pipeline.report.figures.compare import difference_figures, ensembles_
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report import template
+from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
@@ -50,21 +48,21 @@ def sentence_of(found: Comparison) -> str:
         return _pair_sentence(found.pairs[0], found.tolerance)
     changed = [pair.other.label for pair in found.pairs if pair.changed]
     if not changed:
-        return f"Nothing changed in any of the {len(found.pairs)} runs against {found.runs[0].words}."
+        return f"Nothing changed in any of the {len(found.pairs)} runs against {found.runs[0].title}."
     same = [pair.other.label for pair in found.pairs if not pair.changed]
     rest = f"; {', '.join(same)} did not" if same else ""
-    return f"Against {found.runs[0].words}, {', '.join(changed)} changed{rest}."
+    return f"Against {found.runs[0].title}, {', '.join(changed)} changed{rest}."
 
 
 def _pair_sentence(pair: Pair, tolerance: float) -> str:
     if pair.changed:
-        more = "" if len(pair.words) == 1 else f" (and {len(pair.words) - 1} more)"
-        first = f"{pair.other.words} differs from {pair.one.words}: {pair.words[0].rstrip('.')}{more}."
-        return f"{first}{_largest_words(pair)}"
+        more = "" if len(pair.changes) == 1 else f" (and {len(pair.changes) - 1} more)"
+        first = f"{pair.other.title} differs from {pair.one.title}: {pair.changes[0].rstrip('.')}{more}."
+        return f"{first}{_largest_text(pair)}"
     if not pair.same_data:
         return (
-            f"Nothing changed: on different frames, all maps of {pair.other.words} agree with those of "
-            f"{pair.one.words} within their standard errors."
+            f"Nothing changed: on different frames, all maps of {pair.other.title} agree with those of "
+            f"{pair.one.title} within their standard errors."
         )
     rows = [row for row in pair.arrays if row.counts and row.state in ("identical", "equal")]
     values = sum(row.n_values for row in rows)
@@ -73,7 +71,7 @@ def _pair_sentence(pair: Pair, tolerance: float) -> str:
     return f"Nothing changed: {count(len(rows), 'array')} with {values:,} values {what}."
 
 
-def _largest_words(pair: Pair) -> str:
+def _largest_text(pair: Pair) -> str:
     """Say by how many standard errors maps of the same frames moved at most."""
     counted = {name: each for name, each in pair.maps.items() if each.n_counted}
     if not pair.same_data or not counted:
@@ -100,7 +98,7 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
 
     parts = [_part(pair, found, pictures(maps[pair.other.label])) for pair in found.pairs]
     page = template("compare.html.j2").render(
-        title=" · ".join(run.words for run in found.runs),
+        title=" · ".join(run.title for run in found.runs),
         level="caution" if found.changed else "good",
         name="Changed" if found.changed else "Nothing changed",
         sentence=sentence_of(found),
@@ -113,11 +111,11 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
 
 
 def _part(pair: Pair, found: Comparison, pictures: list[Picture]) -> _Part:
-    more = len(pair.words) - _MOST_WORDS
-    words = (*pair.words[:_MOST_WORDS], *((f"And {more} more; see compare.json.",) if more > 0 else ()))
+    more = len(pair.changes) - _MOST_WORDS
+    words = (*pair.changes[:_MOST_WORDS], *((f"And {more} more; see compare.json.",) if more > 0 else ()))
     return _Part(
         f"pair-{pair.other.label}",
-        f"{pair.other.words} against {pair.one.words}",
+        f"{pair.other.title} against {pair.one.title}",
         "caution" if pair.changed else "good",
         "Changed" if pair.changed else "Nothing changed",
         _pair_sentence(pair, found.tolerance),
@@ -128,7 +126,7 @@ def _part(pair: Pair, found: Comparison, pictures: list[Picture]) -> _Part:
 
 
 def _numbers(found: Comparison) -> dict[str, Any]:
-    numbers: dict[str, Any] = _plain(
+    numbers: dict[str, Any] = json_value(
         {
             "compare_version": COMPARE_VERSION,
             "changed": found.changed,
@@ -163,7 +161,7 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
         "run": pair.other.label,
         "same_data": pair.same_data,
         "changed": pair.changed,
-        "what": list(pair.words),
+        "what": list(pair.changes),
         "maps": {
             name: {key: value for key, value in vars(each).items() if key not in skipped}
             | ({"reasons": vars(pair.reasons[name])} if name in pair.reasons else {})
@@ -174,19 +172,6 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
         "settings": [vars(setting) for setting in pair.settings],
         "versions": [vars(version) for version in pair.versions],
     }
-
-
-def _plain(value: Any) -> Any:
-    """Turn numpy numbers into what JSON knows; NaN into None."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(item) for item in value]
-    return value
 
 
 _GRADES = ("good fit", "use with caution", "no value")
@@ -220,7 +205,7 @@ def run_table(found: Comparison) -> Table:
     for name in dict.fromkeys(each for run in runs for each in run.rmse):
         cells = [scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs]
         rows.append((f"RMSE, {name.replace('_', ' ')}", *cells))
-    return Table("runs", "The runs", "", ("", *(run.words for run in runs)), tuple(rows))
+    return Table("runs", "The runs", "", ("", *(run.title for run in runs)), tuple(rows))
 
 
 def pair_tables(pair: Pair, tolerance: float) -> list[Table]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pchem_pipeline.discrepancy.verdict import Candidate, GapChange, Moved, Place, Rival, Step, Verdict
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures
-from pchem_pipeline.report.figures.discrepancy_gap import gap_words
+from pchem_pipeline.report.figures.discrepancy_gap import gap_text
 from pchem_pipeline.report.pages.pictures import Drawn, Picture
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table
@@ -82,7 +82,7 @@ _EMPTY = {
 class KeyFact:
     """One number of the first screen, with up to two lines below it."""
 
-    words: str
+    label: str
     value: str
     more: tuple[str, ...] = ()
 
@@ -145,18 +145,11 @@ def verdict_level(found: Verdict) -> tuple[Level, str]:
     return VERDICT_WORDS.get(found.verdict, ("note", found.verdict.capitalize()))
 
 
-def probability_words(p: float) -> str:
+def probability_text(p: float) -> str:
     """Return a probability as people write it."""
     if not math.isfinite(p):
         return ""
     return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
-
-
-def parameter_words(step: Step) -> list[str]:
-    """Return the parameters of a step's effect, each as ``name value ± error unit``."""
-    return [
-        f"{name} = {measured(p.value, p.stderr, unit_text(p.unit))}" for name, p in step.parameters.items()
-    ]
 
 
 def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
@@ -186,8 +179,8 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(gap.before):
         return []
     grown = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    value = f"{gap_words(gap.before)} → {gap_words(gap.after)}" if grown else gap_words(gap.before)
-    more = [f"10⁻⁶ nats per sample; floor {gap_words(gap.floor)}"]
+    value = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if grown else gap_text(gap.before)
+    more = [f"10⁻⁶ nats per sample; floor {gap_text(gap.floor)}"]
     if grown and math.isfinite(gap.closed_fraction):
         more.append(f"{percent(max(gap.closed_fraction, 0.0), 1.0)} of the gap closed{_interval(gap)}")
     return [KeyFact("gap", value, tuple(more))]
@@ -197,7 +190,7 @@ def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
-    return f"; after: {gap_words(low)} to {gap_words(high)}"
+    return f"; after: {gap_text(low)} to {gap_text(high)}"
 
 
 def _effect_facts(found: Verdict) -> list[KeyFact]:
@@ -243,7 +236,7 @@ def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
     more = [f"of a disagreement this large, from {found.replicates} replicates"] if found.replicates else []
-    before, after = probability_words(found.p_global.before), probability_words(found.p_global.after)
+    before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
     value = f"{before} → {after}" if after and found.effects else before
     return [KeyFact("probability by chance", value, tuple(more))]
 
@@ -277,7 +270,7 @@ def _closing(found: Verdict, last: Step) -> list[Flag]:
         if gap.after <= gap.floor:
             flags.append(Flag("good", "The gap that is left is at its floor: chance alone makes as much."))
         else:
-            words = f"{gap_words(gap.after)} against {gap_words(gap.floor)} (10⁻⁶ nats per sample)"
+            words = f"{gap_text(gap.after)} against {gap_text(gap.floor)} (10⁻⁶ nats per sample)"
             flags.append(Flag("note", f"The gap that is left lies above its floor: {words}."))
     share = _closed(last, last.placebo)
     if last.placebo is not None and math.isfinite(share):
@@ -288,8 +281,8 @@ def _closing(found: Verdict, last: Step) -> list[Flag]:
     if last.runner_up is not None and math.isfinite(share):
         closed = percent(max(share, 0.0), 1.0)
         text = f"The second-best effect ({last.runner_up.effect}) closes {closed} of the gap"
-        flags.append(Flag("note", f"{text}; {last.effect} leaves {gap_words(last.gap_after)}, it leaves "
-                                  f"{gap_words(last.runner_up.gap_after)}."))  # fmt: skip
+        flags.append(Flag("note", f"{text}; {last.effect} leaves {gap_text(last.gap_after)}, it leaves "
+                                  f"{gap_text(last.runner_up.gap_after)}."))  # fmt: skip
     return flags
 
 
@@ -328,7 +321,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
     return {part: [table for table in tables if table.rows] for part, tables in parts.items()}
 
 
-def place_words(place: Place) -> str:
+def place_text(place: Place) -> str:
     """Return where a statistic points to: pixels, DN, frames; empty for the whole sensor and run."""
     words = []
     if place.pixels:
@@ -339,11 +332,11 @@ def place_words(place: Place) -> str:
         low, high = place.dn
         words.append(f"{low:g} DN" if low == high else f"{low:g} to {high:g} DN")
     if place.frames:
-        words.append(_frame_words(place.frames))
+        words.append(_frame_text(place.frames))
     return "; ".join(words)
 
 
-def _frame_words(frames: Sequence[int]) -> str:
+def _frame_text(frames: Sequence[int]) -> str:
     if len(frames) <= 4:
         return "frames " + ", ".join(str(frame) for frame in frames)
     return f"{count(len(frames), 'frame')} from {min(frames)} to {max(frames)}"
@@ -355,8 +348,8 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
             place.sentence or _sentence(data, place.statistic),
             place.channel or data.statistics.get(place.statistic, ("", ""))[0],
             signed(place.z),
-            probability_words(place.p),
-            place_words(place) or "everywhere",
+            probability_text(place.p),
+            place_text(place) or "everywhere",
             place.statistic,
         )
         for place in places[:_MOST_PLACES]
@@ -387,7 +380,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 data.titles.get(candidate.effect, ""),
                 measured(candidate.score, candidate.stderr),
                 short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
-                probability_words(candidate.probability),
+                probability_text(candidate.probability),
                 ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
             )
         )
@@ -423,17 +416,17 @@ def _gaps(found: Verdict) -> Table:
     rows = []
     for i, step in enumerate(found.steps):
         low, high = step.gap_interval_after
-        interval = f" ({gap_words(low)} to {gap_words(high)})" if math.isfinite(low) else ""
+        interval = f" ({gap_text(low)} to {gap_text(high)})" if math.isfinite(low) else ""
         rivals = [
-            f"{gap_words(rival.gap_after)} ({rival.effect})" if rival is not None else ""
+            f"{gap_text(rival.gap_after)} ({rival.effect})" if rival is not None else ""
             for rival in (step.runner_up, step.placebo)
         ]
         rows.append(
             (
                 f"{i + 1}: {found.added(step) or step.verdict}",
-                gap_words(step.gap_before),
-                f"{gap_words(step.gap_after)}{interval}",
-                gap_words(step.gap_floor),
+                gap_text(step.gap_before),
+                f"{gap_text(step.gap_after)}{interval}",
+                gap_text(step.gap_floor),
                 *rivals,
             )
         )
@@ -504,7 +497,7 @@ def _untestable(data: DiscrepancyData) -> Table:
 
 def _unexplained(places: Sequence[Place]) -> Table:
     rows = tuple(
-        (place.sentence or place.statistic, signed(place.z), place_words(place), place.statistic)
+        (place.sentence or place.statistic, signed(place.z), place_text(place), place.statistic)
         for place in places[:_MOST_PLACES]
     )
     return Table(

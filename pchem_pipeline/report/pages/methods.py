@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.methods import crossing_words, gain_rmse, percent_text
+from pchem_pipeline.report.figures.methods import crossing_text, gain_rmse, percent_text
 from pchem_pipeline.report.pages.tables import Table
 
 _COLUMNS = (
@@ -59,7 +59,7 @@ def methods_text(result: Mapping[str, Any]) -> str:
             f"{at['n_pixels']} pixels at each read noise: rmse of g in %",
             *_study_lines(result["study"]),
             "",
-            crossing_words(result["study"]),
+            crossing_text(result["study"]),
         ]
     return "\n".join(lines)
 
@@ -125,7 +125,7 @@ def method_tables(data: ReportData) -> list[Table]:
     against = {"truth": "the truth", "fit": "the fit of this run, from the same frames"}[result["reference"]]
     rows = [row if len(row) > 2 else (*row, *[""] * (len(_HEAD) - 2)) for row in method_rows(result)]
     remarks = " ".join(f"{remark[0].upper()}{remark[1:]}." for remark in result["remarks"])
-    verdict = crossing_words(result["study"]) if result["study"] else ""
+    verdict = crossing_text(result["study"]) if result["study"] else ""
     caption = (
         f"The same {result['pixels']:,} {data.noun}s for every method; errors against {against}. "
         f"{f'{verdict[0].upper()}{verdict[1:]}.' if verdict else ''} {remarks}"

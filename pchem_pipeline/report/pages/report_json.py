@@ -30,7 +30,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
     """
     facts = dict(data.ensemble_facts)
     rmse = dict(facts.pop("rmse", {}))
-    numbers: dict[str, Any] = _plain(
+    numbers: dict[str, Any] = json_value(
         {
             "report_version": REPORT_VERSION,
             "title": data.title,
@@ -167,18 +167,18 @@ def _discrepancy(data: ReportData) -> dict[str, Any] | None:
     return {"verdict": found.verdict, "sentence": found.sentence, "effects": found.effects}
 
 
-def _plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Turn numpy scalars and arrays, tuples and odd objects into what JSON knows; NaN into None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return json_value(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | int | bool):
         return value
     if isinstance(value, Sequence):
-        return [_plain(item) for item in value]
+        return [json_value(item) for item in value]
     return str(value)

@@ -32,7 +32,7 @@ class KeyNumber:
     """A number of the first screen: the median over the pixels and the spread between them."""
 
     name: str
-    words: str
+    label: str
     value: str
     spread: str
     per_pixel: str

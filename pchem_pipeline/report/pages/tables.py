@@ -53,7 +53,7 @@ def provenance_tables(data: ReportData) -> list[Table]:
     return [table for make in (_run, _stages, _inputs) if (table := make(data)).rows]
 
 
-def size_words(size: float) -> str:
+def size_text(size: float) -> str:
     """Return a number of bytes in MB or GB."""
     return (
         f"{size / 1e9:.2f} GB"
@@ -450,7 +450,7 @@ def _stages(data: ReportData) -> Table:
                 str(stage.get("state", "")),
                 f"{float(stage['seconds']):.1f} s" if stage.get("seconds") is not None else "",
                 f"{float(stage['cpu_seconds']):.1f} s" if stage.get("cpu_seconds") is not None else "",
-                size_words(float(memory)) if memory else "",
+                size_text(float(memory)) if memory else "",
                 str(stage.get("started", "")),
             )
         )
@@ -471,7 +471,7 @@ def _inputs(data: ReportData) -> Table:
     rows = [
         (
             str(entry.get("name", "")),
-            size_words(float(entry["size"])) if entry.get("size") is not None else "",
+            size_text(float(entry["size"])) if entry.get("size") is not None else "",
             str(entry.get("hash", "")),
         )
         for entry in data.inputs[:_MOST_FILES]

@@ -36,6 +36,7 @@ class Palette:
         grid: lines of a grid.
         no_value: pixels without a value in maps, outside the range of ``MAP_COLOURS`` in hue and saturation.
         mark: what the verdict points to.
+        from_paper: colours of a map that begin with the paper's lightness.
     """
 
     ink: str = "#000000"
@@ -54,6 +55,7 @@ class Palette:
     grid: str = "#DDDDDD"
     no_value: str = "#D9D9D9"
     mark: str = "#F0E442"
+    from_paper: str = "viridis_r"
 
     @property
     def cycle(self) -> tuple[str, ...]:
@@ -80,6 +82,7 @@ DARK = Palette(
     grid="#39434C",
     no_value="#4A4A4A",
     mark="#7A7320",
+    from_paper="viridis",
 )
 
 

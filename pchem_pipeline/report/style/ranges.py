@@ -39,7 +39,7 @@ class DisplayRange:
         """Number of finite values that are not drawn."""
         return self.n_below + self.n_above
 
-    def words(self) -> str:
+    def remark(self) -> str:
         """Return a note on what is not drawn, e.g. ``3 outside the axis; 5 without a value``."""
         parts = []
         if self.n_outside:

@@ -107,9 +107,9 @@ def map_entry(listed: Listed) -> MapEntry:
     if variable.path == "fit/fit_status":
         kind, words = "bits", {int(bit): text for bit, text in MEANINGS.items()}
     elif "flag_masks" in attributes:
-        kind, words = "bits", _flag_words(attributes, "flag_masks")
+        kind, words = "bits", _flag_texts(attributes, "flag_masks")
     elif "flag_values" in attributes:
-        kind, words = "words", _flag_words(attributes, "flag_values")
+        kind, words = "words", _flag_texts(attributes, "flag_values")
     elif variable.dtype == "uint8":
         words = {int(number): text.strip() for number, text in _WORDS.findall(variable.long_name)}
         kind = "words" if words else "value"
@@ -120,7 +120,7 @@ def map_entry(listed: Listed) -> MapEntry:
     return MapEntry(variable.path, label, variable.unit, variable.long_name, kind, words)
 
 
-def _flag_words(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
+def _flag_texts(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
     texts = str(attributes.get("flag_meanings", "")).split()
     return {int(n): text.replace("_", " ") for n, text in zip(attributes[key], texts, strict=False)}
 

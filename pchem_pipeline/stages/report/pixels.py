@@ -159,7 +159,7 @@ class ChosenPixels:
     """Pixels and why they were chosen.
 
     Attributes:
-        index: ``y * nx + x`` of each, each once, the most telling first; shape (n,).
+        index: ``y * nx + x`` of each, each once, the shown and odd ones first; shape (n,).
         reasons: words and indices; the even sample is not among them.
     """
 

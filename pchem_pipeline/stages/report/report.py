@@ -234,7 +234,7 @@ def _run_facts(run: StoredRun, config: RunConfig) -> dict[str, Any]:
     sensor = run.sensor
     facts: dict[str, Any] = {
         "store": run.name,
-        "input": _input_words(sensor),
+        "input": _input_text(sensor),
         "type of the data": sensor.dtype,
         "bit depth": sensor.bit_depth,
         "digest of the input": sensor.identity.get("digest", ""),
@@ -273,7 +273,7 @@ def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:
     }
 
 
-def _input_words(sensor: SensorInfo) -> str:
+def _input_text(sensor: SensorInfo) -> str:
     if sensor.samples:
         return f"{len(sensor.samples)} samples; maps and ensemble show {sensor.samples[sensor.shown].name}"
     return f"{sensor.kind}, {sensor.mode}" if sensor.kind == "frames" else "ready-made histograms"

@@ -277,7 +277,7 @@ def test_the_path_of_a_drift_is_what_the_frames_show() -> None:
 
 
 def test_the_largest_maps_are_those_with_structure() -> None:
-    words = [each.words for each in largest_maps(discrepancy_data().arrays)]
+    words = [each.title for each in largest_maps(discrepancy_data().arrays)]
     assert words[0].startswith("goodness of fit")
     assert words[1] == "readout: heavy tails (He4)"
     assert largest_maps({}) == []
@@ -299,16 +299,16 @@ def test_a_comb_a_pile_up_and_an_alternation_are_in_the_numbers() -> None:
 
 def test_the_gap_has_a_line_for_every_model() -> None:
     bars = discrepancy_gap.gap_bars(verdict_of("named"))
-    assert [(bar.words, bar.role, round(bar.gap, 1)) for bar in bars] == [
+    assert [(bar.label, bar.role, round(bar.gap, 1)) for bar in bars] == [
         ("plain model", "before", 477.0),
         ("with row_noise", "after", 31.0),
         ("… and bias_drift", "after", 1.8),
         ("runner-up: periodic_pickup", "runner-up", 120.0),
         ("placebo: flicker_noise", "placebo", 116.4),
     ]
-    doubt = [bar.words for bar in discrepancy_gap.gap_bars(verdict_of("ambiguous"))]
+    doubt = [bar.label for bar in discrepancy_gap.gap_bars(verdict_of("ambiguous"))]
     assert doubt[1] == "with row_noise or periodic_pickup or interpixel_capacitance"
-    assert [bar.words for bar in discrepancy_gap.gap_bars(verdict_of("consistent"))] == ["plain model"]
+    assert [bar.label for bar in discrepancy_gap.gap_bars(verdict_of("consistent"))] == ["plain model"]
     unmeasured = dict.fromkeys(("before", "after", "floor", "closed_fraction"))
     assert discrepancy_gap.gap_bars(verdict_of("consistent", gap=unmeasured)) == []
     rows = discrepancy_gap.families(verdict_of("named"))

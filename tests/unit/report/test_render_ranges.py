@@ -16,14 +16,14 @@ def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:
     assert shown.high < 0.5
     assert shown.n_above == 7 + int((values[9:] > shown.high).sum())
     assert shown.n_missing == 2
-    assert f"{shown.n_outside} outside the axis" in shown.words()
-    assert "2 without a value" in shown.words()
+    assert f"{shown.n_outside} outside the axis" in shown.remark()
+    assert "2 without a value" in shown.remark()
 
 
 def test_all_values_are_drawn_where_none_is_odd() -> None:
     shown = robust_range(np.linspace(1.0, 2.0, 500))
     assert (shown.low, shown.high, shown.n_outside) == (1.0, 2.0, 0)
-    assert shown.words() == ""
+    assert shown.remark() == ""
 
 
 def test_decades_make_a_logarithmic_axis_but_not_for_signed_data() -> None:

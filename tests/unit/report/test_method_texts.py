@@ -8,7 +8,7 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import csv_text
 from pchem_pipeline.report.figures.methods import (
     bound_crossing,
-    crossing_words,
+    crossing_text,
     measured_crossing,
     method_figures,
 )
@@ -85,8 +85,8 @@ def test_the_crossing_is_interpolated():
     assert measured_crossing(STUDY) == pytest.approx(0.5 + 0.1 * 0.0953 / (0.0953 + 0.9445), abs=1e-3)
     assert bound_crossing(STUDY) > measured_crossing(STUDY)
     assert measured_crossing(STUDY[:2]) is None
-    assert "do not cross" in crossing_words(STUDY[:1])
-    assert "0.51 e- on the simulated pixels" in crossing_words(STUDY)
+    assert "do not cross" in crossing_text(STUDY[:1])
+    assert "0.51 e- on the simulated pixels" in crossing_text(STUDY)
 
 
 def test_the_text_has_a_row_for_every_method():
