@@ -1,0 +1,128 @@
+"""The examples of CONTRIBUTING.md as they stand: a package of others, and additions to a copy of ours."""
+
+import csv
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.places import ROOT
+
+from pchem_pipeline.store.run_store import RunStore
+
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+EXAMPLE = re.compile(
+    r"<!-- file: (?P<file>\S+?)(?:, (?P<where>before|behind): (?P<anchor>.+?))? -->\n"
+    r"```\w+\n(?P<text>.*?)```",
+    re.S,
+)
+
+
+def write_examples(folder):
+    """Write the files of the examples, and put the additions to ours into the copy of our package."""
+    for example in EXAMPLE.finditer(TEXT):
+        path, text = folder / example["file"], example["text"]
+        if example["where"] is None:
+            assert not path.exists()
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+            continue
+        anchor = example["anchor"].replace("\\n", "\n")
+        before, found, behind = path.read_text().partition(anchor)
+        assert found, f"{example['file']} has no {anchor!r}"
+        added = text + found if example["where"] == "before" else f"{found}\n{text.rstrip()}"
+        path.write_text(before + added + behind)
+
+
+def install(project, site):
+    """Leave a package as pip leaves it: its modules, and what its pyproject.toml announces."""
+    about = tomllib.loads((project / "pyproject.toml").read_text())
+    info = site / f"{about['project']['name'].replace('-', '_')}-{about['project']['version']}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {about['project']['name']}\nVersion: {about['project']['version']}\n"
+    )
+    points = about["project"]["entry-points"].items()
+    (info / "entry_points.txt").write_text(
+        "".join(f"[{group}]\n" + "".join(f"{a} = {b}\n" for a, b in rows.items()) for group, rows in points)
+    )
+    for module in about["tool"]["setuptools"]["py-modules"]:
+        shutil.copy(project / f"{module}.py", site)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory, kernels):
+    """The folder in which all commands of the page were run, in order."""
+    folder = tmp_path_factory.mktemp("contributing")
+    shutil.copytree(
+        ROOT / "pchem_pipeline", folder / "pchem_pipeline", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    write_examples(folder)
+    install(folder / "lab_effects", folder / "site")
+    (folder / "bin").mkdir()
+    pchem = folder / "bin" / "pchem"
+    pchem.write_text(f"#!{sys.executable}\nfrom pchem_pipeline.cli.app import main\nmain()\n")
+    pchem.chmod(0o755)
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": kernels,
+        "PYTHONPATH": os.pathsep.join(map(str, (folder, folder / "site"))),
+        "PATH": os.pathsep.join([str(folder / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]]),
+    }
+    script = "set -e\n" + "\n".join(re.findall(r"```bash\n(.*?)```", TEXT, re.S))
+    result = subprocess.run(
+        ["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True, timeout=500
+    )
+    assert result.returncode == 0, result.stderr
+    return folder
+
+
+def test_the_effect_is_simulated_and_fitted(done):
+    store = RunStore.open(done / "odd_even.zarr")
+    fitted, true = store.read("fit/read_noise_dn"), store.read("truth/read_noise_dn")
+    # without the effect in the law the fit would find (sigma^2 + 4)^(1/2) DN
+    assert abs(np.median(fitted / true) - 1) < 0.05
+    assert np.median(np.hypot(true, 2.0) / true) > 1.1
+
+
+def test_the_reader_reads(done):
+    store = RunStore.open(done / "night.zarr")
+    assert store.read("maps/quanta_exposure").shape == (9, 10)
+    assert np.nanmedian(store.read("maps/quanta_exposure")) == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_method_stands_beside_the_others(done):
+    assert "low_side" in (done / "night.zarr" / "methods.json").read_text()
+
+
+def test_the_stage_writes_its_array(done):
+    store = RunStore.open(done / "night.zarr")
+    expected = np.nanmedian(store.read("maps/read_noise_e"), axis=1)
+    np.testing.assert_allclose(store.read("lines/read_noise_e"), expected)
+    assert store.records.read("lines").finished
+
+
+def test_the_figure_is_in_the_report_and_has_its_numbers(done):
+    assert "Read noise of the rows" in (done / "night.zarr" / "report.html").read_text()
+    assert (done / "figures" / "read_noise_of_rows.svg").exists()
+    with (done / "figures" / "read_noise_of_rows.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["y", "read noise (e-)"]
+    assert len(rows) == 10
+
+
+def test_the_files_that_it_names_exist():
+    words = set(re.findall(r"`([\w/]+\.(?:py|md|toml))\b", TEXT)) | set(
+        re.findall(r"`((?:scripts|tests)/[\w/.]+)`", TEXT)
+    )
+    added = {example["file"] for example in EXAMPLE.finditer(TEXT)}
+    for word in words:
+        places = (ROOT / word, ROOT / "pchem_pipeline" / word)
+        assert any(place.exists() for place in places) or word in added, word
+    for folder in re.findall(r"^(\w+)/ ", TEXT, re.M):
+        assert (ROOT / folder).is_dir() or (ROOT / "pchem_pipeline" / folder).is_dir(), folder
