@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.inspector_material import make_run
+from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.commands.view import make_server
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import display_transform
-from pchem_pipeline.report.inspector.packing import unpack_map
 from pchem_pipeline.report.style.wording import measured, short, symbol
 from pchem_pipeline.stages.report.inspector import packed_map
 from pchem_pipeline.store.run_store import RunStore

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PackedMap", "Scale", "choose_scale", "pack_counts", "pack_map", "unpack_map", "varints"]
+__all__ = ["PackedMap", "Scale", "choose_scale", "pack_counts", "pack_map", "varints"]
 
 FloatArray = NDArray[np.float64]
 
@@ -106,20 +106,6 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     content = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
     return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0))
-
-
-def unpack_map(packed: PackedMap, shape: tuple[int, int]) -> FloatArray:
-    """Return the values of a packed map, as the page does it."""
-    content, n = gzip.decompress(packed.data), shape[0] * shape[1]
-    planes = np.frombuffer(content, np.uint8, 2 * n).astype(np.uint16)
-    codes = planes[:n] | planes[n:] << 8
-    values = packed.scale.low + packed.scale.step * (codes.astype(np.float64) - _FIRST)
-    values = 10.0**values if packed.scale.log else values
-    values[codes == _NONE] = np.nan
-    values[codes == _BELOW] = 0.0
-    odd = np.frombuffer(content, "<u4", packed.n_odd, 2 * n)
-    values[odd] = np.frombuffer(content, "<f4", packed.n_odd, 2 * n + 4 * packed.n_odd)
-    return values.reshape(shape)
 
 
 def varints(values: NDArray[Any]) -> bytes:

@@ -1,18 +1,18 @@
-"""Read the verdict that the stage ``discrepancy`` left in a run, with its arrays and the names of effects."""
+"""The verdict that the stage ``discrepancy`` left in a run: its state, and what the report shows of it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.base.variables import variables_of
+from numpy.typing import NDArray
+
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.verdict import read_verdict
+from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.report.data import DiscrepancyData
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
-
-__all__ = ["discrepancy_state", "read_discrepancy"]
 
 _STAGE = "discrepancy"
 
@@ -27,21 +27,19 @@ def discrepancy_state(store: RunStore) -> str | None:
     return f"{found.verdict}{when}"
 
 
-def read_discrepancy(store: RunStore) -> DiscrepancyData | None:
-    """Return what the report shows of the verdict, or None where there is none.
+def verdict_data(found: Verdict, arrays: Mapping[str, NDArray[Any]]) -> DiscrepancyData:
+    """Return what the report shows of a verdict, with the names of effects and statistics.
 
-    Raises:
-        StoreError: the JSON or an array cannot be read.
+    Args:
+        found: the verdict.
+        arrays: group ``discrepancy`` of the store.
     """
     from pchem_pipeline.effects.framework.registry import effect_classes
 
-    found = read_verdict(store.path)
-    if found is None:
-        return None
     effects = effect_classes()
     return DiscrepancyData(
         found=found,
-        arrays={v.name: store.read(v.path) for v in variables_of(_STAGE) if store.has(v.path)},
+        arrays=arrays,
         statistics={name: (s.channel, s.sentence) for name, s in STATISTICS.items()},
         titles={tag: effect.title for tag, effect in effects.items() if effect.title},
         sources={tag: effect.source for tag, effect in effects.items() if effect.source},

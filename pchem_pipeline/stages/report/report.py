@@ -16,13 +16,14 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.data import ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.inspector.inspector_data import PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
+from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.report.drawing import draw_by_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
@@ -35,6 +36,7 @@ from pchem_pipeline.stages.report.pixels import (
 )
 from pchem_pipeline.stages.report.plan_section import plan_section
 from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
+from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
@@ -125,7 +127,7 @@ def gather(
     Raises:
         StoreError: maps or histograms are missing.
     """
-    run = read_run(store, config.input)
+    run = read_run(store)
     shape, shown, worst = run.sensor.shape, _shown(run, config), _worst(run)
     full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
     index = np.concatenate([pixel_index([*shown, *worst], shape), full.index])
@@ -169,7 +171,7 @@ def _worst(run: StoredRun) -> list[Chosen]:
 
 def _suspects(run: StoredRun) -> list[tuple[int, int]]:
     """Return the pixels to which the verdict points."""
-    return [] if run.discrepancy is None else [p for each in run.discrepancy.found.where for p in each.pixels]
+    return [] if run.verdict is None else [p for each in run.verdict.where for p in each.pixels]
 
 
 def report_data(
@@ -225,9 +227,23 @@ def report_data(
         methods=run.methods,
         # several samples need other frames than one: see pchem plan
         plan=None if sensor.samples else plan_section(maps, n_frames),
-        discrepancy=run.discrepancy,
-        samples=run.samples,
+        discrepancy=None if run.verdict is None else verdict_data(run.verdict, run.discrepancy),
+        samples=_samples(run, config),
     )
+
+
+def _samples(run: StoredRun, config: RunConfig) -> Samples | None:
+    """Return the exposures of a run of several; None for a run of one."""
+    found = run.sensor.samples
+    if not found or "quanta_exposure" not in run.samples:
+        return None
+    x = exposure_axis(config.input, found)
+    places = [None if x is None or np.isnan(x[i]) else float(x[i]) for i in range(len(found))]
+    samples = [
+        Sample(each.name, "bias" if each.bias else "exposed", place, each.n_frames)
+        for each, place in zip(found, places, strict=True)
+    ]
+    return Samples(tuple(samples), config.input.against, run.samples)
 
 
 def _run_facts(run: StoredRun, config: RunConfig) -> dict[str, Any]:

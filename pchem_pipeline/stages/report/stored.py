@@ -10,24 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.stages.discrepancy.result import read_discrepancy
 from pchem_pipeline.stages.methods.result import read_methods
-from pchem_pipeline.stages.report.samples import read_samples
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.frames.settings import InputSettings
-    from pchem_pipeline.report.data import DiscrepancyData, Samples
     from pchem_pipeline.run.model_versions import ModelVersion
     from pchem_pipeline.store.records import StageRecord
     from pchem_pipeline.store.run_store import RunStore
 
-_FIT_MAPS = ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share")
-_TRUTH = (*PARAMETERS, "read_noise_e")
+#: Group to the names of the arrays that the report is made from.
+_ARRAYS: dict[str, tuple[str, ...]] = {
+    **{group: tuple(v.name for v in variables_of(group)) for group in ("maps", "ensemble", "discrepancy")},
+    "fit": ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share"),
+    "truth": (*PARAMETERS, "read_noise_e"),
+    "samples": ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p"),
+}
 
 
 @dataclass(frozen=True)
@@ -82,9 +84,10 @@ class StoredRun:
         truth: true maps of simulated data.
         facts: group to its attributes, of ``maps`` and ``ensemble``.
         model: of the fit.
-        discrepancy: the verdict, or None.
+        verdict: on what the model is missing, or None.
+        discrepancy: group ``discrepancy``, the arrays that go with it.
+        samples: group ``samples``, of a run of several exposures.
         methods: content of ``methods.json``, or None.
-        samples: the exposures, where there are several, or None.
         record: of the report that is being made, or None.
     """
 
@@ -97,38 +100,27 @@ class StoredRun:
     truth: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     facts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     model: FittedModel = field(default_factory=FittedModel)
-    discrepancy: DiscrepancyData | None = None
+    verdict: Verdict | None = None
+    discrepancy: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    samples: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     methods: Mapping[str, Any] | None = None
-    samples: Samples | None = None
     record: StageRecord | None = None
 
 
-def read_run(store: RunStore, settings: InputSettings) -> StoredRun:
+def read_run(store: RunStore) -> StoredRun:
     """Read all of a run but its histograms.
-
-    Args:
-        store: the run.
-        settings: its section ``input``.
 
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    model, discrepancy, methods = read_model(store), read_discrepancy(store), read_methods(store)
-    sensor = SensorInfo.read(store)
-    samples = read_samples(store, settings, sensor)
-    arrays = {
-        variable.path: store.read(variable.path)
-        for group in ("maps", "ensemble")
-        for variable in variables_of(group)
-        if store.has(variable.path)
+    verdict, methods, model = read_verdict(store.path), read_methods(store), read_model(store)
+    sensor, record = SensorInfo.read(store), store.records.read("report")
+    groups = {
+        group: {name: store.read(f"{group}/{name}") for name in names if store.has(f"{group}/{name}")}
+        for group, names in _ARRAYS.items()
+        if group != "discrepancy" or verdict is not None
     }
-    paths = (*(f"fit/{name}" for name in _FIT_MAPS), *(f"truth/{name}" for name in _TRUTH))
-    arrays |= {path: store.read(path) for path in paths if store.has(path)}
     facts = {group: store.attributes(group) for group in ("maps", "ensemble")}
-    groups: dict[str, dict[str, NDArray[Any]]] = {name: {} for name in ("maps", "fit", "ensemble", "truth")}
-    for path, values in arrays.items():
-        group, name = path.split("/", 1)
-        groups[group][name] = values
     maps, fit = groups.pop("maps"), groups["fit"]
     if "goodness_q" in maps:
         fit["goodness_q"] = maps["goodness_q"]
@@ -139,10 +131,9 @@ def read_run(store: RunStore, settings: InputSettings) -> StoredRun:
     ends = {name: interval_names(name) for name in (*INTERVALS, "dark_current")}
     found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
     shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}
-    record = store.records.read("report")
     return StoredRun(
-        store.path.name, sensor, shown, intervals=found, facts=facts, model=model, discrepancy=discrepancy,
-        methods=methods, samples=samples, record=record, **groups,
+        store.path.name, sensor, shown, intervals=found, facts=facts, model=model, verdict=verdict,
+        methods=methods, record=record, **groups,
     )  # fmt: skip
 
 

@@ -364,22 +364,26 @@ def test_the_report_says_what_was_found_among_its_flags() -> None:
 def test_the_page_of_a_run(tmp_path: Path) -> None:
     """From the files of a run: JSON and arrays written, read back, and the same."""
     from pchem_pipeline.base.errors import StoreError
-    from pchem_pipeline.stages.discrepancy.result import discrepancy_state, read_discrepancy
+    from pchem_pipeline.run.sensor import SensorInfo
+    from pchem_pipeline.stages.discrepancy.result import discrepancy_state, verdict_data
+    from pchem_pipeline.stages.report.stored import read_run
     from pchem_pipeline.store.run_store import RunStore
 
     store = RunStore.create(tmp_path / "run.zarr")
-    assert read_discrepancy(store) is None
+    SensorInfo("frames", 400, 32, 41, "uint16", 14, None, "copy", {"files": [], "digest": ""}).write(store)
+    assert read_run(store).verdict is None
     assert discrepancy_state(store) is None
     arrays = evidence_arrays(evidence())
     for name, array in arrays.items():
         store.write_array(f"discrepancy/{name}", array)
     store.write_file("discrepancy.json", json.dumps(result("named")).encode())
-    data = read_discrepancy(store)
-    assert data is not None
+    run = read_run(store)
+    assert run.verdict is not None
+    data = verdict_data(run.verdict, run.discrepancy)
     assert set(data.arrays) == set(arrays)
     np.testing.assert_array_equal(data.arrays["score"], arrays["score"])
     assert data.found.effects == ("row_noise", "bias_drift")
     assert discrepancy_state(store) == "named"
     store.write_file("discrepancy.json", b"[1, 2")
     with pytest.raises(StoreError, match=r"discrepancy.json is damaged .*run pchem discrepancy with --force"):
-        read_discrepancy(store)
+        read_run(store)

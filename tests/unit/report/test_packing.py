@@ -6,13 +6,13 @@ import gzip
 
 import numpy as np
 import pytest
+from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.report.inspector.packing import (
     Scale,
     choose_scale,
     pack_counts,
     pack_map,
-    unpack_map,
     varints,
 )
 
