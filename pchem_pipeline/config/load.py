@@ -87,9 +87,33 @@ def make_config(content: Mapping[str, Any], name: str) -> RunConfig:
         ConfigError: a setting is wrong.
     """
     try:
-        return RunConfig.model_validate(_of_earlier_version(content, name))
+        return RunConfig.model_validate(_of_earlier_version(_renamed(content, name), name))
     except ValidationError as error:
         raise ConfigError(f"{name}: {complaints(error)}") from error
+
+
+#: Keys of version 0.1, and what they are called now; None for one that did nothing.
+_OLD_KEYS: Mapping[str, str | None] = {
+    "discrepancy.grown_replicates": "discrepancy.extended_replicates",
+    "discrepancy.material": None,
+}
+
+
+def _renamed(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Give keys of version 0.1 the names that they have now, and say so in a line each."""
+    result = {key: dict(value) if isinstance(value, dict) else value for key, value in content.items()}
+    for old, new in _OLD_KEYS.items():
+        section, key = old.split(".")
+        if not isinstance(result.get(section), dict) or key not in result[section]:
+            continue
+        value = result[section].pop(key)
+        if new is None:
+            sys.stderr.write(f"pchem: {name}: {old} did nothing and is gone; remove it\n")
+            continue
+        sys.stderr.write(f"pchem: {name}: {old} is now called {new}\n")
+        section, key = new.split(".")
+        result.setdefault(section, {}).setdefault(key, value)
+    return result
 
 
 def _of_earlier_version(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:

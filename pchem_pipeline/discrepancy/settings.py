@@ -18,7 +18,7 @@ class DiscrepancySettings(Section):
         le=2000,
         description="simulated and refitted stacks behind the null distribution, a third of the run each",
     )
-    grown_replicates: int = Field(
+    extended_replicates: int = Field(
         default=16, ge=12, le=2000, description="the same for each model that effects were added to"
     )
     block_frames: int | None = Field(
@@ -55,11 +55,6 @@ class DiscrepancySettings(Section):
     )
     max_rounds: int = Field(
         default=3, ge=1, le=10, description="rounds of naming and adding; each round may add several effects"
-    )
-    material: float = Field(
-        default=0.0,
-        ge=0,
-        description="nats per sample: a smaller remaining gap is not pursued; 0: pursue all",
     )
     candidates: tuple[str, ...] | None = Field(
         default=None, description="effects (tags) to consider; null: all that are known, plug-ins included"

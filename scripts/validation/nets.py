@@ -236,7 +236,7 @@ def hidden(at: Folder) -> None:
     """Name row noise on simulated frames, by replicates."""
     camera = {"shape": [16, 16], "n_frames": 1800, "seed": 5, "output": "hidden", "format": "npy"}
     camera["effects"] = [{"tag": "row_noise", "row_noise_dn": 1.2}]
-    search = {"replicates": 20, "grown_replicates": 12, "candidates": ["row_noise", "frame_noise"]}
+    search = {"replicates": 20, "extended_replicates": 12, "candidates": ["row_noise", "frame_noise"]}
     run = at.run("hidden", None, simulate=camera, discrepancy=search)
     at.pchem("simulate", run)
     at.pchem("run", run, "--until", "fit")

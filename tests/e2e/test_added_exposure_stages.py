@@ -33,7 +33,7 @@ def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None
         "simulate": {"shape": [16, 20], "n_frames": 2400, "seed": 3, "format": "npy", "effects": [BLINKING]},
         "discrepancy": {
             "replicates": 20,
-            "grown_replicates": 12,
+            "extended_replicates": 12,
             "candidates": ["dark_current_rts", "exposure_flicker"],
         },
         "report": {"figure_formats": [], "dpi": 72},

@@ -21,7 +21,7 @@ simulate:
   effects: [{tag: row_noise, row_noise_dn: 1.2}]
 discrepancy:   # quick
   replicates: 20
-  grown_replicates: 12
+  extended_replicates: 12
   candidates: [row_noise, frame_noise]
 report: {figure_formats: [], dpi: 72}
 """

@@ -13,7 +13,7 @@ simulate:
   output: frames
   integration_time: 1.0
   effects: [{tag: row_noise, row_noise_dn: 1.0}]
-discrepancy: {replicates: 24, grown_replicates: 12, candidates: [row_noise, frame_noise, column_noise]}
+discrepancy: {replicates: 24, extended_replicates: 12, candidates: [row_noise, frame_noise, column_noise]}
 """
 
 

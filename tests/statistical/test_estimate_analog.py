@@ -92,8 +92,11 @@ def test_a_path_of_the_gain_is_found():
     found = GainDrift.estimate(evidence_of(effect))
     assert found[0].shape == "path"
     position = np.linspace(0, 1, 50)
-    seen_course, true_course = found[0].drift * found[0]._course(position), 0.06 * effect._course(position)
-    assert np.abs(seen_course - true_course).max() < 0.02
+    seen_profile, true_profile = (
+        found[0].drift * found[0]._profile(position),
+        0.06 * effect._profile(position),
+    )
+    assert np.abs(seen_profile - true_profile).max() < 0.02
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -102,9 +105,9 @@ def test_a_gain_that_settles_is_found_as_such(sign):
     [first] = [e for e in GainDrift.estimate(evidence_of(effect)) if e.shape == "settling"]
     assert 0.05 <= first.settling_fraction <= 0.2
     position = np.linspace(0, 1, 50)
-    apart = first.drift * first._course(position) - effect.drift * effect._course(position)
+    apart = first.drift * first._profile(position) - effect.drift * effect._profile(position)
     assert np.abs(apart).max() < 0.02
-    line = effect.drift * (position - 0.5) - effect.drift * effect._course(position)
+    line = effect.drift * (position - 0.5) - effect.drift * effect._profile(position)
     assert np.abs(line).max() > 0.02  # what the limit would catch
 
 

@@ -17,7 +17,7 @@ from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
-from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_course
+from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_profile
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
@@ -59,7 +59,7 @@ def test_noise_and_what_cannot_be_seen_give_no_hypothesis(hidden, seed):
 
 def test_evidence_without_time_gives_no_hypothesis_on_time():
     evidence = dataclasses.replace(seen(ExposureDrift(drift=0.5)), time=None)
-    assert exposure_course(evidence) is None
+    assert exposure_profile(evidence) is None
     assert block_charge(evidence) is None
     for cls in (ExposureDrift, Persistence, DarkCurrentRts, ExposureFlicker, OpticalCrosstalk, CosmicRays):
         assert len(cls.estimate(evidence)) == 0
@@ -83,7 +83,7 @@ def test_drift(drift, settling):
     truth = ExposureDrift(drift=drift, settling_fraction=settling)
     evidence = seen(truth)
     first, *others = ExposureDrift.estimate(evidence)
-    shape = truth.course(np.linspace(0, 1, 1001))
+    shape = truth.profile(np.linspace(0, 1, 1001))
     stderr = np.sqrt(shot_variance(evidence) / evidence.n_frames / shape.var())
     assert (first.settling_fraction, first.path) == (settling, ())
     assert abs(first.drift - drift) < 5 * stderr
@@ -91,13 +91,13 @@ def test_drift(drift, settling):
     assert len(others) <= 2
 
 
-def test_a_drift_of_any_course_is_followed():
+def test_a_drift_of_any_profile_is_followed():
     t = np.linspace(0, 1, 60)
     truth = ExposureDrift(drift=0.1, path=tuple(np.sin(9 * t)))
     evidence = seen(truth)
     first = ExposureDrift.estimate(evidence)[0]
     at = np.linspace(0, 1, 500)
-    wanted, found = (e.drift * e.course(at) for e in (truth, first))
+    wanted, found = (e.drift * e.profile(at) for e in (truth, first))
     n_nodes = len(first.path)
     stderr = np.sqrt(shot_variance(evidence) * n_nodes / evidence.n_frames)
     assert np.sqrt(np.mean((found - found.mean() - wanted + wanted.mean()) ** 2)) < 3 * stderr

@@ -34,7 +34,7 @@ def compare(found: Verdict, hidden: Effect, truth: Maps, before: Maps, after: Ma
         hidden: the effect in the frames.
         truth: true maps of :data:`COMPARED`.
         before: maps of the plain model, with ``<name>_stderr`` and ``quality``.
-        after: the same of the grown model.
+        after: the same of the extended model.
     """
     title = type(hidden).title
     lines = [f"hidden was: {hidden.tag}{f' ({title})' if title else ''} - {judgement(found, hidden)}"]

@@ -87,9 +87,9 @@ def run_hidden_demo(
     if not (output / _PLAIN_MAPS).exists():
         _run_plain(output, command)
     run_stages(find_run(output / _YAML), ["discrepancy"], command)
-    grown, _ = adopt_verdict(find_run(output / _YAML))
-    run_stages(grown, pipeline_of(grown.config), command)
-    return _text(output, grown)
+    extended, _ = adopt_verdict(find_run(output / _YAML))
+    run_stages(extended, pipeline_of(extended.config), command)
+    return _text(output, extended)
 
 
 def _new_seed() -> int:
@@ -202,7 +202,7 @@ def _unpacked(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _run_plain(output: Path, command: Command) -> None:
-    """Run every stage with the plain model, and keep its maps: the grown model replaces them."""
+    """Run every stage with the plain model, and keep its maps: the extended model replaces them."""
     target = find_run(output / _YAML)
     run_stages(target, [name for name in pipeline_of(target.config) if name != "report"], command)
     write_atomic(output / _PLAIN_MAPS, _packed(_maps(target)))

@@ -189,7 +189,7 @@ class HistogramExplainer:
 
     @property
     def _count(self) -> int:
-        return max(self.settings.grown_replicates, _FEWEST_REPLICATES)
+        return max(self.settings.extended_replicates, _FEWEST_REPLICATES)
 
     def _drawn(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
         """Draw histograms from a law, and observe each, refit included."""

@@ -343,7 +343,7 @@ class FrameExplainer:
 
     def _extended_null(self, maps: PixelMaps, prefix: str) -> NullModel:
         """Return the null of the model with effects; statistics that they leave scatter as they did."""
-        vectors = self._replicates(maps, prefix, self.settings.grown_replicates)
+        vectors = self._replicates(maps, prefix, self.settings.extended_replicates)
         return NullModel.from_replicates(self.first.names, as_matrix(self.first.names, vectors), self.first)
 
     def _counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:

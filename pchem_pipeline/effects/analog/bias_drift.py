@@ -117,7 +117,7 @@ class BiasDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the frames' means on time: a line, and courses that explain more.
+        """Return the regression of the frames' means on time: a line, and time profiles that explain more.
 
         Those are an exponential approach, a path with as many nodes as the Bayesian information criterion
         asks for, and a random walk like that path.

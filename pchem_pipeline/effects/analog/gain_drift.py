@@ -1,4 +1,4 @@
-"""Drift of the conversion gain: the DN per electron change in the course of the run, for all pixels alike.
+"""Drift of the conversion gain: the DN per electron change during the run, for all pixels alike.
 
 The gain of amplifiers and the references of the ADC follow temperature and supply: ``x = round(mu + (1 +
 drift u_t) (K + R) / g)`` with u_t from -1/2 at the first frame to 1/2 at the last (gain stability: EMVA
@@ -55,7 +55,7 @@ class GainDrift(Effect):
     separate: ClassVar[Mapping[str, str]] = {
         "bias_drift": "frames without exposure: a drift of the bias remains there, one of the gain does not",
         "exposure_drift": "a logged light level; the peaks keep their distance where it is the exposure",
-        "signal_dependent_noise": "repeating the run: a drift has a course in time, noise has none",
+        "signal_dependent_noise": "repeating the run: a drift follows a time profile, noise does not",
         "flicker_noise": "dark and bright pixels: a drift of the gain grows with the signal",
     }
     drift: float = Field(
@@ -83,14 +83,14 @@ class GainDrift(Effect):
             raise ValueError("gain_drift: shape path needs `path` with 2 values or more")
         if self.shape != "path" and self.path:
             raise ValueError(f"gain_drift: `path` is for shape path, not {self.shape}; leave one of them out")
-        if abs(self.drift) * float(np.abs(self._course(np.linspace(0.0, 1.0, 4097))).max()) >= 1:
+        if abs(self.drift) * float(np.abs(self._profile(np.linspace(0.0, 1.0, 4097))).max()) >= 1:
             raise ValueError("gain_drift: drift times path takes the gain to zero; make one of them smaller")
         return self
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, scaled by the course of the gain; draws nothing."""
-        course = self._course(run_position(context.frames, context.n_frames))
-        result: NDArray[Any] = values * (1.0 + self.drift * course)[:, None, None]
+        """Return the signal (frame, y, x), e-, scaled by the time profile of the gain; draws nothing."""
+        profile = self._profile(run_position(context.frames, context.n_frames))
+        result: NDArray[Any] = values * (1.0 + self.drift * profile)[:, None, None]
         return result
 
     @classmethod
@@ -101,7 +101,7 @@ class GainDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the gain of the blocks on time: a line, and courses that explain more.
+        """Return the regression of the blocks' gain on time: a line, and time profiles that explain more.
 
         Those are an exponential approach and a path with as many nodes as the Bayesian information criterion
         asks for; the likeliest comes first.
@@ -130,16 +130,16 @@ class GainDrift(Effect):
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law with the variance of the gain: that of the peaks grows as k^2."""
-        course = self.drift * self._course(np.linspace(0.0, 1.0, 1001))
-        return model.with_variance(per_electron2=float(course.var()))
+        profile = self.drift * self._profile(np.linspace(0.0, 1.0, 1001))
+        return model.with_variance(per_electron2=float(profile.var()))
 
-    def _course(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
         nodes = np.array(self.path or (-0.5, 0.5))
-        course: NDArray[np.float64] = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
-        return course - _path_mean(nodes)
+        profile: NDArray[np.float64] = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
+        return profile - _path_mean(nodes)
 
 
 def _improvement(nodes: int) -> float:
@@ -162,10 +162,10 @@ def _chi_square(
 
 
 def _along(
-    gain: NDArray[np.float64], error: NDArray[np.float64], course: NDArray[np.float64]
+    gain: NDArray[np.float64], error: NDArray[np.float64], profile: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Return chi squared that a course at its best scale leaves, and the scale within limits."""
-    left, (_, size) = _chi_square(gain, error, np.stack([np.ones_like(course), course], 1))
+    """Return chi squared that a time profile at its best scale leaves, and the scale within limits."""
+    left, (_, size) = _chi_square(gain, error, np.stack([np.ones_like(profile), profile], 1))
     return left, float(np.clip(size, -0.5, 0.5))
 
 

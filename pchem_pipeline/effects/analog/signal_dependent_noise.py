@@ -50,7 +50,7 @@ class SignalDependentNoise(Effect):
         "noise_skew": "frames without any exposure: a skew remains there, this does not",
         "heavy_tailed_noise": "frames without any exposure: heavy tails remain there, this does not",
         "overdispersed_counts": "higher exposure: peaks of few electrons that are still narrow exclude this",
-        "gain_drift": "repeating the run: a drift has a course in time, noise has none",
+        "gain_drift": "repeating the run: a drift follows a time profile, noise does not",
     }
     noise_e: float = Field(ge=0, description="standard deviation that one electron adds, e-")
     growth: Literal["root", "linear"] = Field(

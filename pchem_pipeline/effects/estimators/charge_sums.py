@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["BlockCharge", "ExposureCourse", "block_charge", "exposure_course", "exposure_nodes"]
+__all__ = ["BlockCharge", "ExposureProfile", "block_charge", "exposure_nodes", "exposure_profile"]
 
 FloatArray = NDArray[np.float64]
 
 
-class ExposureCourse(NamedTuple):
+class ExposureProfile(NamedTuple):
     """Relative deviation of the exposure of each frame from its mean, and its shot noise.
 
     Attributes:
@@ -34,7 +34,7 @@ class ExposureCourse(NamedTuple):
     variance: float
 
 
-def exposure_course(evidence: Evidence) -> ExposureCourse | None:
+def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
     """Return how the exposure common to all pixels went along, or None where time is not known.
 
     Frame t has ``sum(k - H) / sum(H)`` of mean ``d_t sum(Var k) / sum(H)`` and variance ``sum(Var k) /
@@ -50,7 +50,7 @@ def exposure_course(evidence: Evidence) -> ExposureCourse | None:
     if not (variance > 0 and exposure > 0):
         return None
     deviation = np.asarray(time.frame_charge, np.float64) * (exposure / variance)
-    return ExposureCourse(time.frames.astype(np.float64), deviation, 1.0 / variance)
+    return ExposureProfile(time.frames.astype(np.float64), deviation, 1.0 / variance)
 
 
 class BlockCharge(NamedTuple):

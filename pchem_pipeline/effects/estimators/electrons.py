@@ -113,8 +113,8 @@ def regrouped(
     lost = binomial_upper(v, n, drop)
     # where nothing is lost the rest of the number is uniform again
     rest = np.minimum((1.0 - v) / np.exp(n * np.log1p(-drop)), 1.0)
-    grown = binomial_upper(np.where(lost > 0, further_uniform(v, 0), rest), n - lost, grow)
-    owner, number = numbered(grown)
+    more = binomial_upper(np.where(lost > 0, further_uniform(v, 0), rest), n - lost, grow)
+    owner, number = numbered(more)
     more = extra(further_uniform(v[owner], 1 + number), index[owner])
     added = np.bincount(owner, weights=more, minlength=index.size).astype(np.int64)
     flat[index] = n - lost + added

@@ -130,7 +130,7 @@ class Fading:
 
 
 def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:
-    """Return the time constants, from the course of all pixels with their amplitudes as weights.
+    """Return the time constants, from the time profile of all pixels with their amplitudes as weights.
 
     A second one where it explains more by three standard deviations.
     """
@@ -138,11 +138,11 @@ def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:
     significant = (cells.amplitude / cells.noise) ** 2 > _PRICE_OF_CELL
     amplitude = np.where(significant, cells.amplitude, 0.0).reshape(-1)[cells.cell]
     power = max(float(np.sum(amplitude**2 / blocks.variance)), 1e-300)
-    course = blocks.deviation @ (amplitude / blocks.variance) / power
+    profile = blocks.deviation @ (amplitude / blocks.variance) / power
     decays = n_run * np.geomspace(0.01, 3.0, 25)
     shapes = np.stack([_exponential(blocks, decay) for decay in decays])
     weighted = shapes * blocks.length
-    products, overlaps = weighted @ shapes.T, weighted @ course
+    products, overlaps = weighted @ shapes.T, weighted @ profile
     single = overlaps**2 / np.diag(products) * (overlaps > 0)
     top = int(np.argmax(single))
     best = float(single[top]) + 9.0 / power

@@ -1,4 +1,4 @@
-"""Courses that a slow change takes along the run."""
+"""Time profiles of a slow change along the run."""
 
 from __future__ import annotations
 
@@ -20,5 +20,5 @@ def settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float
     """
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
-    course: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
-    return course
+    profile: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
+    return profile

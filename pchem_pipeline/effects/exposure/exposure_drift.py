@@ -1,9 +1,9 @@
 """Drift of the quanta exposure during a capture (the sensor warms up, the lamp ages).
 
 PCH-EM assumes independent, identically distributed frames (Hendrickson et al. 2023, Sec. II-B). Here frame
-``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a course s of mean 0 and range 1, so they are not. Dark
-current doubles every 6 to 8 K, about 10 % per kelvin, so a tenth of a kelvin over the run already drifts by 1
-%.
+``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a time profile s of mean 0 and range 1, so they are not.
+Dark current doubles every 6 to 8 K, about 10 % per kelvin, so a tenth of a kelvin over the run already
+drifts by 1 %.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.charge_sums import ExposureCourse, exposure_course, exposure_nodes
+from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.time_profiles import SETTLING, settling
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
@@ -40,7 +40,7 @@ _PRICE_OF_SETTLING = 3.0
 class ExposureDrift(Effect):
     """Relative change of H from the first frame to the last, the same in every pixel.
 
-    The course is a straight line, an exponential approach to the end (``settling_fraction``), or any course
+    The time profile is a straight line, an exponential approach to the end (``settling_fraction``), or any
     given by its values at equal distances (``path``).
 
     Signature: block means of the electron number follow the drift with a slope proportional to H,
@@ -66,38 +66,40 @@ class ExposureDrift(Effect):
         "exposure_flicker": "a reference photodiode or the logged temperature",
     }
     drift: float = Field(
-        ge=-2, le=2, description="(H_last - H_first) / H_mean (range of the course for a path), no unit"
+        ge=-2, le=2, description="(H_last - H_first) / H_mean (range of the time profile for a path), no unit"
     )
     settling_fraction: float | None = Field(
         default=None,
         gt=0,
         le=10,
-        description="time constant of an exponential course in lengths of the run; null: a straight line",
+        description="time constant of an exponential time profile, lengths of the run; null: a straight line",
     )
     path: tuple[float, ...] = Field(
         default=(),
         max_length=1000,
-        description="course at equally spaced times from the first frame to the last, linear in between, any "
+        description="profile at equal distances from the first frame to the last, linear in between, any "
         "unit (its mean and range are taken out); empty: a straight line",
     )
 
     @model_validator(mode="after")
-    def _one_course(self) -> Self:
+    def _one_profile(self) -> Self:
         if self.path and self.settling_fraction is not None:
-            raise ValueError("exposure_drift: path and settling_fraction are two courses; give one of them")
+            raise ValueError(
+                "exposure_drift: path and settling_fraction are two time profiles; give one of them"
+            )
         if self.path and max(self.path) == min(self.path):
             raise ValueError("exposure_drift: path needs at least two different values; leave it empty")
         return self
 
-    def course(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the course s of mean 0 and range 1 over the run at times in 0..1 (first to last frame)."""
+    def profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the profile s, of mean 0 and range 1 over the run, at times 0..1 (first to last frame)."""
         if self.path:
             nodes = np.asarray(self.path)
             # the mean of a broken line counts its ends by half
             mean = np.mean(0.5 * (nodes[1:] + nodes[:-1]))
             values = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
-            course: NDArray[np.float64] = (values - mean) / np.ptp(nodes)
-            return course
+            profile: NDArray[np.float64] = (values - mean) / np.ptp(nodes)
+            return profile
         if self.settling_fraction is not None:
             return settling(position, self.settling_fraction)
         return position - 0.5
@@ -107,7 +109,7 @@ class ExposureDrift(Effect):
         last = context.n_frames - 1
         # frames before the run are simulated only as memory of the first: as exposed as that one
         position = context.frames.clip(0, last) / last if last > 0 else np.full(context.frames.shape, 0.5)
-        factor = np.maximum(1.0 + self.drift * self.course(position), 0.0)
+        factor = np.maximum(1.0 + self.drift * self.profile(position), 0.0)
         result: NDArray[Any] = values * factor[:, None, None]
         return result
 
@@ -123,21 +125,21 @@ class ExposureDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the courses that least squares on the frames' exposures cannot tell from the best one.
+        """Return the time profiles that least squares on the frames' exposures cannot tell from the best one.
 
-        A course is taken seriously where it explains two and a half standard deviations more than chance; one
-        with more freedom only where that is not far below the best.
+        A profile is taken seriously where it explains two and a half standard deviations more than chance;
+        one with more freedom only where that is not far below the best.
         """
-        course = exposure_course(evidence)
-        if course is None or evidence.time is None:
+        profile = exposure_profile(evidence)
+        if profile is None or evidence.time is None:
             return ()
-        position = course.frames / max(evidence.time.n_run - 1, 1)
+        position = profile.frames / max(evidence.time.n_run - 1, 1)
         # what flickers from frame to frame is noise to a drift
-        noise = max(course.variance, 0.5 * float(np.mean(np.diff(course.deviation) ** 2)))
-        curves = [_fit(cls(drift=1.0, settling_fraction=s), course, position, noise) for s in SETTLING]
-        line = _fit(cls(drift=1.0), course, position, noise)
+        noise = max(profile.variance, 0.5 * float(np.mean(np.diff(profile.deviation) ** 2)))
+        curves = [_fit(cls(drift=1.0, settling_fraction=s), profile, position, noise) for s in SETTLING]
+        line = _fit(cls(drift=1.0), profile, position, noise)
         curve = max(curves, key=lambda pair: pair[0])
-        path = _fit_path(cls, course, position, noise)
+        path = _fit_path(cls, profile, position, noise)
         net = [line, (curve[0] - _PRICE_OF_SETTLING, curve[1]), path]
         best = max(chi2 for chi2, _ in net)
         likely = [pair for pair in net if pair[0] > max(6.5, best - 25.0)]
@@ -145,23 +147,23 @@ class ExposureDrift(Effect):
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
         """Return the law mixed over the exposures of the run."""
-        factors = 1.0 + self.drift * self.course(np.linspace(0.0, 1.0, 401))
+        factors = 1.0 + self.drift * self.profile(np.linspace(0.0, 1.0, 401))
         return model.with_exposures(*exposure_nodes(factors))
 
 
-def _fit(unit: _T, course: ExposureCourse, position: NDArray[np.float64], noise: float) -> tuple[float, _T]:
-    """Return the chi-square that a course explains, and it at its fitted strength."""
-    shape = unit.course(position)
+def _fit(unit: _T, profile: ExposureProfile, position: NDArray[np.float64], noise: float) -> tuple[float, _T]:
+    """Return the chi-square that a time profile explains, and it at its fitted strength."""
+    shape = unit.profile(position)
     shape = shape - shape.mean()
-    slope = float(shape @ course.deviation) / float(shape @ shape)
+    slope = float(shape @ profile.deviation) / float(shape @ shape)
     return slope**2 * float(shape @ shape) / noise, unit.scaled(slope)
 
 
 def _fit_path(
-    cls: type[_T], course: ExposureCourse, position: NDArray[np.float64], noise: float
+    cls: type[_T], profile: ExposureProfile, position: NDArray[np.float64], noise: float
 ) -> tuple[float, _T]:
     """Return the same for a broken line with free nodes, as many as pay; the chi-square less their price."""
-    deviation = course.deviation - course.deviation.mean()
+    deviation = profile.deviation - profile.deviation.mean()
     best = (0.0, cls(drift=0.0))
     for n in _NODES:
         hats = np.stack([np.interp(position, np.linspace(0.0, 1.0, n), row) for row in np.eye(n)], axis=1)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.charge_sums import ExposureCourse, exposure_course, exposure_nodes
+from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -118,10 +118,10 @@ class ExposureFlicker(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return rms, and memory or period, from the variance, lags and spectrum of the frames' exposures."""
-        course = exposure_course(evidence)
-        if course is None or evidence.time is None:
+        profile = exposure_profile(evidence)
+        if profile is None or evidence.time is None:
             return ()
-        found = [*_sine(cls, course), *_random(cls, course)]
+        found = [*_sine(cls, profile), *_random(cls, profile)]
         return found[:3]
 
     def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
@@ -137,18 +137,18 @@ class ExposureFlicker(Effect):
         return model.with_exposures(weights, factors / (weights @ factors))
 
 
-def _random(cls: type[_T], course: ExposureCourse) -> list[_T]:
+def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
     """Return a flicker anew in every frame, and one with a memory, where there is more than shot noise."""
-    n = course.deviation.size
-    step = np.diff(course.deviation)[np.diff(course.frames) == 1]
+    n = profile.deviation.size
+    step = np.diff(profile.deviation)[np.diff(profile.frames) == 1]
     if step.size < 8:
         return []
     # differences do not see a drift; their variance has the kurtosis of a moving average
-    fast = 0.5 * float(np.mean(step**2)) - course.variance
-    fast_error = course.variance * np.sqrt(3.0 / step.size)
-    smooth = course.deviation - course.deviation.mean()
-    whole = float(smooth @ smooth) / (n - 1) - course.variance
-    whole_error = course.variance * np.sqrt(2.0 / n)
+    fast = 0.5 * float(np.mean(step**2)) - profile.variance
+    fast_error = profile.variance * np.sqrt(3.0 / step.size)
+    smooth = profile.deviation - profile.deviation.mean()
+    whole = float(smooth @ smooth) / (n - 1) - profile.variance
+    whole_error = profile.variance * np.sqrt(2.0 / n)
     if max(fast / fast_error, whole / whole_error) < 3.0:
         return []
     found: list[_T] = []
@@ -163,25 +163,25 @@ def _random(cls: type[_T], course: ExposureCourse) -> list[_T]:
     return found
 
 
-def _sine(cls: type[_T], course: ExposureCourse) -> list[_T]:
+def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:
     """Return a sine at the highest line of the spectrum that stands out of shot noise and of the rest."""
-    first, n = int(course.frames[0]), int(course.frames[-1] - course.frames[0]) + 1
-    place = course.frames.astype(np.int64) - first
+    first, n = int(profile.frames[0]), int(profile.frames[-1] - profile.frames[0]) + 1
+    place = profile.frames.astype(np.int64) - first
     series = np.zeros(n)
-    series[place] = course.deviation - _slow(place / n, course.deviation)
+    series[place] = profile.deviation - _slow(place / n, profile.deviation)
     # padded to twice the length, so that a line between two frequencies keeps most of its height
     spectrum = np.fft.rfft(series, 2 * n)
-    power = np.abs(spectrum) ** 2 / course.deviation.size
+    power = np.abs(spectrum) ** 2 / profile.deviation.size
     power[: 2 * _SLOWEST] = 0.0
     peak = int(np.argmax(power))
     # the median of exponentially distributed powers is ln 2 of their mean; a memory raises it nearby
     around = power[max(peak - _AROUND, 0) : peak + _AROUND]
-    floor = max(course.variance, float(np.median(around)) / np.log(2.0))
+    floor = max(profile.variance, float(np.median(around)) / np.log(2.0))
     if power[peak] < 16.0 * floor:
         return []
     frequency = _refined(series, peak / (2 * n))
     phase = np.exp(-2j * np.pi * frequency * np.arange(n))
-    line = complex(np.sum(series * phase)) * 2.0 / course.deviation.size
+    line = complex(np.sum(series * phase)) * 2.0 / profile.deviation.size
     rms = abs(line) / np.sqrt(2.0)
     # a sine that rises through the mean at frame 0 has the phase of -i
     cycles = (np.angle(line * 1j) / (2.0 * np.pi) - frequency * first) % 1.0

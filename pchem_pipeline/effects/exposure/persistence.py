@@ -120,7 +120,7 @@ class Persistence(Effect):
     def added_exposure(
         self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
     ) -> AddedExposure | None:
-        """Return the ghost, with three levels for its course."""
+        """Return the ghost, with three levels for its time profile."""
         left = self._left(numbers)
         mean = float(left.mean())
         if not mean > 0:

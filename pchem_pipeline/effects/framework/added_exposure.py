@@ -37,7 +37,7 @@ class AddedExposure(NamedTuple):
         """Return it with the pixels in one axis, (j, n)."""
         return AddedExposure(*(values.reshape(values.shape[0], -1) for values in self))
 
-    def beside(self, other: AddedExposure) -> AddedExposure:
+    def combined_with(self, other: AddedExposure) -> AddedExposure:
         """Return that of two independent ones together, all pairs of levels."""
         exposure = self.exposure_e[:, None] + other.exposure_e[None]
         weight = self.weight[:, None] * other.weight[None]
@@ -73,5 +73,5 @@ def added_exposures(
                 f"exposure: {type(error).__name__}: {error}; remove it from model.effects"
             ) from error
         if added is not None:
-            found = added if found is None else found.beside(added)
+            found = added if found is None else found.combined_with(added)
     return found

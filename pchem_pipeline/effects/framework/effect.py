@@ -62,8 +62,8 @@ class Effect(Section):
         strength: the parameter that scales it; 0 is no effect (a clipping limit and its like have none: "").
         power: near zero the statistics grow like ``strength ** power``.
         separate: for each effect that it is confused with (tag), the measurement that tells them apart.
-        erratic: whether its course is drawn anew in every simulation, so that a fingerprint is one of many
-            and another effect outdoes it only by a clear margin.
+        erratic: whether its time profile is drawn anew in every simulation, so that a fingerprint is one of
+            many and another effect outdoes it only by a clear margin.
         untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
     """
 

@@ -267,17 +267,17 @@ def test_memory_is_of_the_frame_before():
 
 
 @pytest.mark.parametrize(
-    ("effect", "course"),
+    ("effect", "profile"),
     [
         (GainDrift(drift=0.2), np.linspace(-0.5, 0.5, 101)),
         (GainDrift(drift=0.2, shape="path", path=BOW), 0.5 - np.abs(np.linspace(-1, 1, 101))),
     ],
 )
-def test_the_gain_follows_its_course(effect, course):
+def test_the_gain_follows_its_profile(effect, profile):
     after, before, _, _ = analog(effect, (101, 2, 3))
-    np.testing.assert_allclose(after, before * (1 + 0.2 * course)[:, None, None], rtol=1e-12)
+    np.testing.assert_allclose(after, before * (1 + 0.2 * profile)[:, None, None], rtol=1e-12)
     early, before, _, _ = analog(effect, (5, 2, 3), first=-9, n_run=101)
-    np.testing.assert_allclose(early, before * (1 + 0.2 * course[0]), rtol=1e-12)
+    np.testing.assert_allclose(early, before * (1 + 0.2 * profile[0]), rtol=1e-12)
 
 
 # -- long memory --------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Effects on the exposure: courses, flicker, blinking pixels and ghosts against theory.
+"""Effects on the exposure: time profiles, flicker, blinking pixels and ghosts against theory.
 
 Limits are five standard errors from theory; what they guard against is many more.
 """
@@ -17,7 +17,7 @@ from pchem_pipeline.effects.exposure.persistence import Persistence
     "shape", [{}, {"settling_fraction": 0.1}, {"settling_fraction": 3.0}, {"path": (5.0, 9.0, 1.0, 2.0)}]
 )
 @pytest.mark.parametrize("drift", [0.3, -0.3])
-def test_courses_have_mean_zero_and_the_range_of_the_drift(shape, drift):
+def test_profiles_have_mean_zero_and_the_range_of_the_drift(shape, drift):
     n = 3001
     h = exposures(ExposureDrift(drift=drift, **shape), np.full((1, 1), 2.0), n)[:, 0, 0]
     assert abs(h.mean() - 2.0) < 2.0 * 0.3 * 5 / n

@@ -46,7 +46,7 @@ def test_ghost_has_the_moments_of_its_course() -> None:
 def test_effects_add_up_and_the_others_add_nothing() -> None:
     one = AddedExposure(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.7, 1.0], [0.3, 0.0]]))
     two = AddedExposure(np.array([[0.1, 0.2], [0.4, 0.6]]), np.array([[0.5, 0.5], [0.5, 0.5]]))
-    both = one.beside(two)
+    both = one.combined_with(two)
     assert both.weight.shape == (4, 2)
     np.testing.assert_allclose(both.weight.sum(axis=0), 1.0)
     np.testing.assert_allclose((both.weight * both.exposure_e).sum(axis=0), [0.3 + 0.25, 0.4])
