@@ -72,7 +72,7 @@ class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]
     """The code of a kernel for the kernels that call it: linked into theirs, never run by itself."""
 
     def _optimize_final_module(self) -> None:
-        """Leave it to the caller."""
+        """Do nothing: the code is optimised in the caller's library."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()

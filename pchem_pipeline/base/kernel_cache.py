@@ -153,7 +153,7 @@ class KernelCache:
             listener(self._function.__name__, seconds)
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep what was compiled, whole or not at all, and let others have it."""
+        """Write a compiled kernel to its file, whole or not at all, and release its lock."""
         from numba.core.serialize import dumps
 
         codegen = result.library.codegen
@@ -197,7 +197,7 @@ class KernelCache:
         return CompileResult._rebuild(target_context, *payload)
 
     def _lock(self, path: Path) -> bool:
-        """Become the one who compiles a kernel; False where that cannot be known, so that all may."""
+        """Lock a kernel that is to be compiled; return False where that fails or another holds it too long."""
         from filelock import FileLock, Timeout
 
         lock = FileLock(path.with_suffix(".lock"), timeout=_PATIENCE)

@@ -22,7 +22,7 @@ _AFTERWARDS = ("fit", "maps", "ensemble", "report")
 
 
 def find_and_add(target: Target, command: Command, *, refit: bool) -> str:
-    """Search, put what was named into the model, and fit with it; return the verdict in words.
+    """Search for effects, add those named to the model, and fit with it; return the verdict as text.
 
     Args:
         target: the run.

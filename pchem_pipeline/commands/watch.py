@@ -114,7 +114,7 @@ def watch(
 
 
 def _snapshots(target: Target, follow: bool, sleep: Callable[[float], None]) -> Iterator[Snapshot]:
-    """Look at the run; where asked again and again, the last time after the command's end."""
+    """Yield the state of the run, once or until its command ends."""
     while True:
         # before the states: what is done when nobody works is done for good
         progress = read_progress(target.store)

@@ -239,7 +239,7 @@ def library_versions() -> dict[str, str]:
 
 
 def _alike(expected: dict[str, str], function: Callable[[Any], Any], item: Any) -> Outcome:
-    """Do an item on a worker, if its versions are those of who asks: others would give other bits."""
+    """Call a function on an item in a worker of the caller's versions: others would give other bits."""
     if text := _differences(tuple(expected.items())):
         return Outcome(error=OtherVersionsError(text))
     return guarded(function, item)

@@ -59,7 +59,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_model(path: Path, model: ModelSettings) -> None:
-    """Put a model into a YAML file, in place of the one that it has.
+    """Replace the model in a YAML file.
 
     Args:
         path: of the YAML; a link stays one, and its target is written.
@@ -221,7 +221,7 @@ def _put_effects(section: CommentedMap, before: Sequence[Effect], wanted: Sequen
 
 
 def _behind(section: CommentedMap) -> None:
-    """Let the comments between the key ``effects`` and its first entry stand behind an empty list."""
+    """Move the comments between the key ``effects`` and its first entry behind the empty list."""
     *rest, beside, above = section.ca.items.get("effects", [None] * 4)
     tokens = [token for token in (beside, *(above or ())) if token is not None and token.value.strip()]
     if tokens:

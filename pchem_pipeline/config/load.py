@@ -100,7 +100,7 @@ _OLD_KEYS: Mapping[str, str | None] = {
 
 
 def _renamed(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Give keys of version 0.1 the names that they have now, and say so in a line each."""
+    """Rename keys of version 0.1 to those of now; write a line about each to stderr."""
     result = {key: dict(value) if isinstance(value, dict) else value for key, value in content.items()}
     for old, new in _OLD_KEYS.items():
         section, key = old.split(".")

@@ -89,7 +89,7 @@ class RunConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _read_what_is_simulated(cls, data: Any) -> Any:
-        """Let the input be the simulated camera's files, where no files are named."""
+        """Set the input to the simulated camera's files, where no files are named."""
         if not isinstance(data, dict) or data.get("simulate") is None:
             return data
         given = data.get("input") or {}

@@ -93,7 +93,7 @@ def _place(context: StageContext) -> Path:
 
 
 def inspect_input(context: StageContext) -> None:
-    """Look at the input for mistakes, without reading it.
+    """Check the input for mistakes, without reading the frames.
 
     Raises:
         InputError: files are missing or bad.

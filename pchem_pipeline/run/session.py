@@ -224,7 +224,7 @@ def _reading_context(target: Target, reporter: Reporter, options: Options) -> St
 
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:
-    """Complain if more pixels have no value than the configuration allows."""
+    """Raise an error if more pixels have no value than the configuration allows."""
     from pchem_pipeline.model.fit.status import FAILED
 
     words = context.store.read(name)

@@ -303,7 +303,7 @@ class StageContext:
         return [unit for unit in units if not set(unit.keys) <= done]
 
     def _know_total(self, n_keys: int) -> None:
-        """Keep how many markers the stage will have, before the first is set: a kill must not lose it."""
+        """Record how many markers the stage will have, before the first is set: a kill must not lose it."""
         self.n_keys = n_keys
         record = self.store.records.read(self.stage)
         if record is not None and record.keys != n_keys:

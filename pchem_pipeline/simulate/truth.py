@@ -52,7 +52,7 @@ class TruthMaps:
     defect: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        """Refuse what no sensor can be, since the compiled chain would make nonsense of it."""
+        """Refuse parameters out of range: the compiled chain does not check them."""
         allowed = {
             "quanta_exposure": (0.0, LARGEST_EXPOSURE),
             "conversion_gain": (np.nextafter(0.0, 1.0), np.inf),

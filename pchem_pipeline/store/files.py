@@ -73,7 +73,7 @@ def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a path beside ``path`` to write a large file or a folder to, which then takes its place.
+    """Yield a path beside ``path`` to write a large file or a folder to, then rename it to ``path``.
 
     If something is raised inside, nothing is left of it. What a killed process left goes with the next
     writing, so only one process may write a file. The name aside keeps the suffix, since some libraries look
@@ -88,7 +88,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _put_in_place(path: Path, aside: Path, sync: bool) -> Iterator[Path]:
-    """Give ``aside`` to write to, and rename it to ``path``: the one place where files appear."""
+    """Yield ``aside`` to write to, then rename it to ``path``: the one place where files appear."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove(aside)

@@ -49,7 +49,7 @@ def place_of(path: Path | str, base_dir: Path | None = None) -> Path:
 
 
 def _asked(method: F) -> F:
-    """Let files that are not there be an error of their own, and make one line of all others."""
+    """Turn errors of the storage into FileNotFoundError, or into one line with the cure."""
 
     @functools.wraps(method)
     def ask(self: RemotePath, *args: Any, **kwargs: Any) -> Any:

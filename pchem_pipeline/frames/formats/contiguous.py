@@ -126,7 +126,7 @@ class OpenedFile:
             offset += wanted
 
     def expect(self, offset: int, count: int) -> None:
-        """Let the disk fetch bytes that will be asked for, while these are worked on; no more than a hint."""
+        """Ask the operating system to read the bytes ahead that will be wanted next (a hint)."""
         if hasattr(os, "posix_fadvise"):
             with suppress(OSError):
                 os.posix_fadvise(self._handle, offset, count, os.POSIX_FADV_WILLNEED)

@@ -145,7 +145,7 @@ def _run_histograms(context: StageContext, before: Sequence[Effect]) -> None:
 
 
 def _nothing_left(unit: Unit) -> None:
-    """Be a unit whose work is done."""
+    """Do nothing: the work of the unit was done beforehand."""
 
 
 @dataclass

@@ -23,7 +23,7 @@ _Region = tuple[slice, slice]
 
 
 def judge_sensor(context: StageContext) -> int:
-    """Give the word ``WEAKLY_IDENTIFIED`` to the pixels that earn it; return their number.
+    """Set ``WEAKLY_IDENTIFIED`` in the status of pixels that are clear by chance only; return their number.
 
     The words depend on the sensor as a whole, not on its tiles, and may be given again and again.
 
