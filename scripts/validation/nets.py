@@ -251,8 +251,7 @@ def spectra(at: Folder) -> None:
         files.append(path.name)
     run = at.run("spectra", None, input={"files": files})
     at.pchem("run", run, "--until", "ensemble")
-    at.pchem("discrepancy", run, "--no-refit")
-    at.pchem("fit", run)
+    at.pchem("discrepancy", run)
 
 
 CASES: tuple[Callable[[Folder], None], ...] = (plain, exact, errors, effects, joint, hidden, spectra)
@@ -353,8 +352,9 @@ class Comparison:
                 self.parameter(f"{run}:{name}", left, right, old[f"{name}_stderr"], rose)
             else:
                 self.say(f"{run}:{name}", difference(left, right))
-        more = sorted(new.keys() - seen)
-        print(f"  {run}: {equal} of {len(old)} arrays are equal to the bit; new: {', '.join(more) or 'none'}")
+        more = Counter(name.split("/")[0] for name in new.keys() - seen)
+        added = ", ".join(f"{n} in {group}" for group, n in sorted(more.items())) or "none"
+        print(f"  {run}: {equal} of {len(old)} arrays are equal to the bit; new: {added}")
 
     def likelihood(self, run: str, old: dict[str, Array], new: dict[str, Array]) -> Array | None:
         """Compare log-likelihoods; return where they rose, (y, x)."""
@@ -410,10 +410,10 @@ class Comparison:
         if "verdict" in old:
             self.verdict(name, old, new)
         left, right = dict(leaves(old)), dict(leaves(new))
-        numbers = []
+        numbers, gone = [], 0
         for key, value in left.items():
             if key not in right:
-                numbers.append((np.inf, f"{key} gone"))
+                gone += 1
             elif is_number(value) and is_number(right[key]):
                 change = abs(right[key] - value) / max(abs(value), 1e-300)
                 if change > 1e-9:
@@ -422,7 +422,10 @@ class Comparison:
                 numbers.append((np.inf, f"{key} {str(value)[:50]} -> {str(right[key])[:50]}"))
         numbers.sort(key=lambda each: -each[0])
         added = len(right.keys() - left.keys())
-        self.say(name, f"{len(numbers)} of {len(left)} entries differ by more than 1e-9, {added} are new")
+        words = (
+            f"{len(numbers)} of {len(left)} entries differ beyond 1e-9, {gone} are gone, {added} new"
+        )
+        self.say(name, words)
         for _, words in numbers[:12]:
             print(f"      {words}")
 
