@@ -95,6 +95,9 @@ class Run:
         ny, nx = self.shape
         if self._sensor.kind == "histograms":
             return f"{nx} channels of up to {self.n_frames:,} samples"
+        if self._sensor.samples:
+            n = len(self._sensor.samples)
+            return f"{ny} x {nx} pixels, {n} samples of {self.n_frames:,} frames in all"
         return f"{ny} x {nx} pixels, {self.n_frames:,} frames"
 
     def status(self) -> dict[str, str]:
@@ -172,6 +175,16 @@ class Run:
     def fit(self) -> xr.Dataset:
         """What the fit found for each pixel."""
         return self.group("fit")
+
+    @property
+    def samples(self) -> xr.Dataset:
+        """What each of several exposures has of its own; coordinate ``sample``: names of their runs.
+
+        Raises:
+            StoreError: the run has one sample only.
+        """
+        names = [sample.name for sample in self._sensor.samples]
+        return self.group("samples").assign_coords(sample=("sample", names))
 
     @property
     def histogram(self) -> xr.Dataset:

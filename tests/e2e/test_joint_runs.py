@@ -214,7 +214,9 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
     drawn = shell.ok("figures", "dark.zarr", "-o", str(tmp_path), "--only", "exposures,pixel_fits").stdout
     assert "exposures.pdf" in drawn
     run = open_run(joint / "dark.zarr")
-    assert run.group("samples").quanta_exposure.dims == ("sample", "y", "x")
+    assert run.samples.quanta_exposure.dims == ("sample", "y", "x")
+    assert run.samples.sample.values.tolist()[2:] == ["dark_5s.zarr", "bias.zarr"]
+    assert "4 samples of 6,000 frames in all" in repr(run)
     assert run.pixel(2, 3).histogram.sum() == 1500
     assert "dark_current" in run.maps
     server, _ = make_server(joint / "dark.zarr")
