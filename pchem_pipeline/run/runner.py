@@ -103,7 +103,10 @@ def _perform(
             failed=context.failed,
             notes=tuple(context.notes),
         )
-        records.write(record)
+        if old is None and not record.finished and not record.keys:
+            records.forget(stage.name)  # it was refused before it began, and leaves no trace
+        else:
+            records.write(record)
     return _finish(stage, context, record)
 
 

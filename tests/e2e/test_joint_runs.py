@@ -234,6 +234,7 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
     refused = shell("electrons", "dark.zarr")
     assert refused.code == 4
     assert "was made from samples, which have no frames here" in refused.last
+    assert "electrons" not in run.status()
 
 
 def test_killed_it_ends_with_the_same_bits(joint, kernels):
