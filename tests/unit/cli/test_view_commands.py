@@ -15,7 +15,7 @@ from pchem_pipeline.commands.figures import Wanted, figures_of_run
 
 
 def invoke(*arguments: str) -> str:
-    return CliRunner().invoke(app.app, list(arguments), catch_exceptions=False).stdout
+    return CliRunner().invoke(app, list(arguments), catch_exceptions=False).stdout
 
 
 def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None:

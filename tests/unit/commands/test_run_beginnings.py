@@ -45,7 +45,7 @@ def test_the_region_is_written_into_the_yaml(tmp_path, file):
 def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
     tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app.app, ["run", str(file), "--dry-run"], catch_exceptions=False)
+    result = CliRunner().invoke(app, ["run", str(file), "--dry-run"], catch_exceptions=False)
     assert result.exit_code == 0
     assert "ingest: missing -> would run" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
