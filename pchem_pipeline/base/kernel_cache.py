@@ -197,7 +197,7 @@ class KernelCache:
         return CompileResult._rebuild(target_context, *payload)
 
     def _lock(self, path: Path) -> bool:
-        """Lock a kernel that is to be compiled; return False where that fails or another holds it too long."""
+        """Lock a kernel that is to be compiled; return False if that fails or another holds it too long."""
         from filelock import FileLock, Timeout
 
         lock = FileLock(path.with_suffix(".lock"), timeout=_PATIENCE)
