@@ -422,9 +422,7 @@ class Comparison:
                 numbers.append((np.inf, f"{key} {str(value)[:50]} -> {str(right[key])[:50]}"))
         numbers.sort(key=lambda each: -each[0])
         added = len(right.keys() - left.keys())
-        words = (
-            f"{len(numbers)} of {len(left)} entries differ beyond 1e-9, {gone} are gone, {added} new"
-        )
+        words = f"{len(numbers)} of {len(left)} entries differ beyond 1e-9, {gone} are gone, {added} new"
         self.say(name, words)
         for _, words in numbers[:12]:
             print(f"      {words}")

@@ -117,7 +117,7 @@ def test_the_figure_is_in_the_report_and_has_its_numbers(done):
 
 
 def test_the_files_that_it_names_exist():
-    words = set(re.findall(r"`([\w/]+\.(?:py|md|toml))\b", TEXT)) | set(
+    words = set(re.findall(r"`(\w+/[\w/]+\.(?:py|md|toml))\b", TEXT)) | set(
         re.findall(r"`((?:scripts|tests)/[\w/.]+)`", TEXT)
     )
     added = {example["file"] for example in EXAMPLE.finditer(TEXT)}
