@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pchem_pipeline.discrepancy.verdict import Candidate, GapChange, Moved, Place, Rival, Step, Verdict
 from pchem_pipeline.report.data import DiscrepancyData
-from pchem_pipeline.report.figures.catalogue import discrepancy_figures
 from pchem_pipeline.report.figures.discrepancy_gap import gap_text
-from pchem_pipeline.report.pages.pictures import Drawn, Picture
+from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import count, measured, percent, short, signed, symbol, unit_text
@@ -120,15 +119,14 @@ class DiscrepancyView:
     parts: list[Part]
 
 
-def discrepancy_view(data: DiscrepancyData, drawn: Mapping[str, Drawn]) -> DiscrepancyView:
+def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> DiscrepancyView:
     """Return the page's content.
 
     Args:
         data: verdict and arrays.
-        drawn: name of a figure to its drawing.
+        pictures: the figures of the verdict.
     """
     level, name = verdict_level(data.found)
-    pictures = [Picture(figure, drawn[figure.name]) for figure in discrepancy_figures(data)]
     tables = discrepancy_tables(data)
     parts = []
     for id_, title, intro in PARTS:

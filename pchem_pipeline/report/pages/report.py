@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import jinja2
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.catalogue import report_figures, run_figures
+from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.inspector.inspector import content_policy, embedded, script
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
 from pchem_pipeline.report.pages.methods import method_tables
@@ -50,10 +50,13 @@ def render_report(
         draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
     settings = settings or ReportSettings()
-    drawn = (draw or draw_here)(longest_first(run_figures(data, settings)), settings)
+    shown, others = report_figures(data, settings), discrepancy_figures(data.discrepancy)
+    drawn = (draw or draw_here)(longest_first([*shown, *others]), settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
-    pictures = [Picture(figure, drawn[figure.name]) for figure in report_figures(data, settings)]
-    view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, drawn)
+    pictures, evidence = (
+        [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)
+    )
+    view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, evidence)
     tables = [*result_tables(data), *method_tables(data)]
     inspector = embedded(data)
     page = template("report.html.j2").render(
