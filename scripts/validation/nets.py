@@ -156,6 +156,8 @@ class Folder:
         command = [sys.executable, "-c", entry(), *arguments, "--quiet"]
         done = subprocess.run(command, cwd=self.path, capture_output=True, text=True)
         print(f"  {time.monotonic() - began:6.1f} s  pchem {' '.join(arguments)}", flush=True)
+        if done.returncode == 3:
+            print(f"           {done.stderr.strip().splitlines()[-1]}", flush=True)
         if done.returncode not in (0, 3):
             raise SystemExit(f"pchem {' '.join(arguments)}: exit code {done.returncode}\n{done.stderr}")
 
