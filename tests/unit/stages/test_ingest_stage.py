@@ -26,6 +26,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store
 from pchem_pipeline.stages import ingest
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
 STACK = np.random.default_rng(16).integers(0, 4096, (40, 30, 26)).astype(np.uint16)
@@ -83,7 +84,7 @@ def test_copy(tmp_path: Path, small_chunks: None, backend: str) -> None:
     assert (sensor.bit_depth, sensor.integration_time, sensor.mode) == (12, None, "copy")
     assert sensor.identity["n_files"] == 4
     assert [file["name"] for file in sensor.identity["files"]] == ["f8.tif", "f9.tif", "f10.tif", "f11.tif"]
-    assert status(ingest, context).done == 3 * 4
+    assert status(STAGES["ingest"], context).done == 3 * 4
     assert run(context).state == "complete"
 
 
@@ -135,7 +136,7 @@ def test_stop_and_resume(tmp_path: Path, small_chunks: None, monkeypatch: pytest
         run(make_context(tmp_path, stop=stop))
     open_store.cache_clear()
     context = make_context(tmp_path)
-    assert status(ingest, context).words().startswith("partial 5 of 12")
+    assert status(STAGES["ingest"], context).words().startswith("partial 5 of 12")
     assert run(context).state == "complete"
     assert len(done) == len(set(done)) == 12
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
@@ -154,17 +155,17 @@ def test_identity_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     run(make_context(tmp_path))
     assert len(hashed) == 1
     again = make_context(tmp_path)
-    assert status(ingest, again).state == "complete"
+    assert status(STAGES["ingest"], again).state == "complete"
     assert len(hashed) == 1
     # another time of change, the same content: hashed again, still complete
     os.utime(tmp_path / "cam" / "f9.tif", ns=(5, 5))
-    assert status(ingest, make_context(tmp_path)).state == "complete"
+    assert status(STAGES["ingest"], make_context(tmp_path)).state == "complete"
     assert len(hashed) == 2
     # other content: stale, and why
     changed = STACK[:10].copy()
     changed[0, 0, 0] ^= 1
     tifffile.imwrite(tmp_path / "cam" / "f8.tif", changed, photometric="minisblack")
-    state = status(ingest, make_context(tmp_path))
+    state = status(STAGES["ingest"], make_context(tmp_path))
     assert (state.state, state.why) == ("stale", "the content of the input changed")
     context = make_context(tmp_path)
     assert run(context).state == "complete"
@@ -177,7 +178,7 @@ def test_moved_and_renamed_input_is_the_same(tmp_path: Path) -> None:
     shutil.move(tmp_path / "cam", tmp_path / "elsewhere")
     for i in range(8, 12):
         (tmp_path / "elsewhere" / f"f{i}.tif").rename(tmp_path / "elsewhere" / f"dark{i}.tif")
-    assert status(ingest, make_context(tmp_path, files=["elsewhere/*.tif"])).state == "complete"
+    assert status(STAGES["ingest"], make_context(tmp_path, files=["elsewhere/*.tif"])).state == "complete"
 
 
 def test_input_that_is_gone_leaves_the_copy_valid(tmp_path: Path) -> None:
@@ -206,7 +207,7 @@ def test_input_that_is_gone_leaves_the_copy_valid(tmp_path: Path) -> None:
 def test_which_settings_make_it_stale(tmp_path: Path, key: str, value: Any, stale: bool) -> None:
     write_stack(tmp_path / "cam")
     run(make_context(tmp_path))
-    state = status(ingest, make_context(tmp_path, **{key: value}))
+    state = status(STAGES["ingest"], make_context(tmp_path, **{key: value}))
     assert state.state == ("stale" if stale else "complete")
     assert (f"input.{key}" in state.why) == stale
 
@@ -260,7 +261,7 @@ def test_file_that_vanishes_while_copying(
     monkeypatch.setattr(ingest, "_copy", real)
     write_stack(tmp_path / "cam")
     context = make_context(tmp_path)
-    assert status(ingest, context).words().startswith("partial 4 of 12")
+    assert status(STAGES["ingest"], context).words().startswith("partial 4 of 12")
     assert run(context).state == "complete"
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
 
@@ -302,7 +303,7 @@ def test_sidecar_belongs_to_the_content(tmp_path: Path) -> None:
     run(make_context(tmp_path))
     side.write_text('{"shape": [26, 30], "dtype": "uint16"}')
     context = make_context(tmp_path)
-    assert status(ingest, context).state == "stale"
+    assert status(STAGES["ingest"], context).state == "stale"
     run(context)
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK.reshape(40, 26, 30))
 
