@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pchem_pipeline.base.errors import PchEmError
     from pchem_pipeline.commands.notebook import open_run
-    from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+    from pchem_pipeline.model.fit.api import fit_histograms
+    from pchem_pipeline.model.fit.result import FitResult
     from pchem_pipeline.model.fit.settings import FitSettings
     from pchem_pipeline.model.fit.status import FitStatus
     from pchem_pipeline.store.run_store import RunStore
@@ -40,12 +41,12 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
-    "FitResult": "model.fit.pchem",
+    "FitResult": "model.fit.result",
     "FitSettings": "model.fit.settings",
     "FitStatus": "model.fit.status",
     "PchEmError": "base.errors",
     "RunStore": "store.run_store",
-    "fit_histograms": "model.fit.pchem",
+    "fit_histograms": "model.fit.api",
     "open_run": "commands.notebook",
 }
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numba
 from numba import _dynfunc
+from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, DefaultPassBuilder, _LowerResult
 from numba.core.compiler_machinery import register_pass
@@ -20,7 +21,7 @@ from numba.core.typed_passes import NativeLowering
 
 from pchem_pipeline.base.kernel_cache import KernelCache, values_of_closure
 
-__all__ = ["kernel"]
+__all__ = ["callback", "kernel", "types_of"]
 
 
 def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False) -> Any:
@@ -51,6 +52,43 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False) 
         "no_cfunc_wrapper": True,
     }
     return _Kernel(function, options)
+
+
+def callback(function: Callable[..., Any], result: Any, arguments: tuple[Any, ...]) -> Any:
+    """Compile a function at once, for kernels that are given it and call it by its address.
+
+    A kernel has the code of all kernels that it calls by name in it. What it is given is compiled by itself,
+    once for
+    all of them, and the others need not wait for it: of several such functions only those that are asked for
+        are
+    compiled. A call costs some nanoseconds.
+
+    Args:
+        function: of scalars, arrays and named tuples of them.
+        result: type of its answer (of numba).
+        arguments: an example of each of its arguments, or their types.
+    """
+    if numba.config.DISABLE_JIT:
+        return function
+    kinds = tuple(types_of(arguments)), result
+    compiled = CFunc(function, kinds, locals={}, options={"error_model": "numpy"})
+    compiled._cache = _CallbackCache(function)  # type: ignore[attr-defined]
+    compiled.compile()
+    return compiled
+
+
+def types_of(arguments: tuple[Any, ...]) -> list[Any]:
+    """Return numba's types of examples; what is a type already stays."""
+    return [each if isinstance(each, numba.types.Type) else numba.typeof(each) for each in arguments]
+
+
+class _CallbackCache(KernelCache):
+    """The compiled variants of a function that is called by its address."""
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keep what was compiled; it must have an address by then."""
+        result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+        super().save_overload(signature, result)
 
 
 class _Kernel(CPUDispatcher):  # type: ignore[misc]

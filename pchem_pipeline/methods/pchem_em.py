@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
 __all__ = ["PchEm"]
@@ -15,7 +15,7 @@ __all__ = ["PchEm"]
 class PchEm(Method):
     """Maximum likelihood of one sample: several starts, EM and Newton steps, the neighbours looked at.
 
-    Hendrickson et al. 2023, with the numerical work of :mod:`pchem_pipeline.model.fit.pchem`.
+    Hendrickson et al. 2023, with the numerical work of :mod:`pchem_pipeline.model.fit.api`.
     """
 
     name = "pchem_em"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
-from pchem_pipeline.model.fit.joint import fit_joint
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
 __all__ = ["JointPchEm"]
@@ -16,7 +16,7 @@ class JointPchEm(Method):
     """Maximum likelihood of all samples together: one g, mu and sigma, an H for each exposure.
 
     Multi-sample PCH-EM (Hendrickson et al. 2024, arXiv 2403.04498; IEEE Trans. Electron Devices), with the
-    numerical work of :mod:`pchem_pipeline.model.fit.joint`. The darkest sample is taken for bias frames,
+    numerical work of :mod:`pchem_pipeline.model.fit.api`. The darkest sample is taken for bias frames,
     as by the other methods that need one.
     """
 
@@ -30,7 +30,7 @@ class JointPchEm(Method):
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
         """Return the fit of all samples."""
         darkest = pixels.by_brightness()[0]
-        result = fit_joint(
+        result = fit_histograms(
             [sample.counts for sample in pixels.samples],
             [sample.origin for sample in pixels.samples],
             dark=[number == darkest for number in range(len(pixels.samples))],

@@ -15,7 +15,7 @@ from pchem_pipeline.methods.base import (
     register_method,
 )
 from pchem_pipeline.methods.plain_em import first_start
-from pchem_pipeline.model.fit.start import kernel_counts
+from pchem_pipeline.model.law.inputs import kernel_counts
 
 __all__ = ["PeakValley", "read_noise_of_valley"]
 

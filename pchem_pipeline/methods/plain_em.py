@@ -15,7 +15,8 @@ from pchem_pipeline.methods.base import (
     Settings,
     register_method,
 )
-from pchem_pipeline.model.fit.start import kernel_counts, starting_points
+from pchem_pipeline.model.fit.starts import starting_points
+from pchem_pipeline.model.law.inputs import kernel_counts
 
 __all__ = ["PlainEm", "first_start", "run_em"]
 

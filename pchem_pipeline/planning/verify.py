@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit.joint import fit_joint
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 from pchem_pipeline.planning.point import FloatArray, Point
@@ -136,7 +135,9 @@ def verify_samples(
         draw_histograms(rng, h, point.conversion_gain, bias, point.read_noise_e, n)
         for h, n in zip(exposures, frames, strict=True)
     ]
-    fit = fit_joint([d.counts for d in drawn], [d.origin for d in drawn], dark=[h == 0 for h in exposures])
+    fit = fit_histograms(
+        [d.counts for d in drawn], [d.origin for d in drawn], dark=[h == 0 for h in exposures]
+    )
     brightest = int(np.argmax(exposures))
     found = np.stack(
         [fit.quanta_exposure[:, brightest], fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1

@@ -29,7 +29,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     nuced_independent,
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.simulate.maps import draw_truth

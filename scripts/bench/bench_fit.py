@@ -22,8 +22,9 @@ from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
 from pchem_pipeline.model.errors.fisher import cramer_rao
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
-from pchem_pipeline.model.fit.start import starting_points
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
 
 Array = NDArray[np.float64]

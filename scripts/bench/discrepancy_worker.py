@@ -76,7 +76,7 @@ def fit_maps(
     Returns:
         Maps of H, g, mu and s_e, their standard errors (``*_stderr``), and ``good``.
     """
-    from pchem_pipeline.model.fit.pchem import fit_histograms
+    from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.status import FAILED
     from pchem_pipeline.model.histogram.count import histogram_frames
 
@@ -111,12 +111,12 @@ def _grown(
 ) -> Any:
     """Fit again with the law that the effects make of the PCD."""
     from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
-    from pchem_pipeline.model.fit.grown import fit_grown
+    from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.status import FAILED
 
     parameters = [plain.quanta_exposure, plain.conversion_gain, plain.bias, plain.read_noise_dn]
     model = marginal_model(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)
-    return fit_grown(counts, origin, plain, model, plain=plain)
+    return fit_histograms(counts, origin, law=model, start=plain)
 
 
 def _compared(case: Case, frames: NDArray[np.uint16], found: Any, key: Path) -> dict[str, Any]:

@@ -24,9 +24,8 @@ prepare_environment()
 
 import numpy as np  # noqa: E402
 
-from pchem_pipeline.model.errors.fisher import cramer_rao  # noqa: E402
-from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao  # noqa: E402
-from pchem_pipeline.model.fit.pchem import fit_histograms  # noqa: E402
+from pchem_pipeline.model.errors.fisher import cramer_rao, joint_cramer_rao  # noqa: E402
+from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
 
@@ -65,7 +64,7 @@ def row(noise, n_pixels, n_frames):
     exposures = (*EXPOSURES, 0.0)
     drawn = [draw(rng, exposure, noise, n_pixels, n_frames) for exposure in exposures]
     counts, origins = zip(*drawn, strict=True)
-    found = fit_joint(counts, origins, dark=[exposure == 0 for exposure in exposures])
+    found = fit_histograms(counts, origins, dark=[exposure == 0 for exposure in exposures])
     j = len(exposures)
     bound = np.sqrt(np.diagonal(joint_cramer_rao(exposures, 1 / STEP, noise * STEP, n_frames)))
     errors = {

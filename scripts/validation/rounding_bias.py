@@ -20,8 +20,8 @@ prepare_environment()
 
 import numpy as np  # noqa: E402
 
-from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias  # noqa: E402
-from pchem_pipeline.model.fit.pchem import fit_histograms  # noqa: E402
+from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
+from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
@@ -54,7 +54,7 @@ def row(step, exposure, noise, n_pixels, n_frames):
     truth.append(np.full(n_pixels, np.sqrt((noise * step) ** 2 + 1 / 12)))
     frames = np.full(n_pixels, float(n_frames))
     plain = fit_histograms(counts, origin)
-    exact = refine(counts, origin, plain, FitSettings(likelihood="exact"))
+    exact = fit_histograms(counts, origin, settings=FitSettings(likelihood="exact"), start=plain)
     errors = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
     good = exact.fit_status == 0
     predicted = np.abs(rounding_bias(truth, frames)).max(axis=1)

@@ -24,8 +24,7 @@ def results(order: str) -> str:
     prepare_environment()
     import numpy as np
 
-    from pchem_pipeline.model.fit.joint import fit_joint
-    from pchem_pipeline.model.fit.pchem import fit_histograms
+    from pchem_pipeline.model.fit.api import fit_histograms
 
     rng = np.random.default_rng(5)
     step, bias = rng.uniform(8, 14, N_PIXELS), rng.uniform(95, 105, N_PIXELS)
@@ -41,7 +40,7 @@ def results(order: str) -> str:
     found = {}
     for kind in order.split(","):
         if kind == "joint":
-            joint = fit_joint(counts, origins, dark=[False, False, True])
+            joint = fit_histograms(counts, origins, dark=[False, False, True])
             arrays = [joint.conversion_gain, joint.covariance]
         else:
             single = fit_histograms(counts[0], origins[0])

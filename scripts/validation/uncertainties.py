@@ -35,9 +35,9 @@ prepare_environment()
 
 from pchem_pipeline.model.checks.multiple_testing import false_discovery  # noqa: E402
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of  # noqa: E402
-from pchem_pipeline.model.errors.fisher import sandwich_covariance  # noqa: E402
-from pchem_pipeline.model.fit.intervals import profile_intervals, quantile_of  # noqa: E402
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms  # noqa: E402
+from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
+from pchem_pipeline.model.fit.intervals import quantile_of  # noqa: E402
+from pchem_pipeline.model.fit.result import FitResult  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 from pchem_pipeline.model.fit.status import FitStatus  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
@@ -129,7 +129,10 @@ def coverage(pixels: Pixels, fit: FitResult) -> tuple[int, Array]:
     for place, level in enumerate(LEVELS):
         z = quantile_of(level)
         found[0, place] = inside(truth, values - z * errors, values + z * errors).mean(axis=0)
-        ends = profile_intervals(pixels.counts[good], pixels.origin[good], values[:, :4], level)
+        settings = FitSettings(intervals="profile", interval_level=level)
+        profile = fit_histograms(pixels.counts, pixels.origin, settings=settings).intervals
+        assert profile is not None
+        ends = profile[good]
         found[1, place] = inside(truth, ends[:, :, 0], ends[:, :, 1]).mean(axis=0)
     return int(good.sum()), found
 
@@ -209,7 +212,8 @@ def print_errors(rng: np.random.Generator, n: int) -> None:
         values = estimates(fit)
         values[:, 2] -= pixels.truth[:, 2]
         scatter = values.std(axis=0)
-        sandwich = sandwich_covariance(pixels.counts, pixels.origin, estimates(fit), fit.covariance)
+        settings = GUARD_OFF.model_copy(update={"errors": "sandwich"})
+        sandwich = fit_histograms(pixels.counts, pixels.origin, settings=settings).covariance
         for name, covariance in (("information", fit.covariance), ("sandwich", sandwich)):
             errors = np.median(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), axis=0)
             print(f"{words:34s}{name:13s}" + "".join(f"{v:8.3f}" for v in errors / scatter))

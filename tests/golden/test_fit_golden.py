@@ -10,7 +10,7 @@ from helpers.reference_pchem import Theta, log_likelihood
 from iminuit import Minuit
 from scipy.special import gammaln
 
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.pcd import log_pcd
 

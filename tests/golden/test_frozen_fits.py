@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.effects.framework.registry import effect_class
-from pchem_pipeline.model.fit.joint import fit_joint
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.stages.fit.fit import fit_tile
@@ -53,8 +53,8 @@ def fitted(kind: str, histograms: Arrays) -> Arrays:
         counts = [histograms[f"joint_counts_{j}"] for j in range(len(SAMPLES))]
         origins = [histograms[f"joint_origin_{j}"] for j in range(len(SAMPLES))]
         dark = [each == 0 for each in SAMPLES]
-        fit = fit_joint(counts, origins, dark=dark, settings=settings, adc_limits=ADC)
-        found = {each.name: getattr(fit, each.name) for each in fields(fit)}
+        fit = fit_histograms(counts, origins, dark=dark, settings=settings, adc_limits=ADC)
+        found = {each.name: getattr(fit, each.name) for each in fields(fit) if each.name != "intervals"}
         variances = np.diagonal(fit.covariance, axis1=1, axis2=2)
         errors = [variances[:, : len(SAMPLES)], *variances[:, len(SAMPLES) :].T]
         return found | {

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
 
-from pchem_pipeline.model.fit.exact import refine, rounding_bias
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.rounding import rounding_bias
 from pchem_pipeline.model.fit.settings import FitSettings
 
 N = 800
@@ -18,7 +18,7 @@ def test_exact_is_unbiased_and_the_density_biased_as_predicted(step, exposure):
     frames = 100_000
     drawn = draw(rng, np.full(N, exposure), step, noise, np.full(N, 100.3), frames)
     plain = fit_histograms(drawn.counts, drawn.origin)
-    exact = refine(drawn.counts, drawn.origin, plain, FitSettings(likelihood="exact"))
+    exact = fit_histograms(drawn.counts, drawn.origin, settings=FitSettings(likelihood="exact"), start=plain)
     predicted = rounding_bias(list(drawn.truth[:1].T), np.array([float(frames)]))[0]
     names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
     shifts = []
@@ -44,7 +44,13 @@ def test_codes_at_the_limits_are_censored():
     counts[:, last] += drawn.counts[:, last + 1 :].sum(axis=1, dtype=np.uint32)
     assert counts[:, last].mean() / counts.sum(axis=1).mean() > 0.03
     plain = fit_histograms(counts, drawn.origin, adc_limits=(0, top))
-    exact = refine(counts, drawn.origin, plain, FitSettings(likelihood="exact"), (0, top))
+    exact = fit_histograms(
+        counts,
+        drawn.origin,
+        settings=FitSettings(likelihood="exact"),
+        adc_limits=(0, top),
+        start=plain,
+    )
     good = np.isfinite(exact.conversion_gain)
     assert good.mean() > 0.99
     for i, name in enumerate(("quanta_exposure", "conversion_gain", "bias")):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.drawn_pixels import Drawn, draw
+from helpers.em_trace import em_trace
 from numpy.typing import NDArray
 from scipy.stats import kstest
 
 from pchem_pipeline.model.errors.fisher import cramer_rao, propagate
-from pchem_pipeline.model.fit.pchem import FitResult, em_trace, fit_histograms
-from pchem_pipeline.model.fit.start import START_METHODS, starting_points
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.starts import START_METHODS, starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
 N_PIXELS = 1500

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit.grown import fit_grown, log_likelihood
-from pchem_pipeline.model.fit.grown_profile import profile_effects
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.law.mass import log_likelihood
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
 PIXELS, FRAMES = 120, 4000
@@ -131,7 +131,7 @@ def test_grown_fit_is_unbiased_where_the_plain_one_is_not(name: str) -> None:
     truth = sensor(rng)
     counts, origin = histograms(samples(rng, *(column[:, None] for column in truth)))
     plain = fit_histograms(counts, origin)
-    grown = fit_grown(counts, origin, plain, model, plain=plain)
+    grown = fit_histograms(counts, origin, law=model, start=plain)
     before, after = pulls(plain, truth, 0.8), pulls(grown, truth)
     assert (abs(after) < 5).all(), after
     for parameter in wrong:
@@ -140,57 +140,5 @@ def test_grown_fit_is_unbiased_where_the_plain_one_is_not(name: str) -> None:
     share = np.mean(grown.goodness_p[np.isfinite(grown.goodness_p)] < 0.1)
     assert abs(share - 0.1) < 5 * np.sqrt(0.09 / PIXELS)
     # the right law wins on the frames that it was fitted to, all pixels together
-    neutral = log_likelihood(counts, origin, fit_grown(counts, origin, plain, PLAIN, plain=plain), PLAIN)
+    neutral = log_likelihood(counts, origin, fit_histograms(counts, origin, law=PLAIN, start=plain), PLAIN)
     assert np.nansum(grown.log_likelihood - neutral) > (20 if name != "variance" else -5)
-
-
-def test_effect_and_pixels_are_fitted_together() -> None:
-    rng = np.random.default_rng(8)
-    truth = sensor(rng)
-    counts, origin = histograms(widening(rng, *(column[:, None] for column in truth)))
-    plain = fit_histograms(counts, origin)
-
-    def build(theta: NDArray[np.float64]) -> MarginalModel:
-        return PLAIN.with_variance(per_electron=theta[0] ** 2).with_counts("negative_binomial", theta[1])
-
-    found = profile_effects(
-        counts,
-        origin,
-        plain,
-        build,
-        [0.02, 0.01],
-        scales=[0.05, 0.01],
-        bounds=[(0, 1), (0, 1)],
-        max_pixels=80,
-    )
-    assert found.converged
-    assert found.log_likelihood > found.start_log_likelihood + 100
-    assert found.pixels.size == 80
-    assert abs(found.theta[0] - 0.07) < 5 * np.sqrt(found.covariance[0, 0])
-    assert np.sqrt(found.covariance[0, 0]) < 0.005
-    # no dispersion there: at or near the bound
-    assert found.theta[1] < 5 * np.sqrt(np.nan_to_num(found.covariance[1, 1])) + 1e-12
-    chosen = tuple(column[found.pixels] for column in truth)
-    assert (abs(pulls(found.fit, chosen)) < 5).all()
-
-
-def test_profile_is_at_the_top_of_the_profile_and_its_width_is_its_error() -> None:
-    rng = np.random.default_rng(9)
-    truth = sensor(rng)
-    counts, origin = histograms(bent(rng, *(column[:, None] for column in truth)))
-    plain = fit_histograms(counts, origin)
-
-    def build(theta: NDArray[np.float64]) -> MarginalModel:
-        return PLAIN.with_levels(curvature=float(theta[0]))
-
-    found = profile_effects(counts, origin, plain, build, [0.0], scales=[0.01], max_pixels=60)
-    part, start = counts[found.pixels], found.fit
-    stderr = float(np.sqrt(found.covariance[0, 0]))
-    heights = [
-        fit_grown(
-            part, origin[found.pixels], start, build(found.theta + s * stderr), warm=True
-        ).log_likelihood.sum()
-        for s in (-1.0, 0.0, 1.0)
-    ]
-    np.testing.assert_allclose(np.array(heights) - heights[1], [-0.5, 0.0, -0.5], atol=0.1)
-    assert abs(found.theta[0] - 0.01) < 5 * stderr

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.joint_material import draw_series
 
-from pchem_pipeline.model.errors.fisher import cramer_rao
-from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao
+from pchem_pipeline.model.errors.fisher import cramer_rao, joint_cramer_rao
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 
 EXPOSURES = [0.5, 3.0, 12.0]
@@ -16,7 +16,7 @@ N_PIXELS = 150
 def test_the_joint_fit_is_efficient(noise, dark):
     exposures = EXPOSURES + [0.0] * dark
     series = draw_series(np.random.default_rng(int(100 * noise)), exposures, noise, N_PIXELS)
-    found = fit_joint(series.counts, series.origins, dark=series.dark)
+    found = fit_histograms(series.counts, series.origins, dark=series.dark)
     size = len(exposures)
     bound = joint_cramer_rao(exposures, 0.1, noise * 10.0, 4000)
     truth = {size: 0.1, size + 1: 100.3, size + 2: 10.0 * noise} | dict(enumerate(exposures))
@@ -60,7 +60,7 @@ def test_clipped_samples_are_censored():
     assert share > 0.3
     found = {}
     for likelihood in ("exact", "density"):
-        fit = fit_joint(
+        fit = fit_histograms(
             counts, series.origins, settings=FitSettings(likelihood=likelihood), adc_limits=(0, top)
         )
         found[likelihood] = (fit.conversion_gain - 0.1) / np.sqrt(fit.covariance[:, 2, 2])

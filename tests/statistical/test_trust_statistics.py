@@ -14,9 +14,9 @@ from scipy.stats import binom, kstest
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, ensemble_sums
-from pchem_pipeline.model.errors.fisher import sandwich_covariance
-from pchem_pipeline.model.fit.intervals import profile_intervals, quantile_of
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.intervals import quantile_of
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import pcd_mass
@@ -71,7 +71,10 @@ def test_intervals_cover_the_truth_as_often_as_they_say(case: tuple[float, float
     for level in (0.68, 0.95):
         z = quantile_of(level)
         limit = 5 * np.sqrt(level * (1 - level) / n) + 0.005  # the rest: second order at 2000 frames
-        ends = profile_intervals(pixels.counts[good], pixels.origin[good], values, level)[:, :4]
+        settings = FitSettings(intervals="profile", interval_level=level)
+        ends = fit_histograms(pixels.counts, pixels.origin, settings=settings).intervals
+        assert ends is not None
+        ends = ends[good, :4]
         profile = ((ends[:, :, 0] <= truth) & (truth <= ends[:, :, 1])).mean(axis=0)
         normal = (np.abs(values - truth) <= z * stderr).mean(axis=0)
         np.testing.assert_allclose(profile, level, atol=limit)
@@ -185,7 +188,8 @@ def test_sandwich_errors_hold_where_the_model_does_not() -> None:
     counts = np.random.default_rng(67).multinomial(17_750, mass / mass.sum(), n).astype(np.uint32)
     first = np.full(n, origin)
     fit = fit_histograms(counts, first, settings=GUARD_OFF)
-    sandwich = sandwich_covariance(counts, first, estimates(fit), fit.covariance)
+    settings = GUARD_OFF.model_copy(update={"errors": "sandwich"})
+    sandwich = fit_histograms(counts, first, settings=settings).covariance
     scatter = estimates(fit).std(axis=0)[0]
     limit = 5 / np.sqrt(2 * n)
     assert np.median(np.sqrt(sandwich[:, 0, 0])) == pytest.approx(scatter, rel=limit)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
-from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = ["NO_ORDER", "Member", "find_members", "law_of"]

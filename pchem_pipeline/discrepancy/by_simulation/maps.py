@@ -14,8 +14,9 @@ from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.fit.grown import fit_grown, marginal_mass
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.mass import marginal_mass
 
 __all__ = ["Refit", "equivalent_sensor", "expected_codes", "refit_maps"]
 
@@ -74,7 +75,8 @@ def refit_maps(
         return Refit(maps, {}, covariance)
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
-    fit = fit_grown(counts, histograms.origin.ravel(), flat, law, warm=True)
+    near = np.stack(flat, axis=1)
+    fit = fit_histograms(counts, histograms.origin.ravel(), law=law, start=near)
     new = (fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn)
     good = maps.usable.ravel() & np.isfinite(np.stack(new)).all(axis=0)
     exposure, gain, bias, noise = (np.where(good, values, np.nan).reshape(shape) for values in new)

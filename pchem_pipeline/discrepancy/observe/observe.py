@@ -29,7 +29,8 @@ from pchem_pipeline.discrepancy.observe.vector_frames import (
 )
 from pchem_pipeline.discrepancy.observe.vector_space import neighbour_sums, space_statistics
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.histogram.count import histogram_frames

@@ -146,7 +146,7 @@ class PixelLaw:
 
     def mass_of(self, law: MarginalModel) -> tuple[FloatArray, FloatArray]:
         """Return codes, DN, somewhat beyond those of the PCD, and their mass under a law."""
-        from pchem_pipeline.model.fit.grown import marginal_mass
+        from pchem_pipeline.model.law.mass import marginal_mass
 
         mass: FloatArray = marginal_mass(law, self.maps, self._wide)[0]
         return self._wide, mass
@@ -169,7 +169,7 @@ def refitted(
     Returns:
         The fitted PCDs; that of ``laws`` where the fit fails.
     """
-    from pchem_pipeline.model.fit.pchem import fit_histograms
+    from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.settings import FitSettings
 
     origin = np.array([codes[0] for codes, _ in masses], np.int64)

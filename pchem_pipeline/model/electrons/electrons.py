@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.electrons import electrons_numba
-from pchem_pipeline.model.fit.start import kernel_counts
+from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters, usable_pixels
 
 __all__ = [

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.fit.start import kernel_counts
+from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
 __all__ = [

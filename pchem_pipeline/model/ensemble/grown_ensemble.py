@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble import grown_ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, EnsembleSums, NucedAxis
-from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 

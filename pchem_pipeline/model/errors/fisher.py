@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.model.errors import fisher_numba, information_numba
-from pchem_pipeline.model.fit.start import kernel_counts
-from pchem_pipeline.model.law import estep_numba, workspace_numba
+from pchem_pipeline.model.errors import information_numba
+from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pcd import pcd
 
 __all__ = [
@@ -15,9 +14,9 @@ __all__ = [
     "correlations",
     "covariance_from",
     "cramer_rao",
+    "joint_cramer_rao",
     "observed_covariance",
     "propagate",
-    "sandwich_covariance",
 ]
 
 #: Pairs of parameters, in the order of the axis ``parameter_pair``; numbers as in ``variables.PARAMETERS``.
@@ -67,6 +66,41 @@ def _bound(exposure: float, gain: float, sigma: float, n_frames: float) -> NDArr
     return covariance * np.outer(scale, scale)
 
 
+def joint_cramer_rao(
+    quanta_exposure: ArrayLike, conversion_gain: float, read_noise_dn: float, n_frames: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the smallest covariance of unbiased estimates of (H_1 ... H_J, g, mu, sigma) from J samples.
+
+    The information of independent samples adds up; that of each is the inverse of
+    :func:`cramer_rao`.
+
+    Args:
+        quanta_exposure: H_j, e-, shape (J,); 0: a sample without electrons, H not estimated.
+        conversion_gain: g, e-/DN.
+        read_noise_dn: sigma, DN.
+        n_frames: N_j, shape (J,) or one for all.
+
+    Returns:
+        Covariance, shape (J + 3, J + 3); zeros in the rows and columns of samples without electrons.
+    """
+    exposures = np.asarray(quanta_exposure, np.float64)
+    frames = np.broadcast_to(np.asarray(n_frames, np.float64), exposures.shape)
+    size = exposures.size + 3
+    information = np.zeros((size, size))
+    for j, (exposure, n) in enumerate(zip(exposures, frames, strict=True)):
+        if exposure > 0:
+            place = [j, *range(size - 3, size)]
+            own = cramer_rao(exposure, conversion_gain, read_noise_dn, 1.0)
+            information[np.ix_(place, place)] += n * np.linalg.inv(own)
+        else:
+            information[size - 2, size - 2] += n / read_noise_dn**2
+            information[size - 1, size - 1] += 2.0 * n / read_noise_dn**2
+    free = [*np.flatnonzero(exposures > 0), *range(size - 3, size)]
+    bound = np.zeros((size, size))
+    bound[np.ix_(free, free)] = np.linalg.inv(information[np.ix_(free, free)])
+    return bound
+
+
 def observed_covariance(counts: ArrayLike, origin: int, parameters: ArrayLike) -> NDArray[np.float64]:
     """Return the inverse of Louis' observed information of one histogram at a maximum of the likelihood.
 
@@ -79,15 +113,9 @@ def observed_covariance(counts: ArrayLike, origin: int, parameters: ArrayLike) -
         Covariance of (H, g, mu, sigma), shape (4, 4); NaN where the information is not positive definite.
     """
     weights = np.asarray(counts, np.float64)
-    room = np.empty(weights.size), np.empty(weights.size + 1)
-    histogram, centre, _ = workspace_numba.load(weights, *room)
-    exposure, gain, bias, sigma = (float(value) for value in np.asarray(parameters, np.float64))
-    middle = float(origin + centre)
-    theta = np.array([np.log(exposure), 1.0 / gain, bias - middle, 2.0 * np.log(sigma)])
-    space = workspace_numba.make_workspace(workspace_numba.make_rows(weights.size))
-    estep_numba.evaluate(histogram, theta, space, 0.0)
-    covariance = np.empty((4, 4))
-    fisher_numba.to_natural(theta, middle, space.information, np.zeros(4, np.bool_), np.empty(4), covariance)
+    covariance = np.full((4, 4), np.nan)
+    values = np.asarray(parameters, np.float64)
+    information_numba.observed_covariance(weights, int(origin), values, density_likelihood(), covariance)
     return covariance
 
 
@@ -102,43 +130,6 @@ def propagate(covariance: NDArray[np.float64], gradient: NDArray[np.float64]) ->
         ``sqrt(gradient' covariance gradient)``, shape (...).
     """
     return np.asarray(np.sqrt(np.einsum("...i,...ij,...j->...", gradient, covariance, gradient)))
-
-
-def sandwich_covariance(
-    counts: NDArray[np.integer],
-    origin: NDArray[np.integer],
-    parameters: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    tail_guard: float = 0.0,
-) -> NDArray[np.float64]:
-    """Return the covariance of the estimates that holds even where the model does not (White 1982).
-
-    ``C (sum_i c_i s_i s_i') C`` with the inverse information C and the score s of each sample: it describes
-    how estimates scatter from one set of frames to the next whatever the samples' law is, about the
-    parameters of the nearest PCD. Where the model holds it agrees with C.
-
-    Args:
-        counts: histograms, shape (n, B).
-        origin: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma) at the maximum, shape (n, 4); NaN where there is none.
-        covariance: inverse of the observed information, shape (n, 4, 4); NaN where a bound holds a parameter.
-        tail_guard: of the fit; samples that it left out do not count.
-
-    Returns:
-        Covariance of (H, g, mu, sigma), shape (n, 4, 4), NaN where ``covariance`` is.
-    """
-    middle = np.empty((counts.shape[0], 4, 4))
-    information_numba.outer_scores(
-        kernel_counts(counts),
-        np.ascontiguousarray(origin, np.int64),
-        np.ascontiguousarray(parameters, np.float64),
-        tail_guard,
-        middle,
-    )
-    bread = np.where(np.isfinite(covariance), covariance, 0.0)
-    with np.errstate(invalid="ignore"):
-        found = bread @ middle @ bread
-    return np.where(np.isfinite(covariance), found, np.nan)
 
 
 def correlations(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,11 +7,35 @@ The score of a sample x is the posterior mean of the complete-data score (Louis 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.errors.algebra_numba import invert_arrow, to_natural
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    BIAS,
+    CENTRE,
+    DAMPING,
+    DARK,
+    FIRST,
+    HELD,
+    HERE,
+    LOG_VARIANCE,
+    N_BINS,
+    N_SHARED,
+    SATELLITE,
+    SCORE,
+    STEP,
+    SUMS,
+    WEIGHT,
+    Pixel,
+    load,
+    make_pixel,
+    make_scratch,
+)
 
 _REACH = 8.0  # standard deviations around a sample in which components count
 _FAR = 700.0  # exponents below minus this are 0
@@ -79,52 +103,49 @@ def sample_score(
     return top + math.log(s0) - math.log(sigma) - 0.9189385332046727
 
 
-@kernel
+@kernel(inline=True)
 def _size(exposure: float, gain: float, reach: float) -> int:
     """Return how many electron numbers matter for values up to ``reach`` DN above the bias."""
     return int(max(exposure + 12.0 * math.sqrt(exposure), max(reach, 0.0) * gain) + 40.0)
 
 
-@kernel
-def outer_scores(
-    counts: NDArray[np.generic],
-    origin: NDArray[np.int64],
-    parameters: NDArray[np.float64],
-    floor: float,
-    out: NDArray[np.float64],
-) -> None:
-    """Fill the sums of outer products of the samples' scores, the middle of the sandwich.
+@kernel(inline=True)
+def fill_squared_scores(pixel: Pixel, theta: NDArray[np.float64], at: NDArray[np.float64]) -> None:
+    """Fill the sums of outer products of the samples' scores, the middle of the sandwich, of the density.
 
     Args:
-        counts: histograms, shape (n, B).
-        origin: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma), shape (n, 4); NaN where there is none.
-        floor: of the tail guard; samples that it leaves out do not count.
-        out: out, shape (n, 4, 4); NaN without parameters.
+        pixel: its samples.
+        theta: parameters, shape (J + N_SHARED,).
+        at: out, an evaluation, in the place of its damping matrix; lower triangles.
     """
-    score = np.empty(4)
-    for p in range(counts.shape[0]):
-        out[p] = math.nan
-        if not math.isfinite(parameters[p].sum()):
-            continue
-        out[p] = 0.0
-        n = 0.0
-        reach = float(origin[p]) - parameters[p, 2]
-        for b in range(counts.shape[1]):
-            n += float(counts[p, b])
-            if counts[p, b] > 0:
-                reach = float(origin[p] + b) - parameters[p, 2]
-        weights = log_poisson(parameters[p, 0], _size(parameters[p, 0], parameters[p, 1], reach))
-        for b in range(counts.shape[1]):
-            if counts[p, b] == 0:
+    n = pixel.facts.shape[0]
+    parameters, score = np.empty(4), np.empty(4)
+    parameters[1], parameters[3] = 1.0 / theta[n + STEP], math.exp(0.5 * theta[n + LOG_VARIANCE])
+    slope = np.empty(4)
+    slope[1], slope[2], slope[3] = -parameters[1] * parameters[1], 1.0, 0.5 * parameters[3]
+    for j in range(n):
+        facts, first, n_bins = pixel.facts[j], pixel.facts[j, FIRST], int(pixel.facts[j, N_BINS])
+        at[j, DAMPING:SUMS] = 0.0
+        dark = facts[DARK] > 0.0
+        parameters[0], parameters[2] = math.exp(theta[j]), theta[n + BIAS] - facts[CENTRE]
+        slope[0] = parameters[0]
+        size = _size(parameters[0], parameters[1], first + n_bins - parameters[2])
+        weights = log_poisson(parameters[0], size)
+        for i in range(n_bins):
+            c = pixel.bins[j, WEIGHT, i]
+            if c == 0.0:
                 continue
-            c = float(counts[p, b])
-            logged = sample_score(float(origin[p] + b), parameters[p], weights, score)
-            if floor > 0.0 and logged < math.log(floor / n):
-                continue
-            for i in range(4):
-                for j in range(4):
-                    out[p, i, j] += c * score[i] * score[j]
+            if dark:
+                e = first + i - parameters[2]
+                score[0] = score[1] = 0.0
+                score[2] = e / parameters[3] ** 2
+                score[3] = (e * e / parameters[3] ** 2 - 1.0) / parameters[3]
+            else:
+                sample_score(first + i, parameters, weights, score)
+            for row in range(4):
+                for column in range(row + 1):
+                    product = score[row] * slope[row] * score[column] * slope[column]
+                    at[j, DAMPING + row, column] += c * product
 
 
 @kernel
@@ -228,28 +249,31 @@ def curve_variance(
 
 
 @kernel
-def trim_tile(
-    counts: NDArray[np.generic],
-    origin: NDArray[np.int64],
+def observed_covariance(
+    counts: NDArray[np.float64],
+    origin: int,
     parameters: NDArray[np.float64],
-    floor: float,
-    out: NDArray[np.generic],
+    evaluate: Any,
+    covariance: NDArray[np.float64],
 ) -> None:
-    """Copy the histograms of shape (n, B) without the samples that the tail guard leaves out."""
-    score = np.empty(4)
-    for p in range(counts.shape[0]):
-        n, last = 0.0, 0
-        for b in range(counts.shape[1]):
-            out[p, b] = counts[p, b]
-            n += float(counts[p, b])
-            if counts[p, b] > 0:
-                last = b
-        if not (math.isfinite(parameters[p].sum()) and n > 0.0):
-            continue
-        reach = float(origin[p] + last) - parameters[p, 2]
-        weights = log_poisson(parameters[p, 0], _size(parameters[p, 0], parameters[p, 1], reach))
-        for b in range(counts.shape[1]):
-            if counts[p, b] > 0:
-                logged = sample_score(float(origin[p] + b), parameters[p], weights, score)
-                if logged < math.log(floor / n):
-                    out[p, b] = 0
+    """Fill the inverse of the observed information of one histogram; nothing unless that is regular.
+
+    Args:
+        counts: histogram, shape (B,).
+        origin: DN of bin 0.
+        parameters: (H, g, mu, sigma).
+        evaluate: the density.
+        covariance: out, of (H, g, mu, sigma).
+    """
+    pixel = make_pixel(np.zeros(1, np.bool_), counts.size, 0, 0, np.zeros((0, 2)))
+    scratch = make_scratch(1, counts.size, np.bool_(False))
+    centre = origin + load(counts, np.zeros(counts.size, np.uint8), pixel.bins[0], pixel.facts[0])
+    theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]
+    theta[0], theta[1] = math.log(parameters[0]), 1.0 / parameters[1]
+    theta[2], theta[3] = parameters[2] - centre, 2.0 * math.log(parameters[3])
+    evaluate(pixel, theta, False, scratch, at)
+    held[1 + SATELLITE] = True
+    full, found = np.empty((1 + N_SHARED, 1 + N_SHARED)), np.empty(4)
+    at[0, SCORE] = 0.0
+    if invert_arrow(at, theta, held, full):
+        to_natural(theta, held[:1], held, 0.0, full, found, covariance)

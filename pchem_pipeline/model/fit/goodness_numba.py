@@ -1,4 +1,4 @@
-"""Pearson chi-square of a histogram, adjacent bins merged."""
+"""Pearson's chi-square of the histograms of a pixel, adjacent bins merged."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.pixel_numba import DARK, EXPECTED, N_BINS, N_FRAMES, WEIGHT, Pixel
 
 SMALLEST_EXPECTATION = 5.0
 FITTED_PARAMETERS = 4
@@ -53,3 +54,35 @@ def normal_score(chi2: float, freedom: int) -> float:
     spread = 2.0 / (9.0 * freedom)
     deviate: float = ((chi2 / freedom) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread)
     return deviate
+
+
+@kernel
+def goodness(pixel: Pixel) -> tuple[float, int]:
+    """Return Pearson's chi-square of all samples, from the counts expected, and its degrees of freedom.
+
+    Each sample's exposure is a fitted parameter of its own; 1/g, mu and sigma are fitted once.
+    """
+    chi2, freedom = 0.0, 1 - FITTED_PARAMETERS
+    for j in range(pixel.facts.shape[0]):
+        bins, facts = pixel.bins[j], pixel.facts[j]
+        own, degrees = pearson(bins[WEIGHT], bins[EXPECTED], int(facts[N_BINS]), facts[N_FRAMES])
+        if degrees > 0:
+            chi2 += own
+            freedom += degrees + FITTED_PARAMETERS
+            if facts[DARK] == 0.0:
+                freedom -= 1
+    if freedom <= 0:
+        return math.nan, 0
+    return chi2, freedom
+
+
+@kernel
+def outlying(pixel: Pixel, floor: float) -> float:
+    """Return how many samples lie at DN of which fewer than ``floor`` are expected."""
+    found = 0.0
+    for j in range(pixel.facts.shape[0]):
+        bins = pixel.bins[j]
+        for i in range(int(pixel.facts[j, N_BINS])):
+            if bins[EXPECTED, i] < floor:
+                found += bins[WEIGHT, i]
+    return found

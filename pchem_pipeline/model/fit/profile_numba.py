@@ -3,213 +3,208 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.errors.fisher_numba import back_substitute, cholesky, invert
-from pchem_pipeline.model.fit.polish_numba import MAX_ELECTRON_NOISE, MIN_ELECTRON_NOISE, MIN_LOG_VARIANCE
-from pchem_pipeline.model.law.estep_numba import evaluate
-from pchem_pipeline.model.law.workspace_numba import (
-    Histogram,
-    Workspace,
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.errors.algebra_numba import invert_arrow
+from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, Limits, min_log_variance
+from pchem_pipeline.model.fit.tile_numba import Histograms, load_pixel, make_room, theta_of
+from pchem_pipeline.model.law.cells_numba import Law, resolve
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    FIXED,
+    HELD,
+    HERE,
+    KEPT_STARTS,
+    LOG_VARIANCE,
+    N_SHARED,
+    OTHER,
+    SATELLITE,
+    STEP,
+    Pixel,
+    Scratch,
     copy,
-    load,
-    make_rows,
-    make_workspace,
+    make_scratch,
 )
 
-#: targets: log H, 1/g, mu, log sigma^2, and log s_e^2 in the place of the last
-N_TARGETS = 5
-_NOISE_E = 4
+FloatArray = NDArray[np.float64]
 
-_INNER = 40  # Newton steps at a fixed value
 _OUTER = 30  # fixed values tried for an end
-_ENOUGH = 1e-6  # nats of the inner maximisation
 _CLOSE = 1e-4  # of the root of the drop
+_FARTHEST = 60.0  # roots from the maximum
+
+
+@kernel(inline=True)
+def _set(
+    good: FloatArray, direction: FloatArray, distance: float, tied: bool, rounding: float, theta: FloatArray
+) -> None:
+    """Fill ``theta``: ``good`` and so many directions; tied: log (sigma g)^2 stands in the place of v."""
+    noise, step = theta.size - N_SHARED + LOG_VARIANCE, theta.size - N_SHARED + STEP
+    for i in range(theta.size):
+        theta[i] = good[i] + distance * direction[i]
+    if tied:
+        own = math.log((math.exp(good[noise]) + rounding) / good[step] ** 2) + distance * direction[noise]
+        theta[noise] = math.log(max(math.exp(own) * theta[step] ** 2 - rounding, 1e-12))
 
 
 @kernel
-def to_theta(phi: NDArray[np.float64], target: int, theta: NDArray[np.float64]) -> bool:
-    """Turn the coordinates of a target into theta; False outside of what the likelihood is defined for."""
-    copy(phi, theta)
-    if target == _NOISE_E and phi[1] > 0.0:
-        theta[3] = phi[3] + 2.0 * math.log(phi[1])
-    if not (theta[1] > 1.0 and theta[3] >= MIN_LOG_VARIANCE - 1e-9 and -25.0 < theta[0] < 11.0):
-        return False
-    noise = math.exp(0.5 * theta[3]) / theta[1]
-    inside: bool = MIN_ELECTRON_NOISE <= noise <= MAX_ELECTRON_NOISE
-    return inside
-
-
-@kernel
-def to_coordinates(space: Workspace, phi: NDArray[np.float64], target: int) -> None:
-    """Turn score and information in theta, in place, into those in the coordinates of a target."""
-    if target != _NOISE_E:
-        return
-    score, information = space.score, space.information
-    slope = 2.0 / phi[1]  # of log sigma^2 = log s_e^2 + 2 log a with respect to a
-    extra = 2.0 * score[3] / (phi[1] * phi[1])
-    score[1] += slope * score[3]
-    for j in range(4):
-        information[1, j] += slope * information[3, j]
-    for j in range(4):
-        information[j, 1] += slope * information[j, 3]
-    information[1, 1] += extra
-
-
-@kernel
-def maximise_others(
-    histogram: Histogram,
-    phi: NDArray[np.float64],
-    target: int,
-    held: NDArray[np.bool_],
-    space: Workspace,
-) -> float:
-    """Climb over the coordinates that are not held, in place; return the log-likelihood, NaN on failure."""
-    theta, trial, step = np.empty(4), np.empty(4), np.empty(4)
-    matrix, lower = np.empty((4, 4)), np.empty((4, 4))
-    if not to_theta(phi, target, theta):
-        return math.nan
-    loglik: float = evaluate(histogram, theta, space, 0.0)
-    for _ in range(_INNER):
-        to_coordinates(space, phi, target)
-        damping = 0.0
-        while True:
-            for i in range(4):
-                step[i] = 0.0 if held[i] else space.score[i]
-                for j in range(4):
-                    matrix[i, j] = space.information[i, j]
-                matrix[i, i] += damping * abs(matrix[i, i])
-            if cholesky(matrix, held, lower):
-                break
-            damping = 4.0 * damping + 1e-3
-            if damping > 1e3:
-                return math.nan
-        rise: float = 0.5 * back_substitute(lower, step)
-        if rise < _ENOUGH and damping == 0.0:
-            return loglik + rise
-        longest = max(max(abs(step[0]) / 0.5, abs(step[1]) / (0.1 * phi[1])),
-                      max(abs(step[2]) / (0.4 * phi[1]), abs(step[3]) / 0.5))  # fmt: skip
-        factor = 1.0 if longest <= 1.0 else 1.0 / longest
-        higher = -math.inf
-        for _attempt in range(12):
-            for i in range(4):
-                trial[i] = phi[i] + factor * step[i]
-            if to_theta(trial, target, theta):
-                higher = evaluate(histogram, theta, space, 0.0)
-                if higher >= loglik - 1e-9 * abs(loglik) * 1e-3:
-                    break
-            factor *= 0.4
-        if not higher >= loglik - 1e-9 * abs(loglik) * 1e-3:
-            return math.nan
-        copy(trial, phi)
-        loglik = higher
-    return math.nan
-
-
-@kernel
-def find_end(
-    histogram: Histogram,
-    best: NDArray[np.float64],
+def _end(
+    pixel: Pixel,
+    evaluate: Any,
+    climb: Any,
+    limits: Limits,
+    scratch: Scratch,
+    best: FloatArray,
     top: float,
-    target: int,
+    place: int,
+    tied: bool,
     root: float,
-    direction: NDArray[np.float64],
-    held: NDArray[np.bool_],
-    space: Workspace,
-) -> float:
-    """Return the value of the target at which the profile has fallen by ``root^2 / 2``; NaN without one.
+    direction: FloatArray,
+) -> bool:
+    """Find where the profile of a parameter has fallen by ``root^2 / 2``; in the row `HERE` of the scratch.
 
     The signed root of twice the drop is nearly linear, so a secant on it ends after a few values.
 
     Args:
-        histogram: of the pixel.
-        best: coordinates at the maximum.
+        pixel: its samples.
+        evaluate: the likelihood.
+        climb: on it.
+        limits: bounds and limits.
+        scratch: room to work in, with the parameters that stay.
+        best: theta at the maximum.
         top: log-likelihood there.
-        target: the parameter.
+        place: of the parameter in theta.
+        tied: it is the read noise in e- instead.
         root: drop, as standard normal quantile.
-        direction: change of all coordinates per standard error of the target, with the side's sign.
-        held: coordinates that stay, the target's place included.
-        space: scratch.
+        direction: change of all coordinates per standard error of the parameter, with the side's sign.
+
+    Returns:
+        Whether there is such an end.
     """
-    place = min(target, 3)
-    phi, good = best.copy(), best.copy()
+    theta, good = scratch.small[HERE], scratch.small[OTHER]
+    goal = Goal(np.bool_(False), -math.inf, math.inf, tied)
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+    n = theta.size - N_SHARED
+    copy(best, good)
     inside, below, outside, above = 0.0, 0.0, math.inf, math.inf
     distance = root
     for _ in range(_OUTER):
-        for i in range(4):
-            phi[i] = good[i] + (distance - inside) * direction[i]
-        loglik = maximise_others(histogram, phi, target, held, space)
-        drop = math.sqrt(max(0.0, 2.0 * (top - loglik))) if math.isfinite(loglik) else math.inf
+        _set(good, direction, distance - inside, tied, rounding, theta)
+        wanted = theta[place]
+        drop = math.inf
+        low = min_log_variance(theta[n + STEP], limits.cells) if place == n + LOG_VARIANCE else limits.bound
+        if theta[n + STEP] > 0.0 and (place == n + STEP or place == n + 1 or wanted >= low):
+            outcome, loglik, _ = climb(pixel, evaluate, limits, goal, theta, theta, scratch)
+            if outcome == CONVERGED and (tied or theta[place] == wanted):
+                drop = math.sqrt(max(0.0, 2.0 * (top - loglik)))
         if abs(drop - root) < _CLOSE * root:
-            return float(phi[place])
+            return True
         if drop < root:
             inside, below = distance, drop
-            copy(phi, good)
+            copy(theta, good)
         else:
             outside, above = distance, drop
         if outside == math.inf:
             distance = min(3.0 * distance, distance * root / max(below, 0.1 * root) * 1.02)
-            if distance > 60.0 * root:
-                return math.nan
+            if distance > _FARTHEST * root:
+                return False
         elif above == math.inf:
             distance = 0.5 * (inside + outside)
         else:
             share = (root - below) / (above - below)
             distance = inside + min(0.95, max(0.05, share)) * (outside - inside)
         if outside - inside < 1e-7 * root:
-            return math.nan if above == math.inf else float(phi[place])
-    return math.nan
+            return above < math.inf
+    return False
 
 
 @kernel
 def profile_tile(
-    counts: NDArray[np.generic],
-    origin: NDArray[np.int64],
-    parameters: NDArray[np.float64],
+    given: Histograms,
+    law: Law,
+    limits: Limits,
+    evaluate: Any,
+    climb: Any,
+    parameters: FloatArray,
+    satellites: FloatArray,
     root: float,
-    out: NDArray[np.float64],
+    out: FloatArray,
 ) -> None:
-    """Fill the ends of the intervals of every pixel, in theta and log s_e^2.
+    """Fill the ends of the intervals of every pixel.
 
     Args:
-        counts: histograms without outliers, shape (n, B).
-        origin: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma) at the maximum, shape (n, 4); NaN where there is none.
+        given: histograms; codes left out by the tail guard do not count.
+        law: of the samples.
+        limits: bounds and limits.
+        evaluate: the likelihood.
+        climb: the climb on it.
+        parameters: (H_1 ... H_J, g, mu, sigma) at the maximum, shape (n, J + 3); NaN where there is none.
+        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
         root: drop of the log-likelihood, as standard normal quantile.
-        out: out, (log H, 1/g, mu, log sigma^2, log s_e^2) by pixel, and the lower and upper end of each,
-            shape (n, 5, 2); NaN where the likelihood does not fall far enough.
+        out: out, lower and upper ends of (H_1 ... H_J, g, mu, sigma, sigma g), shape (n, J + 4, 2); comes as
+            NaN, which stays where the likelihood does not fall far enough.
     """
-    n_most = counts.shape[1]
-    weights, cumulative = np.empty(n_most), np.empty(n_most + 1)
-    space = make_workspace(make_rows(n_most))
-    theta, best, direction = np.empty(4), np.empty(4), np.empty(4)
-    covariance = np.empty((4, 4))
-    nothing, held = np.zeros(4, np.bool_), np.zeros(4, np.bool_)
-    for p in range(counts.shape[0]):
-        out[p] = math.nan
-        if not math.isfinite(parameters[p].sum()):
+    n = given.dark.size
+    size = n + N_SHARED
+    room = make_room(given, law)
+    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
+    fixed, at, best = scratch.flags[FIXED], scratch.evaluations[AT], scratch.small[KEPT_STARTS]
+    direction, covariance = np.empty(size), np.empty((size, size))
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+    goal = Goal(np.bool_(False), -math.inf, math.inf, np.bool_(False))
+    for index in range(given.counts.shape[0]):
+        pixel = load_pixel(given, index, room)
+        if not theta_of(parameters[index], pixel, limits, best):
             continue
-        histogram, centre, _ = load(counts[p], weights, cumulative)
-        middle = float(origin[p] + centre)
-        theta[0], theta[1] = math.log(parameters[p, 0]), 1.0 / parameters[p, 1]
-        theta[2], theta[3] = parameters[p, 2] - middle, 2.0 * math.log(parameters[p, 3])
-        for target in range(N_TARGETS):
-            place = min(target, 3)
-            copy(theta, best)
-            if target == _NOISE_E:
-                best[3] = theta[3] - 2.0 * math.log(theta[1])
-            top = maximise_others(histogram, best, target, nothing, space)
-            if not math.isfinite(top) or not invert(space.information, nothing, covariance):
+        best[n + LOG_VARIANCE] = math.log(max(math.exp(best[n + LOG_VARIANCE]) - rounding, 1e-12))
+        best[n + SATELLITE] = satellites[index, 1]
+        if limits.cells:
+            resolve(law, index, satellites[index, 0], pixel)
+        for j in range(n):
+            fixed[j] = given.dark[j]
+        for i in range(n, size):
+            fixed[i] = False
+        fixed[n + SATELLITE] = not satellites[index, 1] > 0.0
+        outcome, top, _ = climb(pixel, evaluate, limits, goal, best, best, scratch)
+        held = scratch.flags[HELD].copy()
+        if outcome != CONVERGED or not invert_arrow(at, best, held, covariance):
+            continue
+        slope = 1.0 / (1.0 + rounding * math.exp(-best[n + LOG_VARIANCE]))
+        for target in range(size):
+            tied = target == n + 3
+            place = min(target, n + LOG_VARIANCE)
+            if held[place]:
                 continue
-            for i in range(4):
-                held[i] = i == place
+            for i in range(size):
+                direction[i] = covariance[i, place]
+                if tied:
+                    direction[i] = slope * direction[i] - 2.0 / best[n + STEP] * covariance[i, n + STEP]
+            if tied:
+                direction[place] = slope * direction[place] - 2.0 / best[n + STEP] * direction[n + STEP]
+            sd = math.sqrt(direction[place])
+            for i in range(size):
+                direction[i] /= sd
+                if i < n:
+                    direction[i] *= math.exp(-best[i])  # of log H
+            fixed[place] = True
             for side in range(2):
-                sign = 2.0 * side - 1.0
-                for i in range(4):
-                    direction[i] = sign * covariance[i, place] / math.sqrt(covariance[place, place])
-                out[p, target, side] = find_end(histogram, best, top, target, root, direction, held, space)
-            if target == 2:
-                out[p, target] += middle
+                for i in range(size):
+                    direction[i] = -direction[i]
+                if not _end(pixel, evaluate, climb, limits, scratch, best, top, place, tied, root, direction):
+                    continue
+                end = scratch.small[HERE]
+                value = math.exp(end[place]) if place < n else end[place]
+                if place == n + STEP:
+                    out[index, target, 1 - side] = 1.0 / value  # a larger step is a smaller gain
+                    continue
+                if place == n + 1:
+                    value += pixel.centre
+                if place == n + LOG_VARIANCE:
+                    value = math.sqrt(math.exp(value) + rounding)
+                    value = value / end[n + STEP] if tied else value
+                out[index, target, side] = value
+            fixed[place] = False

@@ -1,93 +1,110 @@
-"""What rounding to whole DN does to estimates from the density of the PCD."""
+"""Loop of :mod:`pchem_pipeline.model.fit.rounding`."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.errors.fisher_numba import back_substitute, cholesky, invert
-from pchem_pipeline.model.law.estep_numba import evaluate
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.errors.algebra_numba import invert_arrow, solve_arrow
 from pchem_pipeline.model.law.pcd_numba import masses
-from pchem_pipeline.model.law.workspace_numba import Histogram, make_rows, make_workspace
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    CUMULATIVE,
+    FIRST,
+    HELD,
+    HERE,
+    MEAN,
+    N_BINS,
+    N_FRAMES,
+    N_SHARED,
+    SATELLITE,
+    SCORE,
+    STEPS,
+    VARIANCE,
+    WEIGHT,
+    make_pixel,
+    make_scratch,
+)
 
-_ROUNDING = 1.0 / 12.0
 _REACH = 8.0  # standard deviations
 
 
-@kernel
-def rounding_bias(
-    exposure: float, a: float, bias: float, sigma: float, n: float, shift: NDArray[np.float64]
-) -> bool:
+@kernel(inline=True)
+def _shift(parameters: NDArray[np.float64], n: float, evaluate: Any, shift: NDArray[np.float64]) -> bool:
     """Fill the bias of (log H, 1/g, mu, log sigma^2) in standard errors.
 
     To first order it is ``I^-1 s``, with score s and information I of the density at the truth, on the counts
     that the exact masses expect.
 
     Args:
-        exposure: H, e-.
-        a: 1/g, DN.
-        bias: mu, DN; only its fraction matters.
-        sigma: DN, quantisation included.
+        parameters: (H, g, mu, sigma).
         n: frames.
+        evaluate: the density.
         shift: out, shape (4,).
 
     Returns:
         Whether there is an answer: not where sigma is rounding alone.
     """
-    analog2 = sigma * sigma - _ROUNDING
+    exposure, a, bias, sigma = parameters[0], 1.0 / parameters[1], parameters[2], parameters[3]
+    analog2 = sigma * sigma - QUANTISATION_VARIANCE
     if not (analog2 > 0.0 and exposure > 0.0 and math.isfinite(a + bias + n)):
         return False
     first = math.floor(-_REACH * sigma) - 1
     n_bins = int((exposure + _REACH * math.sqrt(exposure) + 8.0) * a + _REACH * sigma) + 2 - first
     offset = bias - math.floor(bias)
-    places, weights = np.empty(n_bins), np.empty(n_bins)
-    for i in range(n_bins):
-        places[i] = float(first + i)
+    pixel = make_pixel(np.zeros(1, np.bool_), n_bins, 0, 0, np.zeros((0, 2)))
+    scratch = make_scratch(1, n_bins, np.bool_(False))
+    places = np.arange(n_bins) + float(first)
     same = np.ones(n_bins)
+    weights, cumulative, facts = pixel.bins[0, WEIGHT, :n_bins], pixel.bins[0, CUMULATIVE], pixel.facts[0]
     masses(places, exposure * same, same / a, offset * same, math.sqrt(analog2) / a * same, weights)
-    cumulative = np.empty(n_bins + 1)
-    cumulative[0] = 0.0
+    total = mean = variance = 0.0
     for i in range(n_bins):
         weights[i] *= n
         cumulative[i + 1] = cumulative[i] + weights[i]
-    total = cumulative[n_bins]
-    mean = variance = 0.0
-    for i in range(n_bins):
-        mean += weights[i] * places[i] / total
+        total += weights[i]
+        mean += weights[i] * places[i]
+    mean /= total
     for i in range(n_bins):
         variance += weights[i] * (places[i] - mean) ** 2 / total
-    histogram = Histogram(weights, cumulative, n_bins, float(first), total, mean, variance)
-    space = make_workspace(make_rows(n_bins))
-    theta = np.array([math.log(exposure), a, offset, 2.0 * math.log(sigma)])
-    evaluate(histogram, theta, space, 0.0)
-    held = np.zeros(4, np.bool_)
-    lower, covariance = np.zeros((4, 4)), np.empty((4, 4))
-    if not cholesky(space.information, held, lower):
+    facts[N_BINS], facts[FIRST], facts[N_FRAMES], facts[MEAN] = float(n_bins), float(first), total, mean
+    facts[VARIANCE] = variance
+    theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]
+    theta[0], theta[1], theta[2], theta[3] = math.log(exposure), a, offset, 2.0 * math.log(sigma)
+    evaluate(pixel, theta, False, scratch, at)
+    held[1 + SATELLITE] = True
+    step = scratch.small[STEPS]
+    covariance = np.empty((1 + N_SHARED, 1 + N_SHARED))
+    if not solve_arrow(at, 0.0, scratch, step) >= 0.0:
+        return False
+    at[0, SCORE] = 0.0
+    if not invert_arrow(at, theta, held, covariance):
         return False
     for i in range(4):
-        shift[i] = space.score[i]
-    back_substitute(lower, shift)
-    invert(space.information, held, covariance)
-    for i in range(4):
-        shift[i] /= math.sqrt(covariance[i, i])
+        shift[i] = step[i] / math.sqrt(covariance[i, i])
+    shift[0] *= exposure
     return True
 
 
 @kernel
-def rounding_tile(parameters: NDArray[np.float64], n: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def rounding_tile(
+    parameters: NDArray[np.float64], n: NDArray[np.float64], evaluate: Any, out: NDArray[np.float64]
+) -> None:
     """Fill the bias of every pixel with finite parameters.
 
     Args:
         parameters: (H, g, mu, sigma), shape (n, 4).
         n: frames, shape (n,).
+        evaluate: the density.
         out: out, shape (n, 4); comes as infinity, which stays where there is no answer.
     """
     shift = np.empty(4)
     for pixel in range(parameters.shape[0]):
-        exposure, gain, bias, sigma = parameters[pixel]
-        if rounding_bias(exposure, 1.0 / gain, bias, sigma, n[pixel], shift):
+        if _shift(parameters[pixel], n[pixel], evaluate, shift):
             for i in range(4):
                 out[pixel, i] = shift[i]

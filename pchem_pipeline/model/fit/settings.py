@@ -71,13 +71,12 @@ class FitSettings(Section):
     errors: Literal["information", "sandwich"] = Field(
         default="information",
         description="information: standard errors from the observed information, right if the model holds. "
-        "sandwich: right for the nearest PCD even where it does not (not with model.effects)",
+        "sandwich: right for the nearest such law even where it does not",
     )
     intervals: Literal["normal", "profile"] = Field(
         default="normal",
         description="normal: estimate -+ standard errors. profile: also the ends of profile-likelihood "
-        "intervals, for low quanta exposure or read noise above 0.45 e- (about 0.1 ms per pixel; not with "
-        "model.effects)",
+        "intervals, for low quanta exposure or read noise above 0.45 e- (about 0.1 ms per pixel)",
     )
     interval_level: float = Field(
         default=0.6827, gt=0.1, lt=0.9999, description="probability that a profile interval covers the truth"

@@ -1,7 +1,7 @@
 """Maximum likelihood of the pixels' four parameters together with parameters that all pixels share.
 
 Scoring steps (Fisher 1935) with a damping (Levenberg 1944) on the exact masses of the codes
-(:func:`~pchem_pipeline.model.fit.grown.marginal_mass`); derivatives in what the pixels share are differences
+(:func:`~pchem_pipeline.model.law.mass.marginal_mass`); derivatives in what the pixels share are differences
 of masses, so any law will do. The information matrix has an arrow shape, a 4 x 4 block per pixel and one
 border for what they share, so a step costs no more than the pixels' own.
 
@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit.grown import marginal_mass, marginal_slopes
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.mass import marginal_mass, marginal_slopes
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = ["SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared", "to_parameters", "to_theta"]
@@ -26,7 +27,6 @@ FloatArray = NDArray[np.float64]
 #: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
 Law = Callable[[FloatArray, FloatArray], MarginalModel]
 
-_ROUNDING = 1.0 / 12.0
 _LEAST_MASS = 1e-60
 _STEP = 1e-5  # of the differences, in units of the parameters' natural scale
 _REACH_EXPOSURE, _REACH_STEP = 2.0, 0.3  # logarithms
@@ -109,14 +109,14 @@ class SharedFit:
 
 def to_parameters(theta: FloatArray) -> FloatArray:
     """Return (H, g, mu, sigma), shape (n, 4), of (log H, log 1/g, mu, log sigma_R^2)."""
-    variance = np.exp(theta[:, 3]) + _ROUNDING
+    variance = np.exp(theta[:, 3]) + QUANTISATION_VARIANCE
     return np.stack([np.exp(theta[:, 0]), np.exp(-theta[:, 1]), theta[:, 2], np.sqrt(variance)], axis=1)
 
 
 def to_theta(parameters: FloatArray) -> FloatArray:
     """Return (log H, log 1/g, mu, log sigma_R^2), shape (n, 4), of (H, g, mu, sigma)."""
     h, g, mu, sigma = parameters.T
-    analog = np.maximum(sigma**2 - _ROUNDING, 0.05 * sigma**2)
+    analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.05 * sigma**2)
     return np.stack([np.log(np.maximum(h, 1e-6)), -np.log(g), mu, np.log(analog)], axis=1)
 
 

@@ -59,36 +59,33 @@ def electron_number(
     dispersion: float,
     k: int,
     exposure: float,
-    weights: NDArray[np.float64],
-    factors: NDArray[np.float64],
-    added_weights: NDArray[np.float64],
-    added: NDArray[np.float64],
+    mixtures: NDArray[np.float64],
 ) -> tuple[float, float, float]:
     """Return P(k) of a mixture of exposures and its first two derivatives in log exposure.
 
     Args:
         law: one of the names at the top of this module.
-        dispersion: its parameter, see :class:`~pchem_pipeline.model.law.sample_law.MarginalModel`.
+        dispersion: its parameter, see :class:`~pchem_pipeline.model.law.sample_law.SampleLaw`.
         k: number of electrons.
         exposure: H, e-.
-        weights: of the exposures, shape (m,).
-        factors: exposures in units of H, shape (m,).
-        added_weights: of the exposures beside it, shape (j,).
-        added: these exposures, e-, shape (j,).
+        mixtures: weights of the exposures and these in units of H; weights of the exposures beside it and
+            these in e-; shape (4, m), weight 0 where there are fewer.
     """
     mass = slope = bend = 0.0
-    for b in range(weights.size):
-        own = exposure * factors[b]
-        for j in range(added.size):
-            if added_weights[j] == 0.0:
+    for b in range(mixtures.shape[1]):
+        if mixtures[0, b] == 0.0:
+            continue
+        own = exposure * mixtures[1, b]
+        for j in range(mixtures.shape[1]):
+            if mixtures[2, j] == 0.0:
                 continue
-            whole = own + added[j]
+            whole = own + mixtures[3, j]
             log_mass, first, second = _one_law(law, dispersion, float(k), whole)
             # from the logarithm of the whole exposure to that of H: d log whole = share d log H
             share = own / whole
             second = (second * share + first * (1.0 - share)) * share
             first *= share
-            part = weights[b] * added_weights[j] * math.exp(log_mass)
+            part = mixtures[0, b] * mixtures[2, j] * math.exp(log_mass)
             mass += part
             slope += part * first
             bend += part * (second + first * first)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +15,10 @@ from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.errors.fisher import correlations
-from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine
-from pchem_pipeline.model.fit.excluding_codes import Interval, fit_beside
-from pchem_pipeline.model.fit.grown import fit_grown
-from pchem_pipeline.model.fit.intervals import profile_intervals
-from pchem_pipeline.model.fit.outliers import without_outliers
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.excluding_codes import Interval
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.sample_law import MarginalModel
@@ -40,12 +37,6 @@ __all__ = ["fit_tile", "run"]
 _HISTOGRAM = ("counts", "origin", "under", "over")
 #: Pixels of which effects are told nothing: no value, or one electron off.
 _UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
-
-
-_PLAIN_ONLY = (
-    "fit.intervals: profile and fit.errors: sandwich need the plain model; with model.effects or "
-    "model.set_aside_e the errors are those of the observed information"
-)
 
 
 def fit_tile(
@@ -72,67 +63,40 @@ def fit_tile(
     """
     counts = histogram["counts"]
     shape = counts.shape[:2]
-    flat = {name: histogram[name].ravel() for name in ("origin", "under", "over")}
     rows = counts.reshape(-1, counts.shape[2])
-    old = None if start is None else start.reshape(-1, start.shape[2])
-    known = None if old is None else old[:, : len(PARAMETERS)]
-    plain: FitResult = fit_histograms(rows, **flat, settings=settings, adc_limits=adc_limits, start=known)
-    if old is not None:
-        # from a start no neighbours are tried; the gap to them was the old one, and grows with the frames
-        plain = replace(plain, likelihood_gap=np.fmin(plain.likelihood_gap, old[:, len(PARAMETERS)]))
-    if effects:
-        result = _grown(rows, flat["origin"], plain, settings, effects, added)
+    origin, under, over = (histogram[name].ravel() for name in ("origin", "under", "over"))
+    fit = functools.partial(
+        fit_histograms, rows, origin, under, over, adc_limits=adc_limits, excluding=set_aside
+    )
+    known = None if start is None else start.reshape(-1, start.shape[2])
+    if not effects:
+        result = fit(settings=settings, start=known)
     else:
-        result = refine(rows, flat["origin"], plain, settings, adc_limits)
-    if set_aside:
-        law = functools.partial(_law, effects=effects)
-        result = fit_beside(rows, flat["origin"], plain, result, law, set_aside, settings)
+        # the law is what the effects make of the pixels as the plain fit sees them
+        simple = settings.model_copy(update={"likelihood": "density", "intervals": "normal"})
+        plain = fit_histograms(rows, origin, under, over, settings=simple, adc_limits=adc_limits, start=known)
+        result = fit(settings=settings, start=plain, law=_law(plain, effects, added))
     variances = np.diagonal(result.covariance, axis1=1, axis2=2)
     arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
     arrays["correlation"] = correlations(result.covariance)
-    if settings.intervals == "profile" and not (effects or set_aside):
-        ends = _intervals(rows, flat["origin"], plain, settings)
-        other = result.bias != plain.bias  # fitted with the exact likelihood, whose profile this is not
-        arrays |= {name: np.where(other, np.nan, values) for name, values in ends.items()}
+    if result.intervals is not None:
+        arrays |= {
+            path: result.intervals[:, place, side]
+            for place, name in enumerate(INTERVALS)
+            for side, path in enumerate(interval_names(name))
+        }
     arrays |= {
         v.name: getattr(result, v.name)
         for v in variables_of("fit")
-        if v.name not in arrays and hasattr(result, v.name)
+        if v.name not in arrays and hasattr(result, v.name) and (effects or v.name not in FREE_LOBES)
     }
     return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
 
 
-def _intervals(
-    counts: NDArray[Any], origin: NDArray[Any], fit: FitResult, settings: FitSettings
-) -> dict[str, NDArray[np.float64]]:
-    """Return the ends of the profile intervals of all quantities, by name."""
-    parameters = np.stack([getattr(fit, name) for name in PARAMETERS], axis=1)
-    kept = without_outliers(counts, origin, parameters, fit.outlier_share, settings)
-    ends = profile_intervals(kept, origin, parameters, settings.interval_level)
-    return {
-        path: ends[:, place, side]
-        for place, name in enumerate(INTERVALS)
-        for side, path in enumerate(interval_names(name))
-    }
-
-
-def _grown(
-    counts: NDArray[Any],
-    origin: NDArray[Any],
-    plain: FitResult,
-    settings: FitSettings,
-    effects: Sequence[Effect],
-    added: AddedExposure | None,
-) -> FitResult:
-    """Fit again with the law that the effects compose, as they see the pixels after the plain fit."""
+def _law(plain: FitResult, effects: Sequence[Effect], added: AddedExposure | None) -> MarginalModel:
+    """Return the law that the effects compose, as they see the pixels after the plain fit."""
     usable = (plain.fit_status & int(_UNUSABLE)) == 0
-    maps = pixel_maps([getattr(plain, name) for name in PARAMETERS], usable)
-    return fit_grown(counts, origin, plain, marginal_model(effects, maps, added), settings, plain=plain)
-
-
-def _law(parameters: NDArray[np.float64], *, effects: Sequence[Effect]) -> MarginalModel:
-    """Return the law of pixels with (H, g, mu, sigma), shape (n, 4)."""
-    return marginal_model(effects, pixel_maps(list(parameters.T), np.ones(parameters.shape[0], np.bool_)))
+    return marginal_model(effects, pixel_maps([getattr(plain, name) for name in PARAMETERS], usable), added)
 
 
 def run(context: StageContext) -> None:
@@ -150,8 +114,6 @@ def run(context: StageContext) -> None:
     settings, plain = context.config.fit, not (effects or model.set_aside_e)
     if settings.intervals == "normal" or not plain:
         left_out |= {path for name in INTERVALS for path in interval_names(name)}
-    if not plain and (settings.intervals, settings.errors) != ("normal", "information"):
-        context.note(_PLAIN_ONLY)
     create_fit_maps(context, left_out)
     if not context.executor.shares_memory:
         _compile(context.store.array("histogram/counts").dtype, effects)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.errors.fisher import correlations
-from pchem_pipeline.model.fit.joint import JointFit, fit_joint
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.stage import StageContext, open_store
@@ -86,16 +87,16 @@ def _fitted(
     bias: Sequence[bool],
     settings: FitSettings,
     adc_limits: tuple[int, int] | None,
-) -> JointFit:
+) -> FitResult:
     """Fit the pixels of a tile in all samples together."""
     outside = sum(each["under"].astype(np.int64) + each["over"] for each in histograms)
-    return fit_joint(
+    return fit_histograms(
         [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms],
         [each["origin"].ravel() for each in histograms],
         dark=list(bias),
         settings=settings,
         adc_limits=adc_limits,
-        outside=np.ravel(outside),
+        under=np.ravel(outside),
     )
 
 

@@ -174,7 +174,7 @@ def _first_frames(config: RunConfig, frames: FrameReader) -> tuple[int, float, N
 
 def _speeds(config: RunConfig, frames: NDArray[Any], bins: int, n_frames: int) -> tuple[float, float]:
     """Return the seconds to count a sample, and to fit a pixel, both on one processor, tried on some rows."""
-    from pchem_pipeline.model.fit.pchem import fit_histograms
+    from pchem_pipeline.model.fit.api import fit_histograms
 
     shape = (frames.shape[1], frames.shape[2])
     histograms = HistogramAccumulator(shape, bins, n_frames)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
-from pchem_pipeline.model.fit.grown import marginal_mass
 from pchem_pipeline.model.fit.status import MEANINGS, describe
+from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
 from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.report.stored import FittedModel, PixelHistograms

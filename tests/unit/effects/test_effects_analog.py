@@ -25,7 +25,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.plane import Plane
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block

@@ -19,7 +19,7 @@ from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
-from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 from pchem_pipeline.simulate.truth import TruthMaps
 

@@ -11,7 +11,7 @@ from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
 from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
-from pchem_pipeline.model.fit.grown import marginal_mass
+from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
 N_FRAMES = 1200

@@ -6,7 +6,7 @@ import numpy as np
 from helpers.drawn_pixels import draw
 
 from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.stages.fit.fit import fit_tile
 

@@ -6,9 +6,8 @@ from helpers.drawn_pixels import draw
 from scipy.optimize import minimize
 
 from pchem_pipeline.model.errors.fisher import cramer_rao
-from pchem_pipeline.model.fit import rounding_numba
-from pchem_pipeline.model.fit.exact import LARGEST_BIAS, biased_by_rounding, refine, rounding_bias
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
@@ -48,13 +47,9 @@ def test_the_predicted_bias_is_where_the_density_goes_on_the_exact_masses():
     np.testing.assert_allclose(predicted, shift / errors, rtol=0.05, atol=0.005)
 
 
-def test_the_compiled_bias_equals_the_plain_one():
-    one, other = np.empty(4), np.empty(4)
-    arguments = (0.4, 3.0, 7.3, 1.0, 1000.0)
-    assert rounding_numba.rounding_bias(*arguments, one)
-    assert rounding_numba.rounding_bias.py_func(*arguments, other)
-    np.testing.assert_allclose(one, other, rtol=1e-9)
-    assert not rounding_numba.rounding_bias(0.4, 3.0, 7.3, 0.28, 1000.0, one)
+def test_there_is_no_bias_to_tell_where_the_noise_is_rounding_alone():
+    parameters = [np.array([v]) for v in (0.4, 1 / 3.0, 7.3, 0.28)]
+    assert np.isinf(rounding_bias(parameters, np.array([1000.0]))).all()
 
 
 def test_pixels_are_named_where_rounding_matters_and_what_is_skipped_is_safe():
@@ -77,10 +72,11 @@ def test_density_is_left_alone_and_auto_refits_only_what_rounding_biases():
     fine, coarse = (draw(np.random.default_rng(2), [1.0, 2.0], step, 0.3) for step in (10.0, 2.5))
     for drawn, changes in ((fine, False), (coarse, True)):
         plain = fit_histograms(drawn.counts, drawn.origin)
-        assert refine(drawn.counts, drawn.origin, plain, FitSettings()) is plain
-        auto = refine(drawn.counts, drawn.origin, plain, AUTO)
+        same = fit_histograms(drawn.counts, drawn.origin, start=plain)
+        np.testing.assert_array_equal(same.conversion_gain, plain.conversion_gain)
+        auto = fit_histograms(drawn.counts, drawn.origin, settings=AUTO, start=plain)
         assert ((auto.conversion_gain != plain.conversion_gain) == changes).all()
-    exact = refine(drawn.counts, drawn.origin, plain, EXACT)
+    exact = fit_histograms(drawn.counts, drawn.origin, settings=EXACT, start=plain)
     np.testing.assert_array_equal(exact.conversion_gain, auto.conversion_gain)
     assert (plain.fit_status & FitStatus.COARSE_STEPS == 0).all() or (exact.fit_status == 0).all()
 
@@ -88,7 +84,7 @@ def test_density_is_left_alone_and_auto_refits_only_what_rounding_biases():
 def test_the_exact_maximum_is_that_of_scipy():
     drawn = draw(np.random.default_rng(7), [1.5], 2.2, 0.33)
     plain = fit_histograms(drawn.counts, drawn.origin)
-    mine = refine(drawn.counts, drawn.origin, plain, EXACT)
+    mine = fit_histograms(drawn.counts, drawn.origin, settings=EXACT, start=plain)
     c = drawn.counts[0]
     x = drawn.origin[0] + np.flatnonzero(c)
 
@@ -110,7 +106,7 @@ def test_the_exact_maximum_is_that_of_scipy():
 def test_few_dn_per_electron_have_their_own_starts():
     drawn = draw(np.random.default_rng(1), np.full(8, 2.0), 1.2, 0.384)
     plain = fit_histograms(drawn.counts, drawn.origin)
-    mine = refine(drawn.counts, drawn.origin, plain, AUTO)
+    mine = fit_histograms(drawn.counts, drawn.origin, settings=AUTO, start=plain)
     good = mine.fit_status == 0
     assert good.sum() >= 5
     pulls = (mine.conversion_gain - 1 / 1.2) / np.sqrt(mine.covariance[:, 1, 1])
@@ -126,7 +122,7 @@ def test_nothing_to_fit_stays_nothing():
     counts = np.zeros((2, 9), np.uint32)
     counts[1, 3] = 50
     plain = fit_histograms(counts, np.zeros(2, np.int64))
-    found = refine(counts, np.zeros(2, np.int64), plain, EXACT)
+    found = fit_histograms(counts, np.zeros(2, np.int64), settings=EXACT, start=plain)
     assert found.fit_status.tolist() == plain.fit_status.tolist()
     assert np.isnan(found.conversion_gain).all()
 

@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw, samples
+from helpers.em_trace import LIMITS, em_trace, evaluated, one_sample
 from helpers.reference_pchem import Theta, e_step, em, log_likelihood
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.errors import fisher_numba
-from pchem_pipeline.model.fit import goodness_numba, polish_numba, start_numba
-from pchem_pipeline.model.fit.pchem import em_trace
-from pchem_pipeline.model.law import estep_numba, simd_math_numba, workspace_numba
-from pchem_pipeline.model.law.simd_numba import counting, least, load_lanes, most, store_lanes
-from pchem_pipeline.model.law.workspace_numba import (
+from pchem_pipeline.model.errors import algebra_numba
+from pchem_pipeline.model.fit import climb_numba, goodness_numba, starts_numba
+from pchem_pipeline.model.law import density_numba, pixel_numba, simd_math_numba
+from pchem_pipeline.model.law.likelihood import density_likelihood
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    FIXED,
+    HELD,
+    INFORMATION,
+    SCORE,
     SUM_E,
     SUM_EE,
     SUM_K,
     SUM_KE,
     SUM_KK,
+    SUMS,
     Histogram,
-    Workspace,
+    Pixel,
+    Scratch,
+    histogram_of,
 )
+from pchem_pipeline.model.law.simd_numba import counting, least, load_lanes, most, store_lanes
 
 # (H, 1/g, s_e) from needles to unresolved peaks, and a hot pixel
 CASES = [
@@ -39,16 +49,36 @@ CASES = [
 N = 3000
 
 
+class Sample(NamedTuple):
+    """One histogram as the loops take it, and room to work in."""
+
+    pixel: Pixel
+    scratch: Scratch
+
+    @property
+    def at(self) -> NDArray[np.float64]:
+        """The evaluation."""
+        return self.scratch.evaluations[AT, 0]
+
+    @property
+    def histogram(self) -> Histogram:
+        return histogram_of.py_func(self.pixel, 0)
+
+    @property
+    def information(self) -> NDArray[np.float64]:
+        lower = np.tril(self.at[INFORMATION : INFORMATION + 4, :4])
+        return np.asarray(lower + np.tril(lower, -1).T)
+
+
 def prepare(
     case: tuple[float, float, float], seed: int = 4
-) -> tuple[Histogram, float, NDArray[np.float64], Theta]:
+) -> tuple[Sample, float, NDArray[np.float64], Theta]:
     """Histogram, centre in DN, raw sample and a theta that is off the truth."""
     counts, origin, truth = draw(np.random.default_rng(seed), *case, n_frames=N)
-    weights, cumulative = np.empty(counts.shape[1]), np.empty(counts.shape[1] + 1)
-    histogram, centre, _ = workspace_numba.load(counts[0], weights, cumulative)
+    pixel, scratch, centre = one_sample(counts[0])
     h, g, mu, sigma = truth[0]
     return (
-        histogram,
+        Sample(pixel, scratch),
         float(origin[0] + centre),
         samples(counts[0], int(origin[0])),
         Theta(1.04 * h, 0.985 * g, mu - 0.3, 1.05 * sigma),
@@ -56,54 +86,59 @@ def prepare(
 
 
 def internal(theta: Theta, centre: float) -> NDArray[np.float64]:
-    return np.array([np.log(theta.exposure), 1 / theta.gain, theta.bias - centre, 2 * np.log(theta.sigma)])
+    sigma = 2 * np.log(theta.sigma)
+    return np.array([np.log(theta.exposure), 1 / theta.gain, theta.bias - centre, sigma, 0.0])
 
 
-def run(histogram: Histogram, theta: NDArray[np.float64]) -> tuple[float, Workspace]:
-    space = workspace_numba.make_workspace(workspace_numba.make_rows(histogram.n_bins))
-    return estep_numba.evaluate(histogram, theta, space, 0.0), space
+def run(sample: Sample, theta: NDArray[np.float64]) -> float:
+    return evaluated(sample.pixel, theta, False, density_likelihood(), sample.scratch)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_e_step_sums_and_likelihood(case: tuple[float, float, float]) -> None:
     histogram, centre, x, theta = prepare(case)
-    loglik, space = run(histogram, internal(theta, centre))
+    loglik = run(histogram, internal(theta, centre))
+    total = histogram.at[SUMS]
     assert loglik == pytest.approx(log_likelihood(x, theta), rel=1e-11)
     sums = e_step(x, theta)
-    mean_k, mean_kk = space.total[SUM_K] / N, space.total[SUM_KK] / N
+    mean_k, mean_kk = total[SUM_K] / N, total[SUM_KK] / N
     assert mean_k == pytest.approx(sums.a, rel=1e-9)
     assert mean_kk == pytest.approx(sums.b, rel=1e-9)
     # k e with e = x - mu - k/g
-    assert space.total[SUM_KE] / N == pytest.approx(
+    assert total[SUM_KE] / N == pytest.approx(
         sums.c - theta.bias * sums.a - sums.b / theta.gain, abs=1e-7 * sums.c
     )
-    assert space.total[SUM_E] / N == pytest.approx(x.mean() - theta.bias - sums.a / theta.gain, abs=1e-7)
+    assert total[SUM_E] / N == pytest.approx(x.mean() - theta.bias - sums.a / theta.gain, abs=1e-7)
     expected = (
         ((x - theta.bias) ** 2).mean()
         - 2 * (sums.c - theta.bias * sums.a) / theta.gain
         + sums.b / theta.gain**2
     )
-    assert space.total[SUM_EE] / N == pytest.approx(expected, rel=1e-7)
+    assert total[SUM_EE] / N == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_score_is_the_gradient_and_information_minus_its_jacobian(case: tuple[float, float, float]) -> None:
     histogram, centre, x, theta = prepare(case)
     point = internal(theta, centre)
-    _, space = run(histogram, point)
-    score, information = space.score.copy(), space.information.copy()
+    run(histogram, point)
+    score, information = histogram.at[SCORE, :4].copy(), histogram.information
     size = np.sqrt(np.abs(np.diag(information)))
     step = 1e-3 / size
 
     def loglik(p: NDArray[np.float64]) -> float:
         return log_likelihood(x, Theta(float(np.exp(p[0])), 1 / p[1], p[2] + centre, float(np.exp(p[3] / 2))))
 
-    for i, h in enumerate(np.diag(step)):
+    def score_at(p: NDArray[np.float64]) -> NDArray[np.float64]:
+        run(histogram, p)
+        return histogram.at[SCORE, :4].copy()
+
+    for i, h in enumerate(np.eye(4, 5) * step[:, None]):
         slope = (
             8 * (loglik(point + h) - loglik(point - h)) - loglik(point + 2 * h) + loglik(point - 2 * h)
         ) / 12
         assert score[i] / size[i] == pytest.approx(slope / step[i] / size[i], rel=1e-6, abs=2e-5)
-        change = run(histogram, point + h)[1].score.copy() - run(histogram, point - h)[1].score
+        change = score_at(point + h) - score_at(point - h)
         np.testing.assert_allclose(
             information[i] / size / size[i], -change / (2 * step[i]) / size / size[i], atol=2e-6
         )
@@ -120,32 +155,33 @@ def test_em_iterates_follow_the_paper(case: tuple[float, float, float]) -> None:
 
 
 def test_compiled_evaluation_equals_plain() -> None:
-    histogram, centre, _, theta = prepare(CASES[0])
+    sample, centre, _, theta = prepare(CASES[0])
     point = internal(theta, centre)
-    loglik, space = run(histogram, point)
-    rows = workspace_numba.make_rows.py_func(histogram.n_bins)
-    plain = workspace_numba.make_workspace.py_func(rows)
-    assert estep_numba.evaluate.py_func(histogram, point, plain, 0.0) == pytest.approx(loglik, rel=1e-13)
-    for compiled_array, plain_array in zip(space[2:5], plain[2:5], strict=True):
-        np.testing.assert_allclose(compiled_array, plain_array, rtol=1e-9, atol=1e-7)
+    loglik = run(sample, point)
+    compiled = sample.at.copy()
+    plain = density_numba.evaluate_density(
+        sample.pixel, point, False, sample.scratch, sample.scratch.evaluations[AT]
+    )
+    assert plain == pytest.approx(loglik, rel=1e-13)
+    np.testing.assert_allclose(sample.at, compiled, rtol=1e-9, atol=1e-7)
 
 
 def take_plain_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     """From here on loops in plain Python take their lanes from numpy; nothing can be compiled."""
     for name in ("artanh_series", "lanes_exp", "lanes_log"):
         plain = getattr(simd_math_numba, name).py_func
-        for module in (simd_math_numba, estep_numba):
+        for module in (simd_math_numba, density_numba):
             monkeypatch.setattr(module, name, plain)
 
 
 def test_compiled_table_equals_plain_at_every_width(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(8)
     kernels = {
-        3: estep_numba.table_sums_3,
-        5: estep_numba.table_sums_5,
-        7: estep_numba.table_sums_7,
-        9: estep_numba.table_sums_9,
-        12: estep_numba.table_sums_any,
+        3: density_numba.table_sums_3,
+        5: density_numba.table_sums_5,
+        7: density_numba.table_sums_7,
+        9: density_numba.table_sums_9,
+        12: density_numba.table_sums_any,
     }
     a, inverse, columns = 1.3, 0.9, 24
     for width, kernel in kernels.items():
@@ -155,7 +191,7 @@ def test_compiled_table_equals_plain_at_every_width(monkeypatch: pytest.MonkeyPa
         table[2] = rng.integers(0, 9, columns)
         table[4:] *= 10.0 ** rng.integers(-30, 30, columns)  # the logarithm over many powers of two
         answers = []
-        for function in (kernel, estep_numba.table_sums_any, kernel.py_func):
+        for function in (kernel, density_numba.table_sums_any, kernel.py_func):
             totals = np.zeros(18)
             if function is kernel.py_func:
                 take_plain_lanes(monkeypatch)
@@ -203,46 +239,62 @@ def test_lanes_are_the_functions_that_they_are_named_after(monkeypatch: pytest.M
 
 
 def test_compiled_steps_equal_plain() -> None:
-    histogram, centre, _, theta = prepare(CASES[0])
+    sample, centre, _, theta = prepare(CASES[0])
     point = internal(theta, centre)
-    _, space = run(histogram, point)
-    compiled, plain = np.empty(4), np.empty(4)
+    run(sample, point)
+    at, scratch, limits = sample.scratch.evaluations[AT], sample.scratch, LIMITS._replace(bound=-9.0)
+    scratch.flags[FIXED, 4] = scratch.flags[HELD, 4] = True
+    compiled, plain = np.zeros(5), np.zeros(5)
     for kernel, arguments in (
-        (polish_numba.em_step, (histogram.n, point, space.total, -9.0)),
-        (polish_numba.newton_step, (histogram.n, point, space, -9.0, 0.01)),
+        (climb_numba.em_step, (sample.pixel, point, at, limits)),
+        (climb_numba.newton_step, (at, 0.01, 1e-5, scratch)),
+        (algebra_numba.solve_arrow, (at, 0.0, scratch)),
     ):
         assert kernel(*arguments, compiled) == pytest.approx(kernel.py_func(*arguments, plain))
         np.testing.assert_allclose(compiled, plain, rtol=1e-9)
-    held = np.array([False, False, True, False])
-    left, right = np.empty((4, 4)), np.empty((4, 4))
-    assert fisher_numba.invert(space.information, held, left)
-    assert fisher_numba.invert.py_func(space.information, held, right)
-    np.testing.assert_allclose(left, right, rtol=1e-9)
-    free = [0, 1, 3]
-    np.testing.assert_allclose(
-        left[np.ix_(free, free)], np.linalg.inv(space.information[np.ix_(free, free)]), rtol=1e-7
-    )
-    assert np.isnan(left[2]).all()
+    for find in (climb_numba.find_held, climb_numba.find_held.py_func):
+        held = np.zeros(5, np.bool_)
+        find(point, at, np.array([False, False, True, False, True]), limits, held)
+        assert held.tolist() == [False, False, True, False, True]
 
 
-def test_singular_information_is_refused() -> None:
-    assert not fisher_numba.invert(np.ones((4, 4)), np.zeros(4, bool), np.empty((4, 4)))
+def test_a_tied_step_leaves_the_noise_in_electrons() -> None:
+    sample, centre, _, theta = prepare(CASES[2])
+    point = internal(theta, centre)
+    at, h = sample.scratch.evaluations[AT], 1e-4
+
+    def score(p: NDArray[np.float64]) -> NDArray[np.float64]:
+        run(sample, p)
+        climb_numba.tie_noise(p, at, LIMITS)
+        return sample.at[SCORE].copy()
+
+    def moved(step: float) -> NDArray[np.float64]:
+        p = point.copy()
+        p[1] += step
+        p[3] = point[3] + 2 * np.log(p[1] / point[1])
+        return p
+
+    score(point)
+    information = sample.at[INFORMATION + 1, 1]
+    slope = (run(sample, moved(h)) - run(sample, moved(-h))) / (2 * h)
+    assert score(point)[1] == pytest.approx(slope, rel=1e-6)
+    assert information == pytest.approx(-(score(moved(h))[1] - score(moved(-h))[1]) / (2 * h), rel=1e-6)
 
 
 def test_ecf_against_the_definition() -> None:
-    histogram, _, _, _ = prepare(CASES[0])
+    histogram = prepare(CASES[0])[0].histogram
     y = histogram.first + np.arange(histogram.n_bins)
     weights = histogram.weights[: histogram.n_bins]
-    rows, plain = workspace_numba.make_rows(histogram.n_bins), workspace_numba.make_rows(histogram.n_bins)
+    rows, plain = np.empty((2, 9, 600))
     expected = np.exp(2j * np.pi * 0.01 * np.arange(1, 21)[:, None] * y) @ weights
     for n_bins in (histogram.n_bins, histogram.n_bins - 1):  # pairs of DN, and one left over
         part = histogram._replace(n_bins=n_bins)
-        start_numba.ecf_power(part, 0.01, 20, rows)
-        start_numba.ecf_power.py_func(part, 0.01, 20, plain)
+        starts_numba.ecf_power(part, 0.01, 20, rows)
+        starts_numba.ecf_power.py_func(part, 0.01, 20, plain)
         phases = np.exp(2j * np.pi * 0.01 * np.arange(1, 21)[:, None] * y[:n_bins])
         np.testing.assert_allclose(rows[0, :20], np.abs(phases @ weights[:n_bins] / N) ** 2, atol=1e-12)
         np.testing.assert_allclose(plain[0, :20], rows[0, :20], atol=1e-12)
-    modulus, phase = start_numba.ecf_at(histogram, 0.05)
+    modulus, phase = starts_numba.ecf_at(histogram, 0.05)
     assert modulus * np.exp(1j * phase) == pytest.approx(expected[4], abs=1e-9 * N)
 
 
@@ -264,6 +316,6 @@ def test_chi_square_merges_to_five_and_keeps_the_total() -> None:
 def test_no_kernel_lets_the_compiler_choose_the_bits() -> None:
     # numba optimises a kernel again in every kernel that calls it, and which copy runs depends on what the
     # process compiled or loaded before: with sums in any order, so would the last bits
-    kernels = sorted(Path(workspace_numba.__file__).parents[1].rglob("*_numba.py"))
+    kernels = sorted(Path(pixel_numba.__file__).parents[1].rglob("*_numba.py"))
     assert len(kernels) > 20
     assert [path.name for path in kernels if "fastmath" in path.read_text()] == []

@@ -7,8 +7,9 @@ import pytest
 from helpers.drawn_pixels import draw
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit import pchem_numba
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.fit import search_numba
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, describe
 
@@ -134,7 +135,7 @@ def test_every_word_has_a_sentence_and_the_loops_agree_on_the_bits() -> None:
     names = {"FIT_NOT_CONVERGED": "NOT_CONVERGED"}
     for name in ("NO_DATA", "TOO_FEW_BINS", "FIT_NOT_CONVERGED", "GAIN_NOT_IDENTIFIED", "EXPOSURE_AT_BOUND",
                  "BIAS_AMBIGUOUS", "NOT_INFORMATIVE", "COARSE_STEPS"):  # fmt: skip
-        assert getattr(pchem_numba, name) == FitStatus[names.get(name, name)]
+        assert getattr(search_numba, name) == FitStatus[names.get(name, name)]
 
 
 def degenerate_pixels() -> dict[str, NDArray[np.generic]]:

@@ -5,58 +5,87 @@ from functools import partial
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
+from helpers.em_trace import LIMITS, evaluated
 from helpers.joint_material import draw_series
 from helpers.reference_pchem import Theta, memberships
 from iminuit import Minuit
 
-from pchem_pipeline.model.fit import joint_climb_numba, joint_likelihood_numba, joint_types_numba
-from pchem_pipeline.model.fit.joint import fit_joint, joint_cramer_rao
-from pchem_pipeline.model.fit.pchem import fit_histograms
+from pchem_pipeline.model.errors import algebra_numba
+from pchem_pipeline.model.errors.fisher import joint_cramer_rao
+from pchem_pipeline.model.fit import tile_numba
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.climb_numba import em_step
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.law.grown_inputs import pack
-from pchem_pipeline.model.law.grown_types_numba import N_LOBE_ROWS
+from pchem_pipeline.model.law import cells_numba
+from pchem_pipeline.model.law.inputs import pack
+from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
 from pchem_pipeline.model.law.pcd import pcd, pcd_mass
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    CENTRE,
+    DAMPING,
+    EXPECTED,
+    FIRST,
+    HELD,
+    INFORMATION,
+    N_BINS,
+    SCORE,
+    WEIGHT,
+    make_scratch,
+)
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
 EXACT = FitSettings(likelihood="exact")
 
 
-class Pixel:
+class Series:
     """One pixel of a series as the loops take it."""
 
     def __init__(self, series):
-        self.places = np.concatenate([[0], np.cumsum([c.shape[1] for c in series.counts])]).astype(np.int64)
-        counts = np.concatenate([c[0] for c in series.counts])
-        most = int(np.diff(self.places).max())
-        self.samples = joint_types_numba.make_samples(len(series.counts), most, np.array(series.dark))
-        origin = np.array([o[0] for o in series.origins], np.int64)
-        self.middle = joint_types_numba.load_samples(counts, self.places, origin, self.samples)
-        law = pack(MarginalModel(), 1)
-        self.bench = joint_types_numba.make_bench(most, law, np.empty((N_LOBE_ROWS, 1)))
-        self.answers = joint_types_numba.make_answers(len(series.counts))
+        places = np.concatenate([[0], np.cumsum([c.shape[1] for c in series.counts])]).astype(np.int64)
+        counts = np.concatenate([c[:1] for c in series.counts], axis=1).astype(np.uint32)
+        origin = np.array([[o[0] for o in series.origins]], np.int64)
+        given = tile_numba.Histograms(
+            counts, places, origin, np.array(series.dark), np.zeros(counts.shape, np.uint8)
+        )
+        law = pack([MarginalModel()] * len(series.counts), 1)
+        self.pixel = tile_numba.load_pixel(given, 0, tile_numba.make_room(given, law))
+        cells_numba.resolve(law, 0, 0.0, self.pixel)
+        self.scratch = make_scratch(len(series.counts), int(np.diff(places).max()), True)
+        self.at = self.scratch.evaluations[AT]
+        self.dark = np.array(series.dark)
 
     def theta(self, exposures, step, bias, v):
         log = [np.log(h) if h > 0 else -60.0 for h in exposures]
-        return np.array([*log, step, bias - self.middle, v])
+        return np.array([*log, step, bias - self.pixel.centre, v, 0.0])
 
-    def __call__(self, theta, exact, kernel=joint_likelihood_numba.evaluate_joint):
-        return kernel(self.samples, self.middle, theta, exact, self.bench, self.answers)
+    def codes(self, j):
+        """Values from the bias's own zero, and counts, of a sample."""
+        facts = self.pixel.facts[j]
+        n = int(facts[N_BINS])
+        first = self.pixel.centre + facts[CENTRE] + facts[FIRST]
+        return first + np.arange(n), self.pixel.bins[j, WEIGHT, :n]
+
+    def __call__(self, theta, exact):
+        likelihood = cells_likelihood() if exact else density_likelihood()
+        return evaluated(self.pixel, theta, False, likelihood, self.scratch)
 
     def dense(self):
-        """Score and information as one vector and matrix."""
-        n = self.samples.dark.size
+        """Score and information of all but the weight of satellites as one vector and matrix."""
+        n = self.dark.size
         score, matrix = np.zeros(n + 3), np.zeros((n + 3, n + 3))
         for j in range(n):
             where = [j, n, n + 1, n + 2]
-            score[where] += self.answers.score[j]
-            matrix[np.ix_(where, where)] += self.answers.information[j]
+            score[where] += self.at[j, SCORE, :4]
+            lower = np.tril(self.at[j, INFORMATION : INFORMATION + 4, :4])
+            matrix[np.ix_(where, where)] += lower + np.tril(lower, -1).T
         return score, matrix
 
 
 @pytest.fixture
 def pixel():
-    return Pixel(draw_series(np.random.default_rng(5), [0.7, 3.0, 0.0], 0.35, 1, n_frames=600))
+    return Series(draw_series(np.random.default_rng(5), [0.7, 3.0, 0.0], 0.35, 1, n_frames=600))
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -85,10 +114,7 @@ def test_the_likelihood_is_that_of_the_samples(pixel):
     for exact in (False, True):
         total = 0.0
         for j, exposure in enumerate((0.8, 2.7, 0.0)):
-            facts = pixel.samples.facts[j]
-            n = int(facts[joint_types_numba.N_BINS])
-            first = pixel.middle + facts[joint_types_numba.CENTRE] + facts[joint_types_numba.FIRST]
-            x, c = first + np.arange(n), pixel.samples.weights[j, :n]
+            x, c = pixel.codes(j)
             if exact:
                 law = pcd_mass(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0) / 9.7)
             else:
@@ -97,51 +123,56 @@ def test_the_likelihood_is_that_of_the_samples(pixel):
         assert pixel(theta, exact) == pytest.approx(total, rel=1e-9)
 
 
-def test_the_compiled_loop_equals_the_plain_one():
-    tiny = Pixel(draw_series(np.random.default_rng(2), [0.5, 0.0], 0.3, 1, step=4.0, n_frames=12))
+def test_the_plain_loop_does_what_the_compiled_one_does():
+    tiny = Series(draw_series(np.random.default_rng(2), [0.5, 0.0], 0.3, 1, step=4.0, n_frames=12))
     theta = tiny.theta([0.6, 0.0], 4.2, 100.0, np.log(1.6))
-    value = tiny(theta, False)
-    before = tiny.dense()
-    assert tiny(theta, False, joint_likelihood_numba.evaluate_joint.py_func) == pytest.approx(
-        value, rel=1e-12
-    )
-    for one, other in zip(before, tiny.dense(), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    value = tiny(theta, True)
+    at = tiny.at.copy()
+    plain = cells_numba.evaluate_cells(tiny.pixel, theta, True, tiny.scratch, tiny.at)
+    assert plain == pytest.approx(value, rel=1e-12)
+    np.testing.assert_allclose(tiny.at[:, :DAMPING], at[:, :DAMPING], rtol=1e-9, atol=1e-9)
+    for j in range(2):
+        x, _ = tiny.codes(j)
+        expected = 12 * pcd_mass(x, (0.6, 0.0)[j], 1 / 4.2, 100.0, np.sqrt(1.6) / 4.2)
+        np.testing.assert_allclose(tiny.pixel.bins[j, EXPECTED, : x.size], expected, atol=1e-9)
 
 
-def test_the_arrow_is_solved_as_the_dense_matrix(pixel):
-    theta = pixel.theta([0.72, 3.05, 0.0], 9.95, 100.4, np.log(12.2))
-    pixel(theta, False)
-    score, information = pixel.dense()
+@pytest.mark.parametrize("exact", [False, True])
+def test_the_arrow_is_solved_and_inverted_as_a_whole(pixel, exact):
+    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
+    pixel(theta, exact)
+    held = pixel.scratch.flags[HELD]
+    held[:] = [False, False, True, False, False, False, True]
+    step = np.empty(7)
+    squared = algebra_numba.solve_arrow(pixel.at, 0.0, pixel.scratch, step)
+    score, matrix = pixel.dense()
     free = [0, 1, 3, 4, 5]
-    step = np.empty(6)
-    held = np.array([False, False, True, False, False, False])
-    squared = joint_likelihood_numba.solve_arrow(pixel.answers, 0.0, held, step, np.zeros((4, 4)))
-    wanted = np.linalg.solve(information[np.ix_(free, free)], score[free])
+    wanted = np.linalg.solve(matrix[np.ix_(free, free)], score[free])
     np.testing.assert_allclose(step[free], wanted, rtol=1e-8)
-    assert squared == pytest.approx(float(score[free] @ wanted), rel=1e-8)
-    covariance = np.empty((6, 6))
-    assert joint_likelihood_numba.joint_covariance(
-        pixel.answers, theta, pixel.samples.dark, False, covariance
-    )
-    scale = np.array([0.72, 3.05, 1.0, 1.0, 1.0])
-    matrix = information[np.ix_(free, free)] / np.outer(scale, scale)
-    matrix[[0, 1], [0, 1]] += score[:2] / scale[:2] ** 2
-    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(matrix), rtol=1e-7)
-    assert (covariance[2] == 0).all()
+    assert squared == pytest.approx(wanted @ score[free], rel=1e-8)
+    assert step[2] == step[6] == 0
+    pixel.at[:, SCORE] = 0.0
+    covariance = np.empty((7, 7))
+    assert algebra_numba.invert_arrow(pixel.at, theta, held, covariance)
+    scale = np.array([np.exp(-theta[0]), np.exp(-theta[1]), 1, 1, 1])
+    own = matrix[np.ix_(free, free)] * scale[:, None] * scale
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(own), rtol=1e-7)
+    assert (covariance[[2, 6]] == 0).all()
+    pixel.at[:, INFORMATION:DAMPING] = 1.0  # singular
+    assert np.isnan(algebra_numba.solve_arrow(pixel.at, 0.0, pixel.scratch, step))
+    assert not algebra_numba.invert_arrow(pixel.at, theta, held, covariance)
 
 
 def test_an_em_step_is_that_of_the_paper_with_all_samples(pixel):
     theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
     pixel(theta, False)
-    out = np.empty(6)
-    assert joint_climb_numba.joint_em_step(pixel.samples, theta, pixel.answers, -20.0, out)
+    out = np.empty(7)
+    limits = LIMITS._replace(bound=-20.0)
+    assert em_step(pixel.pixel, theta, pixel.at, limits, out)
     a, b, c, x1, x2, n, mean_k = [], [], [], [], [], [], []
     for j, exposure in enumerate((0.8, 2.7, 0.0)):
-        facts = pixel.samples.facts[j]
-        bins = int(facts[joint_types_numba.N_BINS])
-        first = pixel.middle + facts[joint_types_numba.CENTRE] + facts[joint_types_numba.FIRST]
-        x = np.repeat(first + np.arange(bins), pixel.samples.weights[j, :bins].astype(int))
+        codes, weights = pixel.codes(j)
+        x = np.repeat(codes, weights.astype(int))
         k = np.zeros((x.size, 1))
         gamma = np.ones((x.size, 1))
         if exposure > 0:
@@ -158,14 +189,14 @@ def test_an_em_step_is_that_of_the_paper_with_all_samples(pixel):
     bias = x1 - a * step
     variance = x2 - x1**2 - (b - a**2) * step**2
     np.testing.assert_allclose(np.exp(out[:2]), mean_k[:2], rtol=1e-9)
-    np.testing.assert_allclose(out[3:], [step, bias - pixel.middle, np.log(variance)], rtol=1e-8)
+    np.testing.assert_allclose(out[3:6], [step, bias - pixel.pixel.centre, np.log(variance)], rtol=1e-8)
 
 
 @pytest.mark.parametrize("settings", [FitSettings(), EXACT])
 def test_one_sample_is_the_single_fit(settings):
     drawn = draw(np.random.default_rng(3), [0.5, 2.0, 6.0], 10.0, 0.3)
     single = fit_histograms(drawn.counts, drawn.origin)
-    joint = fit_joint([drawn.counts], [drawn.origin], settings=settings)
+    joint = fit_histograms([drawn.counts], [drawn.origin], settings=settings)
     errors = np.sqrt(np.diagonal(single.covariance, axis1=1, axis2=2))
     close = 1e-4 if settings.likelihood == "density" else 0.05
     for i, name in enumerate(("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")):
@@ -189,7 +220,7 @@ def minus_log_likelihood(series, pixel, h1, h2, g, mu, sigma):
 
 def test_iminuit_finds_the_same_maximum():
     series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.6, 2)
-    joint = fit_joint(series.counts, series.origins, dark=series.dark, settings=EXACT)
+    joint = fit_histograms(series.counts, series.origins, dark=series.dark, settings=EXACT)
     for pixel in range(2):
         found = Minuit(partial(minus_log_likelihood, series, pixel), 0.7, 2.8, 0.105, 101.0, 6.1)
         found.errordef = Minuit.LIKELIHOOD
@@ -211,8 +242,8 @@ def test_iminuit_finds_the_same_maximum():
 
 def test_a_pixel_does_not_depend_on_the_others():
     series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.5, 4)
-    together = fit_joint(series.counts, series.origins)
-    alone = fit_joint([c[2:3] for c in series.counts], [o[2:3] for o in series.origins])
+    together = fit_histograms(series.counts, series.origins)
+    alone = fit_histograms([c[2:3] for c in series.counts], [o[2:3] for o in series.origins])
     assert together.conversion_gain[2] == alone.conversion_gain[0]
     np.testing.assert_array_equal(together.covariance[2], alone.covariance[0])
 
@@ -223,7 +254,9 @@ def test_words_say_why_a_pixel_has_no_value():
     for j in (0, 1):
         series.counts[j][1] = 0
         series.counts[j][1, 5] = 4000
-    found = fit_joint(series.counts, series.origins, dark=series.dark, adc_limits=(0, 150), outside=[0, 0, 3])
+    found = fit_histograms(
+        series.counts, series.origins, dark=series.dark, adc_limits=(0, 150), under=np.array([0, 0, 3])
+    )
     assert found.fit_status[0] & FitStatus.NO_DATA
     assert found.fit_status[1] & FitStatus.TOO_FEW_BINS
     assert np.isnan(found.conversion_gain[:2]).all()
@@ -234,7 +267,7 @@ def test_words_say_why_a_pixel_has_no_value():
 
 def test_samples_without_any_electrons_do_not_give_a_gain():
     series = draw_series(np.random.default_rng(6), [0.0, 0.0], 0.3, 3)
-    found = fit_joint(series.counts, series.origins, dark=[False, True])
+    found = fit_histograms(series.counts, series.origins, dark=[False, True])
     assert np.isnan(found.conversion_gain).all()
     lacking = FitStatus.GAIN_NOT_IDENTIFIED | FitStatus.EXPOSURE_AT_BOUND | FitStatus.NOT_CONVERGED
     assert ((found.fit_status & int(lacking)) != 0).all()
@@ -243,11 +276,11 @@ def test_samples_without_any_electrons_do_not_give_a_gain():
 def test_what_does_not_fit_together_is_refused():
     series = draw_series(np.random.default_rng(6), [0.6, 2.5], 0.3, 3)
     with pytest.raises(ValueError, match="no sample holds electrons"):
-        fit_joint(series.counts, series.origins, dark=[True, True])
+        fit_histograms(series.counts, series.origins, dark=[True, True])
     with pytest.raises(ValueError, match="one entry for each sample"):
-        fit_joint(series.counts, series.origins[:1])
+        fit_histograms(series.counts, series.origins[:1])
     with pytest.raises(ValueError, match=r"different numbers of pixels: \[2, 3\]"):
-        fit_joint([series.counts[0], series.counts[1][:2]], series.origins)
+        fit_histograms([series.counts[0], series.counts[1][:2]], series.origins)
 
 
 def test_the_bound_of_one_sample_is_the_single_one_and_more_samples_only_help():
@@ -262,8 +295,8 @@ def test_the_bound_of_one_sample_is_the_single_one_and_more_samples_only_help():
 
 def test_plain_em_climbs_to_the_same_place():
     series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.3, 2)
-    newton = fit_joint(series.counts, series.origins)
-    em = fit_joint(series.counts, series.origins, settings=FitSettings(algorithm="em"))
+    newton = fit_histograms(series.counts, series.origins)
+    em = fit_histograms(series.counts, series.origins, settings=FitSettings(algorithm="em"))
     errors = np.sqrt(newton.covariance[:, 2, 2])
     assert (np.abs(em.conversion_gain - newton.conversion_gain) < 0.01 * errors).all()
     assert (em.n_iterations > newton.n_iterations).all()
@@ -271,7 +304,7 @@ def test_plain_em_climbs_to_the_same_place():
 
 def test_a_few_glitches_do_not_move_the_estimates():
     series = draw_series(np.random.default_rng(12), [0.6, 3.0, 0.0], 0.4, 6)
-    clean = fit_joint(series.counts, series.origins, dark=series.dark)
+    clean = fit_histograms(series.counts, series.origins, dark=series.dark)
     assert (clean.outlier_share == 0).all()
     counts = [np.pad(sample, ((0, 0), (0, 3000))) for sample in series.counts]
     for j, place in ((0, 2500), (1, 900), (2, 1700)):
@@ -279,7 +312,9 @@ def test_a_few_glitches_do_not_move_the_estimates():
     errors = np.sqrt(np.diagonal(clean.covariance, axis1=1, axis2=2))[:, [0, 1, 3, 4, 5]]
     shifts = {}
     for guard in (1e-3, 0.0):
-        found = fit_joint(counts, series.origins, dark=series.dark, settings=FitSettings(tail_guard=guard))
+        found = fit_histograms(
+            counts, series.origins, dark=series.dark, settings=FitSettings(tail_guard=guard)
+        )
         mine, others = (
             np.column_stack([f.quanta_exposure[:, :2], f.conversion_gain, f.bias, f.read_noise_dn])
             for f in (found, clean)

@@ -13,10 +13,10 @@ from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
 from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.errors.fisher import correlations, covariance_from, sandwich_covariance
-from pchem_pipeline.model.fit import profile_numba
-from pchem_pipeline.model.fit.intervals import INTERVAL_NAMES, profile_intervals, quantile_of
-from pchem_pipeline.model.fit.pchem import FitResult, fit_histograms
+from pchem_pipeline.model.errors.fisher import correlations, covariance_from
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.intervals import INTERVAL_NAMES, quantile_of
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.pcd import log_pcd
 from pchem_pipeline.stages.fit.fit import fit_tile
@@ -34,6 +34,13 @@ def fitted(case: tuple[float, float, float], seed: int = 3) -> tuple[Drawn, Arra
     pixel = draw(np.random.default_rng(seed), *case, n_frames=N)
     fit = fit_histograms(pixel.counts, pixel.origin, settings=FitSettings(tolerance=1e-12))
     return pixel, estimates(fit)[0], fit.covariance[0]
+
+
+def intervals(pixel: Drawn, level: float) -> Array:
+    settings = FitSettings(intervals="profile", interval_level=level)
+    found = fit_histograms(pixel.counts, pixel.origin, settings=settings).intervals
+    assert found is not None
+    return found
 
 
 def occupied(pixel: Drawn) -> tuple[Array, Array]:
@@ -64,7 +71,7 @@ def test_errors_and_intervals_are_those_of_minuit(case: tuple[float, float, floa
     )
     np.testing.assert_allclose(np.array(found.errors), np.sqrt(np.diag(covariance)), rtol=0.01)
     found.minos(cl=0.6827)
-    ends = profile_intervals(pixel.counts, pixel.origin, at[None], 0.6827)[0]
+    ends = intervals(pixel, 0.6827)[0]
     for place, name in enumerate(("h", "g", "mu", "sigma")):
         other = found.merrors[name]
         width = ends[place, 1] - ends[place, 0]
@@ -82,9 +89,7 @@ def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
     found.errordef = Minuit.LIKELIHOOD
     found.tol = 1e-4
     found.migrad().minos("noise", cl=0.95)
-    ends = profile_intervals(pixel.counts, pixel.origin, at[None], 0.95)[
-        0, INTERVAL_NAMES.index("read_noise_e")
-    ]
+    ends = intervals(pixel, 0.95)[0, INTERVAL_NAMES.index("read_noise_e")]
     other = found.merrors["noise"]
     np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
     # and it is far from symmetric here: standard errors would not do
@@ -165,9 +170,8 @@ def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, fl
 
 def test_loops_are_the_same_compiled_and_plain() -> None:
     pixel, at, covariance = fitted(CASES[1])
-    at, covariance, counts = at[None], covariance[None], pixel.counts
+    at, covariance = at[None], covariance[None]
     for name, arguments, shape in (
-        ("outer_scores", (counts, pixel.origin, at, 1e-3), (1, 4, 4)),
         ("curve_variance", (at, covariance, 90.0, 1.0), (40,)),
         ("grouped_trace", (pixel.origin, pixel.origin + 150, np.array([float(N)]), at, covariance), (1,)),
     ):
@@ -176,10 +180,6 @@ def test_loops_are_the_same_compiled_and_plain() -> None:
         kernel(*arguments, compiled)
         kernel.py_func(*arguments, plain)
         np.testing.assert_allclose(plain, compiled, rtol=1e-10, err_msg=name)
-    ends, plain_ends = np.empty((1, 5, 2)), np.empty((1, 5, 2))
-    profile_numba.profile_tile(counts, pixel.origin, at, 1.0, ends)
-    profile_numba.profile_tile.py_func(counts, pixel.origin, at, 1.0, plain_ends)
-    np.testing.assert_allclose(plain_ends, ends, rtol=1e-9)
 
 
 def test_groups_of_single_dn_determine_all_four_parameters() -> None:
@@ -240,8 +240,6 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     pixels, histogram = tile()
     plain = fit_tile(histogram, FitSettings(), None)
     full = fit_tile(histogram, FitSettings(intervals="profile", errors="sandwich", interval_level=0.95), None)
-    ends = profile_intervals(pixels.counts, pixels.origin, pixels.truth * np.nan, 0.95)
-    assert np.isnan(ends).all()
     for name in INTERVALS:
         low, high = (full[path][0] for path in interval_names(name))
         middle = full[name][0] if name in full else full["conversion_gain"][0] * full["read_noise_dn"][0]
@@ -249,14 +247,23 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
         assert (middle < high).all()
         assert f"{name}_low" not in plain
     fit = fit_histograms(pixels.counts, pixels.origin)
-    sandwich = sandwich_covariance(pixels.counts, pixels.origin, estimates(fit), fit.covariance)
-    np.testing.assert_allclose(full["bias_stderr"][0], np.sqrt(sandwich[:, 2, 2]), rtol=1e-12)
+    middle = np.zeros((4, 4, 4))
+    for i in range(4):
+        score = np.empty(4)
+        at = estimates(fit)[i]
+        weights = information_numba.log_poisson(at[0], 60)
+        for b in np.flatnonzero(pixels.counts[i]):
+            information_numba.sample_score(float(pixels.origin[i] + b), at, weights, score)
+            middle[i] += pixels.counts[i, b] * np.outer(score, score)
+    sandwich = fit.covariance @ middle @ fit.covariance
+    np.testing.assert_allclose(full["bias_stderr"][0], np.sqrt(sandwich[:, 2, 2]), rtol=1e-5)
     assert (full["bias_stderr"] != plain["bias_stderr"]).all()
     np.testing.assert_array_equal(full["bias"], plain["bias"])
-    # under a grown model the profile of the plain one is left out
-    assert "bias_low" not in fit_tile(
-        histogram, FitSettings(intervals="profile"), None, [RowNoise(row_noise_dn=1.0)]
-    )
+    # with effects it is the profile of their law
+    with_noise = fit_tile(histogram, FitSettings(intervals="profile"), None, [RowNoise(row_noise_dn=1.0)])
+    assert (with_noise["bias_low"] < with_noise["bias"]).all()
+    assert (with_noise["bias"] < with_noise["bias_high"]).all()
+    assert (with_noise["read_noise_dn_high"] < full["read_noise_dn"]).all()
 
 
 def test_a_hit_pixel_goes_through_the_plain_loop_as_through_the_compiled() -> None:

@@ -7,11 +7,12 @@ import math
 import mpmath
 import numpy as np
 import pytest
+from helpers.em_trace import evaluated
 from helpers.grown_reference import EVERYTHING, LAWS, reference_mass
 from scipy.stats import norm
 
-from pchem_pipeline.model.fit.grown import lobe_threshold, log_likelihood, marginal_mass
-from pchem_pipeline.model.fit.grown_numba import make_cells, make_lobes
+from pchem_pipeline.model.fit.api import satellite_threshold
+from pchem_pipeline.model.law import cells_numba, pixel_numba
 from pchem_pipeline.model.law.electron_laws_numba import (
     FARTHEST,
     STEPS,
@@ -20,9 +21,9 @@ from pchem_pipeline.model.law.electron_laws_numba import (
     fill_normal_table,
     normal_tail,
 )
-from pchem_pipeline.model.law.grown_cells_numba import evaluate
-from pchem_pipeline.model.law.grown_inputs import pack
-from pchem_pipeline.model.law.grown_types_numba import make_room
+from pchem_pipeline.model.law.inputs import pack
+from pchem_pipeline.model.law.likelihood import cells_likelihood
+from pchem_pipeline.model.law.mass import log_likelihood, marginal_mass
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
@@ -104,24 +105,36 @@ def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel"])
-@pytest.mark.parametrize("lobe", [0.0, 1.3])
-def test_score_and_information_are_the_derivatives(law: str, lobe: float) -> None:
+@pytest.mark.parametrize("satellite", [0.0, 1.3])
+@pytest.mark.parametrize("aside", [False, True])
+def test_score_and_information_are_the_derivatives(law: str, satellite: float, aside: bool) -> None:
     model = EVERYTHING.with_counts(law, 0.06).with_clip(92, 158).with_outliers(1e-3, 4096)
-    counts = np.zeros(90)
+    counts = np.zeros(90, np.uint32)
     counts[2:69] = np.arange(67) % 7 * 9 + 1
-    packed = pack(model.with_free_lobes((1.3,)), 1)
-    cells = make_cells(packed, 0, lobe, 90, 120, 90, (counts, np.empty(91), make_lobes(packed)))
-    room = make_room(90)
-    here = np.array([np.log(1.7), 12.0, -20.3, np.log(10.0), 0.2 if lobe else 0.0])
-    evaluate(here, cells, packed, room)
-    score, information = room.score.copy(), room.information.copy()
-    for i in range(5 if lobe else 4):
-        ends = []
+    packed = pack([model.with_free_lobes((1.3,))], 1)
+    n_peaks = packed.peaks.shape[3] * (1 + packed.pattern.shape[0])
+    n_exposures = max(packed.exposures.shape[2], packed.added.shape[3])
+    pixel = pixel_numba.make_pixel(np.array([False]), 90, n_peaks, n_exposures, packed.table)
+    scratch = pixel_numba.make_scratch(1, 90, True)
+    mask = np.zeros(90, np.uint8)
+    if aside:
+        mask[10:31] = pixel_numba.SET_ASIDE
+    centre = 90 + pixel_numba.load(counts, mask, pixel.bins[0], pixel.facts[0])
+    pixel = pixel._replace(centre=int(centre))
+    cells_numba.resolve(packed, 0, satellite, pixel)
+    at = scratch.evaluations[pixel_numba.AT]
+
+    def evaluate(point):
+        value = evaluated(pixel, point, False, cells_likelihood(), scratch)
+        lower = np.tril(at[0, pixel_numba.INFORMATION : pixel_numba.DAMPING])
+        return value, at[0, pixel_numba.SCORE].copy(), lower + np.tril(lower, -1).T
+
+    here = np.array([np.log(1.7), 12.0, 99.7 - centre, np.log(10.0), 0.2 if satellite else 0.0])
+    _, score, information = evaluate(here)
+    for i in range(5 if satellite else 4):
         step = np.zeros(5)
         step[i] = (1e-5, 1e-4, 1e-4, 1e-5, 1e-5)[i]
-        for point in (here + step, here - step):
-            ends.append((evaluate(point, cells, packed, room), room.score.copy()))
-        (above, score_above), (below, score_below) = ends
+        (above, score_above, _), (below, score_below, _) = evaluate(here + step), evaluate(here - step)
         assert score[i] == pytest.approx((above - below) / 2 / step[i], rel=1e-6, abs=1e-6 * abs(score).max())
         slope = (score_below - score_above) / 2 / step[i]
         np.testing.assert_allclose(information[i], slope, rtol=1e-6, atol=1e-7 * abs(slope).max())
@@ -143,9 +156,9 @@ def test_normal_tail_keeps_its_digits() -> None:
 @pytest.mark.parametrize(("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2)])
 def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int, dispersion: float) -> None:
     # 0.6 e- of the mean are added, and do not grow with H
-    mixtures = np.array([0.25, 0.75]), np.array([1.6, 0.8]), np.array([0.4, 0.6]), np.array([0.0, 1.0])
+    mixtures = np.array([[0.25, 0.75, 0.0], [1.6, 0.8, 0.0], [0.4, 0.6, 0.0], [0.0, 1.0, 0.0]])
     k = np.arange(400)
-    rows = np.array([electron_number(law, dispersion, int(i), 2.4, *mixtures) for i in k])
+    rows = np.array([electron_number(law, dispersion, int(i), 2.4, mixtures) for i in k])
     assert rows[:, 0].sum() == pytest.approx(1.0, abs=1e-10)
     assert rows[:, 0] @ k == pytest.approx(3.0, rel=1e-8)
     mixed = 2.4**2 * 0.12 + 0.24
@@ -153,7 +166,7 @@ def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int
     assert rows[:, 0] @ (k - 3.0) ** 2 == pytest.approx(excess + mixed, rel=1e-7)
     h = 1e-4
     above, below = (
-        np.array([electron_number(law, dispersion, int(i), 2.4 * np.exp(s), *mixtures)[0] for i in k[:40]])
+        np.array([electron_number(law, dispersion, int(i), 2.4 * np.exp(s), mixtures)[0] for i in k[:40]])
         for s in (h, -h)
     )
     np.testing.assert_allclose(rows[:40, 1], (above - below) / (2 * h), atol=1e-8)
@@ -185,8 +198,8 @@ def test_threshold_of_free_lobes_grows_with_the_number_of_trials() -> None:
     one = MarginalModel().with_free_lobes([1.0])
     eight = MarginalModel().with_free_lobes(range(1, 9))
     # half of the chi-square mass: a normal deviate exceeds sqrt(2 rise) with the probability of a trial
-    assert norm.sf(np.sqrt(2 * lobe_threshold(one))) == pytest.approx(1e-4, rel=1e-6)
-    assert norm.sf(np.sqrt(2 * lobe_threshold(eight))) == pytest.approx(1e-4 / 8, rel=1e-6)
+    assert norm.sf(np.sqrt(2 * satellite_threshold(one))) == pytest.approx(1e-4, rel=1e-6)
+    assert norm.sf(np.sqrt(2 * satellite_threshold(eight))) == pytest.approx(1e-4 / 8, rel=1e-6)
 
 
 def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:

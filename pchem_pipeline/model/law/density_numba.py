@@ -1,7 +1,7 @@
-"""One evaluation of a pixel's likelihood: E-step sums, score and Louis' observed information.
+"""The likelihood of the density of the PCD at whole DN: E-step sums, score and Louis' observed information.
 
-Internal parameters ``theta = (log H, a, m, log sigma^2)`` with ``a = 1/g`` and ``m = mu - centre`` (DN); the
-values are counted from an integer ``centre`` near the pixel's mean, so that no moment cancels.
+Parameters of a sample are (log H, a, m, log sigma^2) with ``a = 1/g`` and ``m = mu - centre`` (DN); the
+values are counted from an integer ``centre`` near the sample's mean, so that no moment cancels.
 
 For the values nearest to component ``j``, with ``d = y - m - j a``, the components ``j + l`` weigh in as
 ``(P_{j+l} / P_j) exp(-l^2 a^2 / 2 sigma^2) r^l`` with ``r = exp(d a / sigma^2)``: a polynomial in ``r``, and
@@ -9,7 +9,7 @@ For the values nearest to component ``j``, with ``d = y - m - j a``, the compone
 score and ``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
 
 First `_fill` lays the values out in a table, a column for each DN, with the polynomial's coefficients; then
-one loop without branches or calls runs over the columns, eight side by side (:mod:`.lanes_numba`).
+one loop without branches or calls runs over the columns, eight side by side (:mod:`.simd_numba`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.pixel_numba import (
+    BIAS,
+    CAPACITY,
+    CENTRE,
+    CUMULATIVE,
+    DAMPING,
+    DARK,
+    EXPECTED,
+    FIRST,
+    INFORMATION,
+    LOG_VARIANCE,
+    MAX_COMPONENTS,
+    MEAN,
+    N_BINS,
+    N_BLOCK,
+    N_FRAMES,
+    N_ROWS,
+    SCORE,
+    STEP,
+    SUM_E,
+    SUM_EE,
+    SUM_K,
+    SUM_KE,
+    SUM_KK,
+    SUMS,
+    VARIANCE,
+    WEIGHT,
+    Pixel,
+    Scratch,
+)
 from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, lanes_exp, lanes_log
 from pchem_pipeline.model.law.simd_numba import (
     LANES,
@@ -35,13 +65,6 @@ from pchem_pipeline.model.law.simd_numba import (
     store_lanes,
     sum_lanes,
 )
-from pchem_pipeline.model.law.workspace_numba import (
-    CAPACITY,
-    LOGLIK,
-    MAX_COMPONENTS,
-    Histogram,
-    Workspace,
-)
 
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
 _LARGEST_RATIO = 333.0  # logarithm; keeps r^2 finite when the peaks are needles
@@ -53,12 +76,13 @@ _WEIGHT, _OFFSET, _NEAREST, _LEVEL, _COEFFICIENT = range(5)
 # places in `totals`: the log-likelihood; the sums over c of low and low^2 (low: the lowest component); with i
 # counted from it, the offset d from it and w = d - a low, sums of c times E[i], E[i^2], low E[i], d E[i] and
 # low d; then of c times var(i), cov(i, i^2) and var(i^2) times powers of d and w
+_LOGLIK = 0
 _LOW, _LOW2, _M1, _M2, _LOW_M1, _D_M1, _LOW_D = range(1, 8)
 _V11, _V11W, _V11D, _V11WW, _V11DW, _V11DD, _V12, _V12W, _V12D, _V22 = range(8, 18)
 _N_TOTALS = 18
 
-# rows of `Workspace.rows`
-_EXPECTED, _TOTALS, _POWERS, _RISE, _FALL, _LOG_RISE = range(6)
+# rows of `Scratch.rows`
+_TOTALS, _POWERS, _RISE, _FALL, _LOG_RISE = range(5)
 
 LOG_2PI = math.log(2.0 * math.pi)
 
@@ -118,7 +142,7 @@ def _table_kernel(width: int) -> Callable[..., Any]:
             v11w, v11d = v11w + c11w, v11d + c11d
             v11ww, v11dw, v11dd = fused(c11w, w, v11ww), fused(c11d, w, v11dw), fused(c11d, d, v11dd)
             v12w, v12d = fused(c12, w, v12w), fused(c12, d, v12d)
-        totals[LOGLIK] += sum_lanes(loglik)
+        totals[_LOGLIK] += sum_lanes(loglik)
         first = (sum_m1, sum_m2, sum_low_m1, sum_d_m1, sum_low_d)
         second = (v11, v11w, v11d, v11ww, v11dw, v11dd, v12, v12w, v12d, v22)
         for number_of, value in enumerate(first):
@@ -137,7 +161,7 @@ table_sums_9 = _table_kernel(9)
 table_sums_any = _table_kernel(0)
 
 
-@kernel
+@kernel(inline=True)
 def _half_width(electron_noise: float, exposure: float, first: int, last: int) -> int:
     """Return how many components matter on either side of the nearest one."""
     variance = electron_noise * electron_noise
@@ -148,7 +172,7 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int) -
     return min(half, (MAX_COMPONENTS - 1) // 2)
 
 
-@kernel
+@kernel(inline=True)
 def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure: float) -> None:
     """Fill ``H / k`` of k from ``first`` on, its inverse and its logarithm, by the eight; 1 / k of k = 0."""
     exposure = math.exp(log_exposure)
@@ -160,7 +184,7 @@ def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure:
         store_lanes(rows, _LOG_RISE, i, log_exposure - lanes_log(k))
 
 
-@kernel
+@kernel(inline=True)
 def _fill_coefficients(
     table: NDArray[np.float64],
     filled: int,
@@ -232,7 +256,7 @@ def _sum_table(
         _expect(table, filled, width, a, inverse, frames, expected, end - filled)
 
 
-@kernel
+@kernel(inline=True)
 def _expect(
     table: NDArray[np.float64],
     filled: int,
@@ -261,28 +285,34 @@ def _expect(
         out[start + i] = table[_WEIGHT, i]
 
 
-@kernel
+@kernel(inline=True)
 def _finish(
-    histogram: Histogram, theta: NDArray[np.float64], totals: NDArray[np.float64], space: Workspace
+    facts: NDArray[np.float64],
+    log_exposure: float,
+    a: float,
+    bias: float,
+    inverse: float,
+    totals: NDArray[np.float64],
+    out: NDArray[np.float64],
 ) -> None:
-    """Turn the totals into the E-step's sums, score and observed information.
+    """Turn the totals into a sample's block of an evaluation.
 
     With ``S = const + alpha i + beta i^2``, ``alpha = (1, w/s2, -a/s2, -a d/s2)`` and ``beta = (0, -a/s2, 0,
     a^2/2 s2)``, the conditional covariance of the complete-data score is made of the sums of var(i),
     cov(i, i^2) and var(i^2) times powers of d and w.
     """
-    n, total, score, information = histogram.n, space.total, space.score, space.information
-    exposure, a, inverse = math.exp(theta[0]), theta[1], math.exp(-theta[3])
+    n = facts[N_FRAMES]
+    score, sums = out[SCORE], out[SUMS]
+    exposure = math.exp(log_exposure)
     t = a * inverse
-    mean = histogram.mean - theta[2]
+    mean = facts[MEAN] - bias
     low2, low_d, m2, d_m1 = totals[_LOW2], totals[_LOW_D], totals[_M2], totals[_D_M1]
     sum_k = totals[_LOW] + totals[_M1]
     sum_kk = low2 + 2.0 * totals[_LOW_M1] + m2
     sum_ke = low_d + d_m1 - a * (totals[_LOW_M1] + m2)
     sum_e = n * mean - a * sum_k
-    sum_ee = n * (histogram.variance + mean * mean) - a * (2.0 * (low_d + d_m1) + a * (low2 - m2))
-    for place, value in enumerate((totals[LOGLIK], sum_k, sum_kk, sum_ke, sum_e, sum_ee)):
-        total[place] = value
+    sum_ee = n * (facts[VARIANCE] + mean * mean) - a * (2.0 * (low_d + d_m1) + a * (low2 - m2))
+    sums[SUM_K], sums[SUM_KK], sums[SUM_KE], sums[SUM_E], sums[SUM_EE] = sum_k, sum_kk, sum_ke, sum_e, sum_ee
     v11, v12, v22 = totals[_V11], totals[_V12], totals[_V22]
     cov01 = inverse * totals[_V11W] - t * v12
     cov03 = 0.5 * a * t * v12 - t * totals[_V11D]
@@ -294,22 +324,35 @@ def _finish(
     score[1] = sum_ke * inverse
     score[2] = sum_e * inverse
     score[3] = 0.5 * (sum_ee * inverse - n)
-    information[0, 0] = n * exposure - v11
-    information[0, 1] = -cov01
-    information[0, 2] = t * v11
-    information[0, 3] = -cov03
-    information[1, 1] = sum_kk * inverse - cov11
-    information[1, 2] = sum_k * inverse + t * cov01
-    information[1, 3] = sum_ke * inverse - cov13
-    information[2, 2] = n * inverse - t * t * v11
-    information[2, 3] = sum_e * inverse + t * cov03
-    information[3, 3] = 0.5 * sum_ee * inverse - cov33
-    for row in range(1, 4):
-        for column in range(row):
-            information[row, column] = information[column, row]
+    _fill_complete(n, n * exposure, inverse, out)
+    out[INFORMATION, 0] = n * exposure - v11
+    out[INFORMATION + 1, 0] = -cov01
+    out[INFORMATION + 2, 0] = t * v11
+    out[INFORMATION + 3, 0] = -cov03
+    out[INFORMATION + 1, 1] = sum_kk * inverse - cov11
+    out[INFORMATION + 2, 1] = sum_k * inverse + t * cov01
+    out[INFORMATION + 3, 1] = sum_ke * inverse - cov13
+    out[INFORMATION + 2, 2] = n * inverse - t * t * v11
+    out[INFORMATION + 3, 2] = sum_e * inverse + t * cov03
+    out[INFORMATION + 3, 3] = 0.5 * sum_ee * inverse - cov33
 
 
 @kernel
+def _fill_complete(n: float, of_exposure: float, inverse: float, out: NDArray[np.float64]) -> None:
+    """Fill the complete-data information, of parameters whose electron numbers are known; lower triangle."""
+    sums = out[SUMS]
+    out[DAMPING, 0] = of_exposure
+    for row in range(1, 4):
+        out[DAMPING + row, 0] = 0.0
+    out[DAMPING + 1, 1] = sums[SUM_KK] * inverse
+    out[DAMPING + 2, 1] = sums[SUM_K] * inverse
+    out[DAMPING + 2, 2] = n * inverse
+    out[DAMPING + 3, 1] = sums[SUM_KE] * inverse
+    out[DAMPING + 3, 2] = sums[SUM_E] * inverse
+    out[DAMPING + 3, 3] = 0.5 * sums[SUM_EE] * inverse
+
+
+@kernel(inline=True)
 def _fill(
     table: NDArray[np.float64],
     filled: int,
@@ -333,29 +376,30 @@ def _fill(
         store_lanes(table, _LEVEL, filled + i, level)
 
 
-@kernel
-def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace, frames: float) -> float:
-    """Evaluate log-likelihood, E-step sums, score and observed information of one pixel.
-
-    Args:
-        histogram: of the pixel; its moments take part, too.
-        theta: (log H, a, m, log sigma^2).
-        space: scratch; out: sums, score and information.
-        frames: leave the counts of each DN expected in so many frames in ``space.rows[0]``; nothing if 0.
-
-    Returns:
-        The log-likelihood, nats.
-    """
-    weights, cumulative, n_bins, first, _, _, _ = histogram
-    rows, table = space.rows, space.table
-    expected, totals = rows[_EXPECTED], rows[_TOTALS]
-    exposure, a, origin, inverse = math.exp(theta[0]), theta[1], theta[2], math.exp(-theta[3])
+@kernel(inline=True)
+def _evaluate_sample(
+    pixel: Pixel,
+    sample: int,
+    own: tuple[float, float, float, float],
+    expect: bool,
+    scratch: Scratch,
+    out: NDArray[np.float64],
+) -> float:
+    """Evaluate one sample with electrons at its (log H, 1/g, mu - centre, log sigma^2)."""
+    facts, bins = pixel.facts[sample], pixel.bins[sample]
+    log_exposure, a, origin, log_variance = own
+    weights, cumulative, expected = bins[WEIGHT], bins[CUMULATIVE], bins[EXPECTED]
+    n_bins, first = int(facts[N_BINS]), facts[FIRST]
+    frames = facts[N_FRAMES] if expect else 0.0
+    rows, table = scratch.rows, scratch.table
+    totals = rows[_TOTALS]
+    exposure, inverse = math.exp(log_exposure), math.exp(-log_variance)
     j = max(0, math.floor((first - origin) / a + 0.5))
     last = max(j, math.floor((first + n_bins - 1 - origin) / a + 0.5))
     half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last)
     width = 2 * half + 1
     lowest = max(0, j - half)
-    _fill_steps(rows, lowest, max(last, half) + half + 2 - lowest, theta[0])
+    _fill_steps(rows, lowest, max(last, half) + half + 2 - lowest, log_exposure)
     power = math.exp(-0.5 * a * a * inverse)
     square = power * power
     for step in range(1, width):
@@ -363,7 +407,7 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
         power *= square
     for i in range(_N_TOTALS):
         totals[i] = 0.0
-    level = j * theta[0] - exposure - math.lgamma(j + 1.0) - 0.5 * (theta[3] + LOG_2PI)
+    level = j * log_exposure - exposure - math.lgamma(j + 1.0) - 0.5 * (log_variance + LOG_2PI)
     start = n_bins - n_bins  # 0 as a variable, lest a constant have its own compilation
     filled = start
     while start < n_bins:
@@ -395,5 +439,60 @@ def evaluate(histogram: Histogram, theta: NDArray[np.float64], space: Workspace,
         j += 1
         level += rows[_LOG_RISE, j - lowest]
     _sum_table(table, filled, width, a, inverse, totals, frames, expected, n_bins)
-    _finish(histogram, theta, totals, space)
-    return float(totals[LOGLIK])
+    _finish(facts, log_exposure, a, origin, inverse, totals, out)
+    return float(totals[_LOGLIK])
+
+
+@kernel(inline=True)
+def _evaluate_dark(
+    pixel: Pixel, j: int, bias: float, log_variance: float, expect: bool, out: NDArray[np.float64]
+) -> float:
+    """Evaluate a sample without electrons, one Gaussian."""
+    facts, inverse = pixel.facts[j], math.exp(-log_variance)
+    n, deviation = facts[N_FRAMES], facts[MEAN] - bias
+    for row in range(N_ROWS):
+        for column in range(N_BLOCK):
+            out[row, column] = 0.0
+    sum_e, sum_ee = n * deviation, n * (facts[VARIANCE] + deviation * deviation)
+    out[SUMS, SUM_E], out[SUMS, SUM_EE] = sum_e, sum_ee
+    out[SCORE, 2] = sum_e * inverse
+    out[SCORE, 3] = 0.5 * (sum_ee * inverse - n)
+    _fill_complete(n, 0.0, inverse, out)
+    for row in range(2, 4):
+        for column in range(2, row + 1):
+            out[INFORMATION + row, column] = out[DAMPING + row, column]
+    if expect:
+        sd = math.exp(0.5 * log_variance)
+        for i in range(int(facts[N_BINS])):
+            z = (facts[FIRST] + i - bias) / sd
+            pixel.bins[j, EXPECTED, i] = n * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
+    loglik: float = -0.5 * (n * (LOG_2PI + log_variance) + sum_ee * inverse)
+    return loglik
+
+
+def evaluate_density(
+    pixel: Pixel, theta: NDArray[np.float64], expect: bool, scratch: Scratch, out: NDArray[np.float64]
+) -> float:
+    """Evaluate log-likelihood, score, observed information and E-step sums of all samples of a pixel.
+
+    Args:
+        pixel: histograms; their moments take part, too.
+        theta: parameters, shape (J + N_SHARED,).
+        expect: leave the counts expected of each DN in the pixel's ``bins``.
+        scratch: room to work in.
+        out: out, the evaluation; lower triangles of the matrices.
+
+    Returns:
+        The log-likelihood, nats.
+    """
+    n = pixel.facts.shape[0]
+    a, bias, log_variance = theta[n + STEP], theta[n + BIAS], theta[n + LOG_VARIANCE]
+    loglik = 0.0
+    for j in range(n):
+        own_bias = bias - pixel.facts[j, CENTRE]
+        if pixel.facts[j, DARK] > 0.0:
+            loglik += _evaluate_dark(pixel, j, own_bias, log_variance, expect, out[j])
+        else:
+            own = theta[j], a, own_bias, log_variance
+            loglik += _evaluate_sample(pixel, j, own, expect, scratch, out[j])
+    return loglik

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit import candidates_numba
-from pchem_pipeline.model.fit.start_numba import regression_basis
+from pchem_pipeline.model.fit import starts_numba
+from pchem_pipeline.model.fit.starts_numba import regression_basis
+from pchem_pipeline.model.law.inputs import kernel_counts
 
-__all__ = ["START_METHODS", "kernel_counts", "starting_points"]
+__all__ = ["START_METHODS", "starting_points"]
 
 #: The methods, in the order of the axis ``method`` of :func:`starting_points`.
 START_METHODS = ("regression", "side_lobe", "cumulants")
@@ -32,15 +33,5 @@ def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) ->
     """
     counts = kernel_counts(counts)
     out = np.full((counts.shape[0], len(START_METHODS), 4), np.nan)
-    candidates_numba.start_tile(counts, np.asarray(origin, np.int64), regression_basis(), out)
+    starts_numba.start_tile(counts, np.asarray(origin, np.int64), regression_basis(), out)
     return out
-
-
-def kernel_counts(counts: NDArray[np.integer]) -> NDArray[np.integer]:
-    """Return histograms in the one type that the kernels are compiled for.
-
-    Machine code for another type would round differently in the last bit. Only counts beyond 32 bits keep a
-    type of their own.
-    """
-    wide = counts.dtype.itemsize > 4 and counts.size > 0 and int(counts.max()) > np.iinfo(np.uint32).max
-    return np.ascontiguousarray(counts, np.int64 if wide else np.uint32)

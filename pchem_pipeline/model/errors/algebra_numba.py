@@ -1,0 +1,282 @@
+"""Algebra of the information of a pixel's samples: an arrow of blocks, with parameters that stay.
+
+See :mod:`pchem_pipeline.model.law.pixel_numba` for the parameters and for what an evaluation holds. The
+exposure of each sample is eliminated first; the shared parameters are left with a matrix of their own (Schur
+complement).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.pixel_numba import (
+    DAMPING,
+    HELD,
+    HERE,
+    INFORMATION,
+    LOG_VARIANCE,
+    LOWER,
+    N_BLOCK,
+    N_SHARED,
+    RIGHT,
+    SATELLITE,
+    SCHUR,
+    SCORE,
+    Scratch,
+)
+
+FloatArray = NDArray[np.float64]
+
+_SINGULAR = 1e-12  # of the diagonal element: what is left of it after the other parameters are taken out
+_SMALLEST = 1e-10  # of the damping matrix: less is lost in rounding
+
+
+@kernel
+def cholesky(matrix: FloatArray, held: NDArray[np.bool_], first: int, size: int, lower: FloatArray) -> bool:
+    """Factor the rows 1 ... size - 1 of a matrix; False unless positive definite.
+
+    Args:
+        matrix: its lower triangle.
+        held: which rows stay, from place ``first`` (that of row 1) on: they are taken for those of a unit
+            matrix.
+        first: place of row 1 in ``held``.
+        size: end of the rows.
+        lower: out.
+    """
+    for row in range(1, size):
+        for column in range(1, row + 1):
+            value = matrix[row, column]
+            if held[first + row - 1] or held[first + column - 1]:
+                value = 1.0 if row == column else 0.0
+            for k in range(1, column):
+                value -= lower[row, k] * lower[column, k]
+            if row != column:
+                lower[row, column] = value / lower[column, column]
+            elif held[first + row - 1]:
+                lower[row, row] = 1.0
+            elif value > _SINGULAR * abs(matrix[row, row]):
+                lower[row, row] = math.sqrt(value)
+            else:
+                return False
+    return True
+
+
+@kernel
+def back_substitute(lower: FloatArray, size: int, vector: FloatArray) -> float:
+    """Solve ``L L' x = vector`` in rows 1 ... size - 1 in place; return ``vector' x``, squared decrement."""
+    squared = 0.0
+    for row in range(1, size):
+        for k in range(1, row):
+            vector[row] -= lower[row, k] * vector[k]
+        vector[row] /= lower[row, row]
+        squared += vector[row] * vector[row]
+    for row in range(size - 1, 0, -1):
+        for k in range(row + 1, size):
+            vector[row] -= lower[k, row] * vector[k]
+        vector[row] /= lower[row, row]
+    return squared
+
+
+@kernel
+def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
+    """Solve for the step with the information and a share of the damping matrix.
+
+    Args:
+        at: evaluation.
+        share: of the damping matrix.
+        scratch: with the parameters that stay in its flags `HELD`.
+        step: out, shape (J + N_SHARED,); 0 for what stays.
+
+    Returns:
+        The squared decrement, NaN unless the matrix is positive definite.
+    """
+    n, held, small = at.shape[0], scratch.flags[HELD], scratch.small
+    size = np.int64(N_BLOCK - 1 if held[n + SATELLITE] else N_BLOCK)
+    right, schur, lower = small[RIGHT], small[SCHUR:LOWER], small[LOWER:HERE]
+    for row in range(1, size):
+        right[row] = 0.0
+        for column in range(1, row + 1):
+            schur[row, column] = 0.0
+    squared = 0.0
+    for j in range(n):
+        block = at[j]
+        for row in range(1, size):
+            right[row] += block[SCORE, row]
+            for column in range(1, row + 1):
+                schur[row, column] += block[INFORMATION + row, column] + share * block[DAMPING + row, column]
+        if held[j]:
+            continue
+        own = block[INFORMATION, 0] + share * block[DAMPING, 0]
+        if not own > _SMALLEST * block[DAMPING, 0]:
+            return math.nan
+        squared += block[SCORE, 0] * block[SCORE, 0] / own
+        for row in range(1, size):
+            across = block[INFORMATION + row, 0] + share * block[DAMPING + row, 0]
+            factor = across / own
+            right[row] -= factor * block[SCORE, 0]
+            for column in range(1, row + 1):
+                schur[row, column] -= factor * (
+                    block[INFORMATION + column, 0] + share * block[DAMPING + column, 0]
+                )
+    for row in range(1, size):
+        if held[n + row - 1]:
+            right[row] = 0.0
+    if not cholesky(schur, held, n, size, lower):
+        return math.nan
+    squared += float(back_substitute(lower, size, right))
+    step[n + SATELLITE] = 0.0
+    for row in range(1, size):
+        step[n + row - 1] = 0.0 if held[n + row - 1] else right[row]
+    for j in range(n):
+        block = at[j]
+        step[j] = 0.0
+        if not held[j]:
+            value = block[SCORE, 0]
+            for row in range(1, size):
+                across = block[INFORMATION + row, 0] + share * block[DAMPING + row, 0]
+                value -= across * step[n + row - 1]
+            step[j] = value / (block[INFORMATION, 0] + share * block[DAMPING, 0])
+    return squared
+
+
+@kernel(inline=True)
+def invert_arrow(at: FloatArray, theta: FloatArray, held: NDArray[np.bool_], covariance: FloatArray) -> bool:
+    """Fill the inverse of the observed information of (H_1 ... H_J, 1/g, mu, v, q).
+
+    In H itself, ``-d2 L / dH2 = (I + s) / H^2`` with information I and score s in log H: it stays finite
+    where the exposure is at its lower bound.
+
+    Args:
+        at: evaluation at the maximum.
+        theta: there.
+        held: parameters that stay, shape (J + N_SHARED,).
+        covariance: out, shape (J + N_SHARED, J + N_SHARED); zeros for what stays.
+
+    Returns:
+        Whether the information is positive definite.
+    """
+    n, _, end = at.shape  # a constant would have its own compilation of what is called
+    factors, own = np.zeros((n, N_BLOCK)), np.zeros(n)
+    schur, lower, column = np.zeros((N_BLOCK, N_BLOCK)), np.zeros((N_BLOCK, N_BLOCK)), np.zeros(N_BLOCK)
+    for row in range(n + N_SHARED):
+        for other in range(n + N_SHARED):
+            covariance[row, other] = 0.0
+    for j in range(n):
+        block = at[j]
+        for row in range(1, N_BLOCK):
+            for other in range(1, row + 1):
+                schur[row, other] += block[INFORMATION + row, other]
+        if held[j]:
+            continue
+        exposure = math.exp(theta[j])
+        own[j] = (block[INFORMATION, 0] + block[SCORE, 0]) / (exposure * exposure)
+        if not own[j] > 0.0:
+            return False
+        for row in range(1, N_BLOCK):
+            factors[j, row] = block[INFORMATION + row, 0] / exposure / own[j]
+        for row in range(1, N_BLOCK):
+            for other in range(1, row + 1):
+                schur[row, other] -= factors[j, row] * factors[j, other] * own[j]
+    if not cholesky(schur, held, n, end, lower):
+        return False
+    for i in range(1, N_BLOCK):
+        if held[n + i - 1]:
+            continue
+        for row in range(1, N_BLOCK):
+            column[row] = 1.0 if row == i else 0.0
+        back_substitute(lower, end, column)
+        for row in range(1, N_BLOCK):
+            covariance[n + row - 1, n + i - 1] = 0.0 if held[n + row - 1] else column[row]
+    for j in range(n):
+        for i in range(N_SHARED):
+            value = 0.0
+            for row in range(1, N_BLOCK):
+                value += covariance[n + i, n + row - 1] * factors[j, row]
+            covariance[j, n + i] = covariance[n + i, j] = -value
+    for j in range(n):
+        for other in range(n):
+            value = 0.0
+            for row in range(1, N_BLOCK):
+                value -= covariance[j, n + row - 1] * factors[other, row]
+            covariance[j, other] = value
+        if not held[j]:
+            covariance[j, j] += 1.0 / own[j]
+    return True
+
+
+@kernel(inline=True)
+def enclose(at: FloatArray, theta: FloatArray, covariance: FloatArray) -> None:
+    """Replace the inverse information C by the sandwich ``C (sum of squared scores) C`` (White 1982).
+
+    Args:
+        at: evaluation at the maximum, the samples' squared scores in the place of the damping matrix.
+        theta: there.
+        covariance: as of `invert_arrow`; out.
+    """
+    n, size = at.shape[0], theta.size
+    middle, half = np.zeros((size, size)), np.zeros((size, size))
+    for j in range(n):
+        scale = math.exp(-theta[j])
+        for row in range(N_BLOCK):
+            for column in range(row + 1):
+                value = at[j, DAMPING + row, column]
+                value *= (scale if row == 0 else 1.0) * (scale if column == 0 else 1.0)
+                place = j if row == 0 else n + row - 1
+                other = j if column == 0 else n + column - 1
+                middle[place, other] += value
+                if place != other:
+                    middle[other, place] += value
+    for row in range(size):
+        for column in range(size):
+            for k in range(size):
+                half[row, column] += middle[row, k] * covariance[k, column]
+    product = np.zeros((size, size))
+    for row in range(size):
+        for column in range(size):
+            for k in range(size):
+                product[row, column] += covariance[row, k] * half[k, column]
+    for row in range(size):
+        for column in range(size):
+            covariance[row, column] = product[row, column]
+
+
+@kernel(inline=True)
+def to_natural(
+    theta: FloatArray,
+    dark: NDArray[np.bool_],
+    held: NDArray[np.bool_],
+    rounding: float,
+    full: FloatArray,
+    parameters: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Turn theta and its covariance into (H_1 ... H_J, g, mu, sigma) and theirs.
+
+    Args:
+        theta: parameters, mu counted from 0.
+        dark: which samples hold no electrons: H = 0.
+        held: parameters that a bound holds: NaN in their rows and columns, but for dark samples, where it is
+            0.
+        rounding: variance that sigma has beside v, DN^2.
+        full: covariance of (H_1 ... H_J, 1/g, mu, v, q).
+        parameters: out, shape (J + 3,).
+        covariance: out, shape (J + 3, J + 3).
+    """
+    n = dark.size
+    slope = np.ones(n + N_SHARED)
+    for j in range(n):
+        parameters[j] = 0.0 if dark[j] else math.exp(theta[j])
+    variance = math.exp(theta[n + LOG_VARIANCE])
+    parameters[n] = 1.0 / theta[n]
+    parameters[n + 1] = theta[n + 1]
+    parameters[n + 2] = math.sqrt(variance + rounding)
+    slope[n] = -parameters[n] * parameters[n]
+    slope[n + 2] = 0.5 * variance / parameters[n + 2]
+    for row in range(n + 3):
+        for column in range(n + 3):
+            known = (row < n or not held[row]) and (column < n or not held[column])
+            covariance[row, column] = full[row, column] * slope[row] * slope[column] if known else math.nan

@@ -1,0 +1,537 @@
+"""Maximum likelihood of (H, g, mu, sigma) of pixels: one exposure or several, any law, density or cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, chdtri
+
+from pchem_pipeline.model.errors import information_numba
+from pchem_pipeline.model.errors.fisher import observed_covariance
+from pchem_pipeline.model.fit import engine, guard_numba, profile_numba, search_numba, tile_numba
+from pchem_pipeline.model.fit.climb_numba import Limits
+from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
+from pchem_pipeline.model.fit.guard import fit_guarded
+from pchem_pipeline.model.fit.intervals import quantile_of
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.rounding import biased_by_rounding
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts
+from pchem_pipeline.model.law.inputs import kernel_counts, pack
+from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
+from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = ["fit_histograms", "satellite_threshold"]
+
+FloatArray = NDArray[np.float64]
+Counts = NDArray[np.integer]
+
+WARM_UP = (
+    2  # EM steps before the first Newton step, of several samples; the start of one is good enough without
+)
+_CLEAR_GAP = search_numba.CLEAR_GAP
+# Frames and degrees of freedom below which it matters that merging bins for the chi-square test hides part of
+# what the parameters know: it is half a degree of freedom or so.
+_FEW_FRAMES, _FEW_GROUPS = 5000, 40
+_FEWEST_CODES = 5
+_LOOSE = 0.1  # relative standard error of the gain beyond which several samples do not determine it
+#: Bits about the data, whatever the fit, and those for which a fit with the cells may still find an answer.
+_OF_DATA = FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW
+_NO_FIT = FitStatus.NO_DATA | FitStatus.TOO_FEW_BINS
+
+
+def fit_histograms(
+    counts: Counts | Sequence[Counts],
+    origin: Counts | Sequence[Counts],
+    under: Counts | None = None,
+    over: Counts | None = None,
+    *,
+    dark: Sequence[bool] | None = None,
+    law: MarginalModel | Sequence[MarginalModel] | None = None,
+    settings: FitSettings | None = None,
+    adc_limits: tuple[int, int] | None = None,
+    start: FitResult | FloatArray | None = None,
+    excluding: Sequence[Interval] = (),
+) -> FitResult:
+    """Estimate (H, g, mu, sigma) of every pixel from its histograms by maximum likelihood.
+
+    The likelihood is that of the PCD at whole DN (Hendrickson et al. 2023, eq. X_density); of several
+    exposures of a pixel (Hendrickson and Haefner 2024), which share g, mu and sigma, the product. A start
+    from the empirical characteristic function, or from the line of variance against mean, is improved by
+    damped Newton steps with Louis' observed information, by
+    EM steps, eqs. (update_eqns) to (gamma_nk), where that does not help (``algorithm: em``: by EM steps
+    alone), until the expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried,
+    unless a good fit leaves them no chance, and the likeliest is kept; a pixel whose goodness of fit or read
+    noise raises suspicion gets other starts. No pixel raises: what cannot be fitted holds NaN and a reason.
+    The answer for a pixel does not depend on the others in the batch.
+
+    Under another ``law``, and where the settings ask for the exact likelihood, a second fit starts from that
+    one: the mass of every code is an integral over its cell, not a density at its middle, so that rounding,
+        code edges and
+    clipping are exact, and the likelihood is bounded at any read noise.
+
+    Samples that the model does not expect at all are left out (setting ``tail_guard``): a few outliers move
+    nothing, and a pixel without any has the very estimates that it would have without the guard.
+
+    Args:
+        counts: histograms, shape (n, B), any unsigned type; or a list of them, (n, B_j), one for each
+            exposure.
+        origin: DN of bin 0, shape (n,); or a list of them.
+        under: frames below bin 0, of all samples, shape (n,); such pixels are fitted inside the window and
+            flagged.
+        over: frames above the last bin, shape (n,).
+        dark: which samples hold no electrons (H = 0 exactly); none by default.
+        law: law of the samples of these pixels, or a list of them, one for each exposure; the PCD if None.
+        settings: how to fit; the defaults if None.
+        adc_limits: first and last code of the ADC, DN; pixels that reach them are flagged, and the exact
+            likelihood counts what lies beyond there.
+        start: a fit of the same histograms with the PCD, from which that under the law starts; or
+            (H_1 ... H_J, g, mu, sigma) known to be near the answer, shape (n, J + 3), NaN where nothing is
+            known. In the
+            latter case the maximum next to it is taken where it fits well, without a look at its neighbours:
+                the bias
+            is not tested for ambiguity, and the likelihood gap is that to one Gaussian.
+        excluding: intervals of e- on the comb of the fit with the PCD: codes there are set aside. The
+            likelihood is conditional on the other codes (a truncated sample, Fisher 1931), so the number of
+            samples in them does not matter either.
+
+    Returns:
+        Estimates, covariances and a status word per pixel.
+
+    Raises:
+        ValueError: if there is no sample, their shapes disagree, or none holds electrons.
+    """
+    settings = settings or FitSettings()
+    several = not isinstance(counts, np.ndarray)
+    samples = [counts] if isinstance(counts, np.ndarray) else list(counts)
+    origins = [origin] if isinstance(origin, np.ndarray) else list(origin)
+    dark = [False] * len(samples) if dark is None else list(dark)
+    _check(samples, origins, dark)
+    batch = _Batch(samples, origins, dark, settings, adc_limits, under, over)
+    laws = None if law is None else [law] * len(samples) if isinstance(law, MarginalModel) else list(law)
+    near = None if isinstance(start, FitResult) else start
+    if laws is not None and near is not None:
+        found = batch.fit_cells(laws, near, warm=True)
+        batch.by_cells[:] = True
+    else:
+        plain = batch.resume(_shaped(start, -1)) if isinstance(start, FitResult) else batch.fit_density(near)
+        batch.set_aside(plain, excluding)
+        found = batch.refine(plain, laws)
+    if settings.intervals == "profile":
+        found = replace(found, intervals=batch.intervals(found, laws))
+    return found if several else _shaped(found)
+
+
+def satellite_threshold(law: MarginalModel) -> float:
+    """Return the rise of the log-likelihood, nats, that free satellite peaks must bring to be kept.
+
+    At a weight of 0, the border of what is allowed, twice the rise is 0 or, half of the time, chi-square
+    with one degree of freedom. The amplitude means nothing there, so the largest of the rises at all
+    amplitudes counts (Davies 1987); by Bonferroni's bound over them a pixel without satellites is given some
+    with about the probability ``free_lobe_alarm``: neighbouring amplitudes rise together, which lowers it,
+    and the best one is refined, which raises it.
+    """
+    trials = max(len(law.free_lobes), 1)
+    return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * law.free_lobe_alarm / trials)))
+
+
+def _check(samples: Sequence[Counts], origins: Sequence[Counts], dark: Sequence[bool]) -> None:
+    if not samples or all(dark):
+        raise ValueError("no sample holds electrons")
+    if len(samples) != len(origins) or len(samples) != len(dark):
+        raise ValueError("counts, origins and dark must have one entry for each sample")
+    sizes = {sample.shape[0] for sample in samples} | {np.size(origin) for origin in origins}
+    if len(sizes) != 1:
+        raise ValueError(f"the samples have different numbers of pixels: {sorted(sizes)}")
+
+
+def _shaped(result: FitResult, *columns: int) -> FitResult:
+    """Return a result with the arrays of samples of shape (n, *columns)."""
+    n = result.bias.size
+    return replace(
+        result,
+        quanta_exposure=result.quanta_exposure.reshape(n, *columns),
+        mean=result.mean.reshape(n, *columns),
+        variance=result.variance.reshape(n, *columns),
+    )
+
+
+class _Batch:
+    """The histograms of n pixels at J exposures, and how they are fitted."""
+
+    def __init__(
+        self,
+        samples: Sequence[Counts],
+        origins: Sequence[Counts],
+        dark: Sequence[bool],
+        settings: FitSettings,
+        adc_limits: tuple[int, int] | None,
+        under: Counts | None,
+        over: Counts | None,
+    ) -> None:
+        together = np.concatenate(samples, axis=1) if len(samples) > 1 else samples[0]
+        counts = kernel_counts(together)
+        self.given = Histograms(
+            counts,
+            np.concatenate([[0], np.cumsum([sample.shape[1] for sample in samples])]).astype(np.int64),
+            np.ascontiguousarray(np.stack([np.ravel(each) for each in origins], axis=1), np.int64),
+            np.array(dark, np.bool_),
+            np.zeros(counts.shape, np.uint8),
+        )
+        self.n, self.n_samples = counts.shape[0], len(samples)
+        self.settings, self.adc_limits = settings, adc_limits
+        self.outside, self.by_cells = np.zeros(self.n, np.bool_), np.zeros(self.n, np.bool_)
+        for each in (under, over):
+            if each is not None:
+                self.outside |= np.ravel(each) > 0
+
+    # -- the two fits
+
+    def fit_density(self, near: FloatArray | None) -> FitResult:
+        """Fit with the density; near: parameters, and perhaps the gap of that fit in a further column."""
+        size = self.n_samples + 3
+        gaps = np.full(self.n, np.inf)
+        if near is not None and near.shape[1] > size:
+            gaps = np.where(np.isnan(near[:, size]), np.inf, near[:, size])
+        known = np.empty((0, size)) if near is None else np.ascontiguousarray(near[:, :size], np.float64)
+        starts = Starts(known, gaps, np.empty(0))
+        laws = [MarginalModel()] * self.n_samples
+        return self._result(self._fit(self.given, laws, starts, self._limits(None)), cells=False, adjust=True)
+
+    def resume(self, plain: FitResult) -> FitResult:
+        """Leave out the samples that a fit with the density left out; return it."""
+        pixels = np.flatnonzero(plain.outlier_share > 0)
+        if self.settings.tail_guard > 0 and pixels.size:
+            laws, limits = [MarginalModel()] * self.n_samples, self._limits(None)
+            answers = self._answers(self.n)
+            answers.parameters[:] = plain.columns
+            gone = plain.outlier_share * self.given.counts.sum(axis=1, dtype=np.float64)
+            guard_numba.leave_out_tile(
+                *(self.given, pixels, pack(laws, self.n), limits, density_likelihood(), answers),
+                *(gone, np.zeros(self.n, np.bool_)),
+            )
+        return plain
+
+    def set_aside(self, plain: FitResult, intervals: Sequence[Interval]) -> None:
+        """Set codes aside, but for pixels of which too few would be left."""
+        if not intervals:
+            return
+        mask, fewest = self.given.mask.copy(), np.full(self.n, _FEWEST_CODES)
+        for j in range(self.n_samples):
+            part = slice(self.given.places[j], self.given.places[j + 1])
+            width = part.stop - part.start
+            place = electrons_of(self.given.origin[:, j], width, plain.conversion_gain, plain.bias)
+            mask[:, part][inside(intervals, place)] = SET_ASIDE
+            used = ((self.given.counts[:, part] > 0) & (mask[:, part] == COUNTED)).sum(axis=1)
+            fewest = np.minimum(fewest, used) if not self.given.dark[j] else fewest
+        enough = (fewest >= _FEWEST_CODES) & ((plain.fit_status & int(FAILED)) == 0)
+        self.given.mask[enough] = mask[enough]
+
+    def refine(self, plain: FitResult, laws: Sequence[MarginalModel] | None) -> FitResult:
+        """Fit again with the cells what the law or the settings ask for, from a fit with the density."""
+        fitted = (plain.fit_status & int(FAILED)) == 0
+        if laws is not None or (self.given.mask == SET_ASIDE).any():
+            laws = laws or self._neutral()
+            pixels = np.flatnonzero(
+                fitted | (self._at_limits(laws) & ((plain.fit_status & int(_NO_FIT)) == 0))
+            )
+        elif self.settings.likelihood == "exact":
+            pixels = np.flatnonzero((plain.fit_status & int(_NO_FIT)) == 0)
+        elif self.settings.likelihood == "auto":
+            failed = (plain.fit_status & int(FAILED & ~_NO_FIT)) != 0
+            pixels = np.flatnonzero(self._biased(plain) | failed)
+        else:
+            pixels = np.empty(0, np.intp)
+        if pixels.size == 0:
+            return plain
+        self.by_cells[pixels] = True
+        chosen = laws or self._neutral()
+        near, gaps = plain.columns, plain.likelihood_gap
+        part = self.fit_cells(chosen, near, gaps=gaps, pixels=pixels, scan=laws is None)
+        part = replace(
+            part,
+            fit_status=part.fit_status | (plain.fit_status[pixels] & np.uint16(int(_OF_DATA))),
+            n_iterations=part.n_iterations + plain.n_iterations[pixels],
+        )
+        return plain.with_pixels(pixels, part)
+
+    def fit_cells(
+        self,
+        laws: Sequence[MarginalModel],
+        near: FloatArray,
+        *,
+        gaps: FloatArray | None = None,
+        pixels: NDArray[np.intp] | None = None,
+        warm: bool = False,
+        scan: bool = False,
+    ) -> FitResult:
+        """Fit with the cells from parameters that are near; ``warm``: of a fit with nearly these laws."""
+        some = np.arange(self.n) if pixels is None else pixels
+        whole = some.size == self.n
+        given = (
+            self.given
+            if whole
+            else self.given._replace(
+                counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
+            )
+        )
+        own = laws if whole else [each.of(some) for each in laws]
+        gap = np.full(some.size, np.inf) if gaps is None else gaps[some]
+        for each in own:  # the plain fit of an exposure that is not one may be an electron off
+            mixed = ((each.added_weights > 0.0) & (each.added_exposure > 0.0)).any(axis=1)
+            gap = np.where(mixed, np.minimum(gap, 0.999 * _CLEAR_GAP), gap)
+        starts = Starts(
+            np.ascontiguousarray(near[some], np.float64),
+            np.ascontiguousarray(gap, np.float64),
+            np.array(own[0].free_lobes, np.float64),
+        )
+        limits = self._limits(own, warm=warm, scan=scan)
+        adjust = all(each.neutral for each in own)
+        if not adjust:
+            _count_near(given)
+        answers = self._fit(given, own, starts, limits)
+        if not whole:
+            self.given.mask[some] = given.mask
+        return self._result(answers, cells=True, adjust=adjust, pixels=some)
+
+    def _fit(
+        self, given: Histograms, laws: Sequence[MarginalModel], starts: Starts, limits: Limits
+    ) -> Answers:
+        n = given.counts.shape[0]
+        answers = self._answers(n)
+        packed = pack(laws, n)
+        cells = limits.cells
+        evaluate = cells_likelihood() if cells else density_likelihood()
+        search = engine.cells_search() if cells else engine.density_search()
+
+        def fit(pixels: NDArray[np.intp]) -> None:
+            answers.parameters[pixels] = np.nan
+            answers.covariance[pixels] = np.nan
+            tile_numba.fit_tile(
+                given,
+                pixels,
+                packed,
+                starts,
+                limits,
+                evaluate,
+                engine.climb(),
+                search,
+                engine.regression_basis(),
+                answers,
+            )
+
+        def leave_out(pixels: NDArray[np.intp], gone: FloatArray) -> NDArray[np.bool_]:
+            changed = np.zeros(n, np.bool_)
+            guard_numba.leave_out_tile(given, pixels, packed, limits, evaluate, answers, gone, changed)
+            return changed[pixels]
+
+        fit_guarded(fit, leave_out, given, limits, answers)
+        return answers
+
+    def _answers(self, n: int) -> Answers:
+        """Return room for the answers of so many pixels."""
+        size = self.n_samples + 3
+        return Answers(
+            np.full((n, size), np.nan),
+            np.full((n, size, size), np.nan),
+            np.full((n, self.n_samples, 2), np.nan),
+            np.full((n, search_numba.N_OUT), np.nan),
+            np.zeros((n, tile_numba.N_WORDS), np.int64),
+        )
+
+    # -- what they are told
+
+    def _limits(
+        self, laws: Sequence[MarginalModel] | None, *, warm: bool = False, scan: bool = False
+    ) -> Limits:
+        settings = self.settings
+        em = settings.algorithm == "em" and laws is None
+        return Limits(
+            bound=float(np.log(settings.minimum_quanta_exposure)),
+            tolerance=settings.tolerance,
+            most=settings.em_max_iterations if em else settings.max_iterations,
+            warm_up=0 if self.n_samples == 1 else WARM_UP,
+            only_em=em,
+            cells=laws is not None,
+            gap=settings.gap_threshold,
+            noise=settings.read_noise_limit,
+            floor=settings.tail_guard,
+            most_outliers=settings.tail_guard_share,
+            satellite_rise=0.0 if laws is None else satellite_threshold(laws[0]),
+            reshapes=laws is not None and any(_reshapes(each) for each in laws),
+            warm=warm,
+            scan=scan,
+            sandwich=settings.errors == "sandwich",
+        )
+
+    def _neutral(self) -> list[MarginalModel]:
+        """Return the law of the PCD between the limits of the ADC."""
+        low, high = self.adc_limits or (None, None)
+        return [MarginalModel(clip_low=low, clip_high=high)] * self.n_samples
+
+    def _at_limits(self, laws: Sequence[MarginalModel]) -> NDArray[np.bool_]:
+        """Tell in which pixels codes pile up at a limit of the law."""
+        found = np.zeros(self.n, np.bool_)
+        for j, each in enumerate(laws):
+            part = slice(self.given.places[j], self.given.places[j + 1])
+            codes = self.given.origin[:, j, None] + np.arange(part.stop - part.start)
+            beyond = np.zeros(codes.shape, np.bool_)
+            if each.clip_low is not None:
+                beyond |= codes <= each.clip_low
+            if each.clip_high is not None:
+                beyond |= codes >= each.clip_high
+            found |= (beyond & (self.given.counts[:, part] > 0)).any(axis=1)
+        return found
+
+    def _biased(self, plain: FitResult) -> NDArray[np.bool_]:
+        """Tell in which pixels rounding biases the density's estimates, of any sample."""
+        columns, found = plain.columns, np.zeros(self.n, np.bool_)
+        kept = np.where(self.given.mask == LEFT_OUT, 0, self.given.counts)
+        for j in np.flatnonzero(~self.given.dark):
+            frames = kept[:, self.given.places[j] : self.given.places[j + 1]].sum(axis=1, dtype=np.float64)
+            own = [columns[:, j], *columns[:, self.n_samples :].T]
+            found |= biased_by_rounding(own, frames)
+        return found
+
+    # -- what they found
+
+    def _result(
+        self, answers: Answers, *, cells: bool, adjust: bool, pixels: NDArray[np.intp] | None = None
+    ) -> FitResult:
+        """Add to the status words what the loop over the pixels does not know, and blank what failed."""
+        some = np.arange(self.n) if pixels is None else pixels
+        parameters, covariance, moments, out, words = answers
+        n = self.n_samples
+        frames = words[:, tile_numba.FRAMES].astype(np.float64)
+        left = np.nan_to_num(out[:, search_numba.OUTLYING])
+        chi2, dof = out[:, search_numba.CHI2], words[:, tile_numba.FREEDOM].astype(np.float64)
+        if n == 1 and adjust:
+            dof = self._freedom(some, words, frames, parameters, covariance)
+        probability = np.asarray(chdtrc(np.where(dof > 0, dof, np.nan), chi2))
+        status = words[:, tile_numba.STATUS].copy()
+        status[probability < self.settings.goodness_limit] |= FitStatus.POOR_FIT
+        status[self.outside[some]] |= FitStatus.OUTSIDE_WINDOW
+        if n > 1:
+            with np.errstate(invalid="ignore"):
+                loose = np.sqrt(covariance[:, n, n]) > _LOOSE * parameters[:, n]
+            status[loose] |= FitStatus.NOT_INFORMATIVE
+        if self.adc_limits is not None:
+            status[self._reaches_adc(some)] |= FitStatus.ADC_LIMIT
+        failed = (status & int(FAILED)) != 0
+        parameters[failed] = np.nan
+        covariance[failed] = np.nan
+        weight = np.where(failed, np.nan, np.nan_to_num(out[:, search_numba.SATELLITE_WEIGHT]))
+        return FitResult(
+            quanta_exposure=np.ascontiguousarray(parameters[:, :n]),
+            conversion_gain=np.ascontiguousarray(parameters[:, n]),
+            bias=np.ascontiguousarray(parameters[:, n + 1]),
+            read_noise_dn=np.ascontiguousarray(parameters[:, n + 2]),
+            covariance=covariance,
+            mean=np.ascontiguousarray(moments[:, :, 0]),
+            variance=np.ascontiguousarray(moments[:, :, 1]),
+            log_likelihood=out[:, search_numba.LOG_LIKELIHOOD].copy(),
+            likelihood_gap=out[:, search_numba.GAP].copy(),
+            fit_status=status.astype(np.uint16),
+            n_iterations=words[:, tile_numba.EVALUATIONS].astype(np.int32),
+            goodness_chi2=chi2.copy(),
+            goodness_dof=dof,
+            goodness_p=probability,
+            outlier_share=left / np.maximum(frames + left, 1.0),
+            lobe_amplitude_e=np.where(weight > 0, out[:, search_numba.AMPLITUDE], np.nan),
+            lobe_weight=weight,
+        )
+
+    def _freedom(
+        self,
+        pixels: NDArray[np.intp],
+        words: NDArray[np.int64],
+        frames: FloatArray,
+        parameters: FloatArray,
+        covariance: FloatArray,
+    ) -> FloatArray:
+        """Return the degrees of freedom of chi-square, those that merged bins leave to it included.
+
+        The estimates know every DN, the test only the groups: of the four parameters it loses as many as the
+        groups determine (Chernoff and Lehmann 1954). Many frames leave few DN merged, and that is all four.
+        """
+        freedom = words[:, tile_numba.FREEDOM].astype(np.float64)
+        few = np.flatnonzero((freedom > 0) & (freedom < _FEW_GROUPS) & (frames < _FEW_FRAMES))
+        if few.size:
+            own = covariance[few]
+            if self.settings.errors == "sandwich":
+                kept = np.where(self.given.mask[pixels[few]] == LEFT_OUT, 0, self.given.counts[pixels[few]])
+                rows = zip(kept, self.given.origin[pixels[few], 0], parameters[few], strict=True)
+                own = np.stack([observed_covariance(counts, int(first), at) for counts, first, at in rows])
+            known = np.empty(few.size)
+            ends = (words[few, tile_numba.LOWEST_DN], words[few, tile_numba.HIGHEST_DN])
+            information_numba.grouped_trace(*ends, frames[few], parameters[few], own, known)
+            freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
+        return freedom
+
+    def _reaches_adc(self, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Tell which pixels have samples at the limits of the ADC, those left out included."""
+        assert self.adc_limits is not None
+        found = np.zeros(pixels.size, np.bool_)
+        for j in range(self.n_samples):
+            counts = self.given.counts[pixels, self.given.places[j] : self.given.places[j + 1]] > 0
+            seen = counts.any(axis=1)
+            low = self.given.origin[pixels, j] + counts.argmax(axis=1)
+            high = self.given.origin[pixels, j] + counts.shape[1] - 1 - counts[:, ::-1].argmax(axis=1)
+            found |= seen & ((low <= self.adc_limits[0]) | (high >= self.adc_limits[1]))
+        return found
+
+    def intervals(self, found: FitResult, laws: Sequence[MarginalModel] | None) -> FloatArray:
+        """Return the ends of profile-likelihood intervals, (n, J + 4, 2); NaN where there are none.
+
+        At an end the profile likelihood has fallen by ``z^2 / 2`` nats, all other parameters being at their
+        best for each value of the one (Venzon and Moolgavkar 1988). Unlike ``estimate -+ z stderr`` the ends
+        need not be symmetric, and they follow a change of parameter. Pixels whose cells were integrated have
+        the profile of that likelihood.
+        """
+        ends = np.full((self.n, self.n_samples + 4, 2), np.nan)
+        fitted = np.isfinite(found.bias)
+        for cells in (False, True):
+            some = np.flatnonzero(fitted & (self.by_cells == cells))
+            if some.size == 0:
+                continue
+            chosen = (laws or self._neutral()) if cells else [MarginalModel()] * self.n_samples
+            part = np.full((some.size, *ends.shape[1:]), np.nan)
+            satellites = np.stack([found.lobe_amplitude_e[some], found.lobe_weight[some]], axis=1)
+            profile_numba.profile_tile(
+                self.given._replace(
+                    counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
+                ),
+                pack([each.of(some) for each in chosen], some.size),
+                self._limits(chosen if cells else None),
+                cells_likelihood() if cells else density_likelihood(),
+                engine.climb(),
+                found.columns[some],
+                np.nan_to_num(satellites),
+                quantile_of(self.settings.interval_level),
+                part,
+            )
+            ends[some] = part
+        return ends
+
+
+def _count_near(given: Histograms) -> None:
+    """Count samples again that a fit with the PCD did not expect, but for those that a gap cuts off.
+
+    Another law may expect them: satellite peaks, tails.
+    """
+    gone = np.zeros(given.counts.shape[0])
+    guard_numba.cut_tile(given, np.arange(gone.size), 0.0, np.empty((0, 0), np.uint8), gone)
+    near = np.flatnonzero(gone == 0)
+    given.mask[near] = np.where(given.mask[near] == LEFT_OUT, np.uint8(COUNTED), given.mask[near])
+
+
+def _reshapes(law: MarginalModel) -> bool:
+    """Tell whether a law changes more than the width of peaks: the plain fit may then be an electron off."""
+    one_peak = law.lobe_weights.shape[1] == 1
+    one_law = law.law == "poisson" and law.exposure_weights.size == 1
+    return not (one_peak and one_law and law.curvature == 0.0 and law.variance_per_electron2 == 0.0)

@@ -1,0 +1,344 @@
+"""The search with the cells integrated: from a fit with the density, or other starts where that misleads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.fit.climb_numba import CONVERGED, same_place, sensible
+from pchem_pipeline.model.fit.goodness_numba import normal_score
+from pchem_pipeline.model.fit.satellites_numba import fill_core, search_satellites
+from pchem_pipeline.model.fit.search_numba import (
+    AMPLITUDE,
+    CHI2,
+    CLEAR_GAP,
+    FIT_NOT_CONVERGED,
+    GAP,
+    LOG_LIKELIHOOD,
+    SATELLITE_WEIGHT,
+    SUSPICIOUS,
+    Tools,
+    climb_neighbours,
+    climb_on,
+    examine,
+    from_start,
+    judge,
+    loglik_without_gain,
+)
+from pchem_pipeline.model.fit.starts_numba import (
+    add_line_starts,
+    add_scan_starts,
+    fill_starts,
+    start_cumulants,
+    start_peak,
+    start_regression,
+)
+from pchem_pipeline.model.law.cells_numba import Law
+from pchem_pipeline.model.law.pixel_numba import (
+    ADDED_EXPOSURE,
+    ADDED_WEIGHT,
+    BIAS,
+    BOTTOM,
+    CUMULATIVE,
+    DARK,
+    EXTRA_DN2,
+    EXTRA_E2,
+    FIRST,
+    FIXED,
+    HEIGHTS,
+    HERE,
+    KEPT_STARTS,
+    LOG_VARIANCE,
+    MASS,
+    N_BINS,
+    N_FRAMES,
+    N_KEPT,
+    N_PEAKS,
+    OTHER,
+    PER_ELECTRON,
+    PER_ELECTRON2,
+    RATIO,
+    SATELLITE,
+    SHARE,
+    STEP,
+    TOP,
+    WEIGHT,
+    WIDTH,
+    Histogram,
+    Pixel,
+    copy,
+)
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
+_LEAST_SHARE = (
+    0.1  # of the variance and the exposure of the density's fit, left to the pixel itself at the start
+)
+_FEW_STEP = 3.0  # DN per electron, below which the starts of the density may miss the right maximum
+_POOR = 3.0902  # standard normal: a pixel at a limit is started anew
+# what calls for other starts of free satellites: a bad fit (standard normal), or one without resolved peaks,
+# e-
+_SUSPICIOUS = 2.3
+_UNRESOLVED = 0.45
+_LIMIT_EXPOSURES = (0.3, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)
+_LIMIT_NOISE_E = 0.28
+_STEPS = 4  # biases per electron
+_AROUND = 6  # steps from the exposure to the median, at most
+_LEAST_MASS = 1e-9  # of a sample that must not decide between starts
+
+
+@kernel(inline=True)
+def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray) -> None:
+    """Fill ``theta`` from parameters with the whole variance of the read noise.
+
+    Unless ``warm``, exposures and read noise are those of a fit with the density, which hold the mean
+    exposure and all
+    that widens the peaks: what the law adds is taken off, but for a tenth.
+    """
+    n = pixel.facts.shape[0]
+    copy(near, theta)
+    a = near[n + STEP]
+    analog2 = max(
+        math.exp(near[n + LOG_VARIANCE]) - QUANTISATION_VARIANCE, _LEAST_VARIANCE if not warm else 1e-6
+    )
+    left = frames = 0.0
+    for j in range(n):
+        facts, k = pixel.facts[j], math.exp(near[j])
+        if facts[DARK] > 0.0:
+            k = 0.0
+        elif not warm:
+            exposure = k
+            for i in range(pixel.mixtures.shape[2]):
+                exposure -= pixel.mixtures[j, ADDED_WEIGHT, i] * pixel.mixtures[j, ADDED_EXPOSURE, i]
+            theta[j] = math.log(max(exposure, _LEAST_SHARE * k))
+        spread = facts[EXTRA_E2] + k * (facts[PER_ELECTRON] + k * facts[PER_ELECTRON2])
+        own = 0.0
+        for i in range(int(facts[N_PEAKS])):
+            own += pixel.peaks[j, SHARE, i] * pixel.peaks[j, WIDTH, i] ** 2
+        left += facts[N_FRAMES] * (analog2 - a * a * spread - facts[EXTRA_DN2]) / own
+        frames += facts[N_FRAMES]
+    if not warm:
+        analog2 = max(left / frames, _LEAST_SHARE * analog2)
+    theta[n + LOG_VARIANCE] = math.log(analog2)
+    theta[n + SATELLITE] = 0.0
+
+
+@kernel
+def _better(
+    pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, heights: tuple[float, float]
+) -> tuple[float, float, int]:
+    """Climb from ``trial`` and its neighbours; put it in the place of ``best`` if it is likelier.
+
+    Args:
+        pixel: its samples.
+        tools: of the search.
+        trial: a start; overwritten.
+        best: best maximum so far; its step is 0 where there is none.
+        heights: its log-likelihood and that of its runner-up.
+
+    Returns:
+        Both after that, evaluations.
+    """
+    n = pixel.facts.shape[0]
+    best_loglik, runner_up = heights
+    outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
+    if best[n + STEP] > 0.0 and same_place(best, trial, tools.limits.cells):
+        if outcome == CONVERGED and loglik > best_loglik:
+            copy(trial, best)
+            best_loglik = loglik
+        return best_loglik, runner_up, used
+    if outcome != CONVERGED or loglik <= best_loglik:
+        return best_loglik, max(runner_up, loglik), used
+    runner_up = max(runner_up, best_loglik)
+    copy(trial, best)
+    best_loglik, beside, count = climb_neighbours(pixel, tools, best, loglik)
+    return best_loglik, max(runner_up, beside), used + count
+
+
+@kernel(inline=True)
+def _inside_limits(pixel: Pixel, weights: FloatArray) -> Histogram:
+    """Return the histogram of a single sample without the codes that hold what lies beyond the limits."""
+    facts = pixel.facts[0]
+    n_bins, first = int(facts[N_BINS]), facts[FIRST]
+    n = mean = square = 0.0
+    for i in range(n_bins):
+        beyond = i <= facts[BOTTOM] or i + 1 >= facts[TOP]
+        weights[i] = 0.0 if beyond else pixel.bins[0, WEIGHT, i]
+        n += weights[i]
+        mean += weights[i] * (first + i)
+    mean /= max(n, 1.0)
+    for i in range(n_bins):
+        square += weights[i] * (first + i - mean) ** 2
+    return Histogram(weights, pixel.bins[0, CUMULATIVE], n_bins, first, n, mean, square / max(n, 1.0))
+
+
+@kernel(inline=True)
+def _scan_from_limit(pixel: Pixel, tools: Tools, a: float, height: float, theta: FloatArray) -> float:
+    """Fill ``theta`` with the likeliest exposure and bias for a step if it beats a height; return the larger.
+
+    Mean and variance of a cut histogram say little. Its peaks are where they were: the step comes from their
+    comb. What is left is scanned around the median.
+    """
+    trial, place = tools.scratch.small[OTHER], 0
+    histogram_n = pixel.facts[0, N_FRAMES]
+    while pixel.bins[0, CUMULATIVE, place + 1] < 0.5 * histogram_n:
+        place += 1
+    median = pixel.facts[0, FIRST] + place
+    trial[1 + STEP] = a
+    trial[1 + LOG_VARIANCE] = 2.0 * math.log(_LIMIT_NOISE_E * a)
+    trial[1 + SATELLITE] = trial[0] = 0.0
+    if not sensible(trial, pixel.longest_step, np.bool_(True)):
+        return height
+    for exposure in _LIMIT_EXPOSURES:
+        trial[0] = math.log(exposure)
+        for around in range(-_AROUND, _AROUND + 1):
+            trial[1 + BIAS] = median - a * (exposure + around / _STEPS)
+            fill_core(pixel, trial, tools.scratch)
+            loglik = 0.0
+            for i in range(int(pixel.facts[0, N_BINS])):
+                if pixel.bins[0, WEIGHT, i] > 0.0:
+                    mass = max(tools.scratch.cells[0, MASS, i], _LEAST_MASS)
+                    loglik += pixel.bins[0, WEIGHT, i] * math.log(mass)
+            if loglik > height:
+                height = loglik
+                copy(trial, theta)
+    return height
+
+
+@kernel(inline=True)
+def _limit_start(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
+    """Fill ``theta`` with a start of a single sample with codes at a limit; False where there is none."""
+    rows, own = tools.scratch.rows, np.empty(4)
+    histogram = _inside_limits(pixel, tools.scratch.cells[0, RATIO])
+    if pixel.facts.shape[0] > 1 or histogram.n == pixel.facts[0, N_FRAMES] or not histogram.variance > 0.0:
+        return False
+    steps = np.zeros(3)
+    for which in range(3):
+        if which == 0:
+            found, _ = start_regression(histogram, tools.basis, rows, own)
+        elif which == 1:
+            found = start_peak(histogram, rows, own)
+        else:
+            found = start_cumulants(histogram, own)
+        steps[which] = own[1] if found else 0.0
+    height = -math.inf
+    for a in steps:
+        if a > 0.0:
+            height = _scan_from_limit(pixel, tools, a, height, theta)
+    return height > -math.inf
+
+
+@kernel(inline=True)
+def _climb_few(
+    pixel: Pixel, tools: Tools, best: FloatArray, heights: tuple[float, float]
+) -> tuple[float, float, int]:
+    """Climb from starts ranked by the cells, where a DN is no small part of an electron; see `_better`."""
+    scratch = tools.scratch
+    trial, heights_of = scratch.small[HERE], scratch.small[HEIGHTS]
+    for i in range(N_KEPT):
+        heights_of[i] = -math.inf
+    if pixel.facts.shape[0] == 1:
+        used = add_scan_starts(pixel, tools.evaluate, scratch)
+    else:
+        _, used = fill_starts(np.int64(1), pixel, tools.basis, tools.evaluate, best, scratch)
+        used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
+    for i in range(N_KEPT):
+        if heights_of[i] > -math.inf:
+            copy(scratch.small[KEPT_STARTS + i], trial)
+            first, second, count = _better(pixel, tools, trial, best, heights)
+            heights = first, second
+            used += count
+    return heights[0], heights[1], used
+
+
+def search_cells(
+    pixel: Pixel,
+    tools: Tools,
+    law: Law,
+    index: int,
+    amplitudes: FloatArray,
+    near: FloatArray,
+    gap: float,
+    best: FloatArray,
+    out: FloatArray,
+) -> tuple[int, int, int]:
+    """Find the most likely parameters of one pixel with its cells integrated, under any law.
+
+    From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
+    exclude them, or where its law was too different to do so. Pixels that the limits of the codes led
+    astray, and those of few DN per electron, are also started anew. Where the law has free satellites, each
+    amplitude is tried.
+
+    Args:
+        pixel: its samples and its law.
+        tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
+        law: of all pixels.
+        index: the pixel's place in it.
+        amplitudes: of free satellites, e-.
+        near: theta of the fit to start from, v with the rounding; its step is 0 where there is none.
+        gap: nats of that fit above its runner-up.
+        best: out, theta at the maximum; its step is 0 where there is none.
+        out: out, a row of results.
+
+    Returns:
+        Status word, evaluations, degrees of freedom of the goodness of fit.
+    """
+    n, limits, trial = pixel.facts.shape[0], tools.limits, tools.scratch.small[HERE]
+    place, used, freedom, score, known = n + STEP, 0, 0, math.inf, near[n + STEP] > 0.0
+    if not known:
+        gap = math.inf
+    loglik, runner_up = -math.inf, -math.inf
+    null = loglik_without_gain(pixel)
+    best[place] = 0.0
+    tools.scratch.flags[FIXED, n + SATELLITE] = True
+    out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
+    if known:
+        _from_density(pixel, limits.warm, near, trial)
+        outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
+        if outcome == CONVERGED:
+            copy(trial, best)
+        else:
+            loglik = -math.inf
+    if best[place] > 0.0:
+        if gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
+            loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
+            used += count
+            if runner_up > -math.inf and not limits.scan:
+                gap = math.inf  # that of another law
+        _, freedom, score = examine(pixel, tools, best, out)
+        used += 1
+    before = loglik
+    if not limits.warm and (not best[place] > 0.0 or score > _POOR) and _limit_start(pixel, tools, trial):
+        loglik, runner_up, count = _better(pixel, tools, trial, best, (loglik, runner_up))
+        used += count
+    # several samples, some of them cut, may have led the density astray
+    astray = n > 1 and score > SUSPICIOUS
+    if limits.scan and (astray or not best[place] > _FEW_STEP):
+        loglik, runner_up, count = _climb_few(pixel, tools, best, (loglik, runner_up))
+        used += count
+    if not best[place] > 0.0:
+        return FIT_NOT_CONVERGED, used, 0
+    if loglik > before:
+        _, freedom, score = examine(pixel, tools, best, out)
+        used += 1
+    bias_gap = min(gap, loglik - runner_up)
+    gap = min(bias_gap, loglik - null)
+    if amplitudes.size > 0:
+        noise = math.exp(0.5 * best[n + LOG_VARIANCE]) / best[place]
+        poor = normal_score(out[CHI2], freedom) > _SUSPICIOUS or noise > _UNRESOLVED
+        amplitude, count = search_satellites(
+            best, loglik, pixel, law, index, amplitudes, gap < CLEAR_GAP, poor, tools
+        )
+        loglik, freedom, _ = examine(pixel, tools, best, out)
+        used += count + 1
+        freedom = max(freedom - 2, 0) if amplitude > 0.0 else freedom
+        out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + SATELLITE]
+    out[LOG_LIKELIHOOD], out[GAP] = loglik, gap
+    # the density has told whether there is a gain: it knows no other law than one Gaussian does
+    above_null = math.inf if known else loglik - null
+    return judge(pixel, limits, best, above_null, bias_gap), used, freedom

@@ -1,0 +1,397 @@
+"""From a start to the nearest maximum of the likelihood: damped Newton steps, EM where that does not help.
+
+A share of the damping matrix is added to the observed information, more of it where that is not positive
+definite and after a step that disappoints (Levenberg and Marquardt). With the density that matrix is the
+complete-data information: the step turns from Newton's into a shortened EM step, and at last into one,
+eqs. (update_eqns) of Hendrickson et al. 2023 from the sums of all samples (multi-sample PCH-EM, Hendrickson
+and Haefner 2024). With the cells it is the sum of the squared scores. The likelihood never falls.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.errors.algebra_numba import solve_arrow
+from pchem_pipeline.model.law.pixel_numba import (
+    AHEAD,
+    AT,
+    BIAS,
+    DAMPING,
+    FIXED,
+    HELD,
+    INFORMATION,
+    LOG_VARIANCE,
+    N_BLOCK,
+    N_FRAMES,
+    SATELLITE,
+    SCORE,
+    STEP,
+    STEPS,
+    SUM_E,
+    SUM_EE,
+    SUM_K,
+    SUM_KE,
+    SUM_KK,
+    SUMS,
+    TRIAL,
+    Pixel,
+    Scratch,
+    copy,
+    copy_evaluation,
+)
+
+FloatArray = NDArray[np.float64]
+
+# outcomes
+CONVERGED = 0
+NOT_CONVERGED = 1
+DEGENERATE = 2  # ran towards one Gaussian: g to infinity, or an empty second peak
+FAR_BELOW = 3  # given up: too far below the likelihood to beat
+
+
+MIN_LOG_VARIANCE = math.log(QUANTISATION_VARIANCE)
+MIN_ELECTRON_NOISE = 0.03  # of the density: below it the polynomials of the E-step overflow
+MAX_ELECTRON_NOISE = 3.0  # above it there is one Gaussian to all intents
+MIN_STEP = 1.2  # DN per electron, of the density: a comb with a tooth at each DN would fit any whole numbers
+LEAST_STEP, LEAST_NOISE_DN, LEAST_NOISE_E = 0.6, 0.05, 0.02  # of the cells
+MAX_LOG_EXPOSURE = math.log(1e5)
+MOST_SATELLITE = 0.95
+_LEAST_SHARE = 1e-5  # of the damping matrix in a damped step
+_REFUSED, _REFUSED_CELLS = 3e-5, 1e-2  # after a step that was refused
+_INDEFINITE_CELLS = (
+    1.0  # where the information is not positive definite: most of the step is the damping matrix's
+)
+_LARGEST_SHARE = 3.0  # beyond it an EM step is taken, where there is one
+_MOST_SHARE = 1e9
+_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
+
+
+class Limits(NamedTuple):
+    """Bounds and limits of a climb and of the search, see :mod:`pchem_pipeline.model.fit.settings`.
+
+    Attributes:
+        bound: smallest log H.
+        tolerance: rise of the log-likelihood below which a climb ends, nats.
+        most: evaluations allowed in a climb.
+        warm_up: EM steps before the first Newton step, from a start.
+        only_em: take nothing but EM steps from a start.
+        cells: integrate the cells; else take the density.
+        gap: nats below which a bias is ambiguous and a gain not identified.
+        noise: e-, above which one sample does not inform.
+        floor: expected frames per DN of the tail guard; 0: none.
+        most_outliers: largest share of the frames that it leaves out.
+        satellite_rise: nats that free satellites must bring.
+        reshapes: the law changes more than the width of peaks: look at neighbours.
+        warm: a start is of nearly the same law, not of the density.
+        scan: look for other starts at few DN per electron.
+        sandwich: the covariance is to hold even where the model does not.
+    """
+
+    bound: float
+    tolerance: float
+    most: int
+    warm_up: int
+    only_em: bool
+    cells: bool
+    gap: float
+    noise: float
+    floor: float
+    most_outliers: float
+    satellite_rise: float
+    reshapes: bool
+    warm: bool
+    scan: bool
+    sandwich: bool
+
+
+class Goal(NamedTuple):
+    """What a climb is for.
+
+    Attributes:
+        first: it comes from a start, not from a neighbour: it may warm up by EM steps.
+        to_beat: give up once twice the expected rise would leave the log-likelihood below.
+        known: log-likelihood of a maximum known already: the climb ends where it heads for that one; infinite
+            without one.
+        tied: 1/g moves sigma with it, so that ``sigma g`` stays: the profile of the read noise in e-.
+    """
+
+    first: bool | np.bool_
+    to_beat: float
+    known: float
+    tied: bool | np.bool_
+
+
+@kernel
+def min_log_variance(a: float, cells: bool) -> float:
+    """Return the lower bound of v for a step a: rounding, or little, and a floor in e-."""
+    if cells:
+        return 2.0 * math.log(max(LEAST_NOISE_DN, LEAST_NOISE_E * a))
+    return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
+
+
+@kernel
+def keep_inside(theta: FloatArray, limits: Limits) -> None:
+    """Move ``theta`` to the nearest allowed values."""
+    n = theta.size - N_BLOCK + 1
+    for j in range(n):
+        theta[j] = max(limits.bound, theta[j])
+    theta[n + LOG_VARIANCE] = max(theta[n + LOG_VARIANCE], min_log_variance(theta[n + STEP], limits.cells))
+    theta[n + SATELLITE] = min(max(theta[n + SATELLITE], 0.0), MOST_SATELLITE)
+
+
+@kernel
+def brightest(theta: FloatArray) -> float:
+    """Return the largest log H."""
+    most: float = theta[0]
+    for j in range(1, theta.size - N_BLOCK + 1):
+        most = max(most, theta[j])
+    return most
+
+
+@kernel
+def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
+    """Tell whether the parameters are in the range in which they can be told from those of Gaussians."""
+    n = theta.size - N_BLOCK + 1
+    a = theta[n + STEP]
+    noise = math.exp(0.5 * theta[n + LOG_VARIANCE]) / a
+    least = LEAST_STEP if cells else MIN_STEP
+    inside = noise < MAX_ELECTRON_NOISE and least < a < longest_step
+    return bool(inside and brightest(theta) < MAX_LOG_EXPOSURE)
+
+
+@kernel
+def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
+    """Tell whether two points belong to one maximum.
+
+    The bias is the same within 0.3 e-, and so is the mean of the brightest sample; with the density of one
+    sample the step within 10 %.
+    """
+    n = left.size - N_BLOCK + 1
+    a, most = left[n + STEP], _BRIGHT
+    if n > 1 or cells:
+        most = max(math.exp(brightest(left)), _BRIGHT)
+    near = abs(left[n + BIAS] - right[n + BIAS]) < 0.3 * a
+    return bool(near and abs(a - right[n + STEP]) * most < 0.3 * a)
+
+
+@kernel
+def find_held(
+    theta: FloatArray, at: FloatArray, fixed: NDArray[np.bool_], limits: Limits, held: NDArray[np.bool_]
+) -> None:
+    """Tell which parameters stay: those fixed, and at a bound that the likelihood pushes against."""
+    n = at.shape[0]
+    noise = satellite = 0.0
+    for j in range(n):
+        held[j] = fixed[j] or (theta[j] <= limits.bound + 1e-12 and at[j, SCORE, 0] <= 0.0)
+        noise += at[j, SCORE, 1 + LOG_VARIANCE]
+        satellite += at[j, SCORE, 1 + SATELLITE]
+    held[n + STEP], held[n + BIAS] = fixed[n + STEP], fixed[n + BIAS]
+    floor = min_log_variance(theta[n + STEP], limits.cells)
+    at_floor = theta[n + LOG_VARIANCE] <= floor + 1e-12 and noise <= 0.0
+    held[n + LOG_VARIANCE] = fixed[n + LOG_VARIANCE] or at_floor
+    weight = theta[n + SATELLITE]
+    at_end = (weight <= 0.0 and satellite <= 0.0) or (weight >= MOST_SATELLITE and satellite >= 0.0)
+    held[n + SATELLITE] = fixed[n + SATELLITE] or at_end
+
+
+@kernel(inline=True)
+def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out: FloatArray) -> bool:
+    """One EM update, eq. (update_eqns), from an evaluation of the density; False where it is not defined.
+
+    Written in the residuals e = x - mu - k/g of the present parameters, which is the same update without
+    cancellation; ``1/g``, ``mu`` and ``sigma^2`` from the sums over all samples, ``H_j = A_j``.
+    """
+    samples = at.shape[0]
+    n = sum_k = sum_kk = sum_ke = sum_e = sum_ee = 0.0
+    for j in range(samples):
+        sums = at[j, SUMS]
+        n += pixel.facts[j, N_FRAMES]
+        sum_k, sum_kk, sum_ke = sum_k + sums[SUM_K], sum_kk + sums[SUM_KK], sum_ke + sums[SUM_KE]
+        sum_e, sum_ee = sum_e + sums[SUM_E], sum_ee + sums[SUM_EE]
+    exposure = sum_k / n
+    spread = sum_kk / n - exposure * exposure
+    if not (exposure > 0.0 and spread > 0.0):
+        return False
+    mean_e = sum_e / n
+    # C - xbar A = a (B - A^2) + (sum of k e - A sum of e) / N
+    change = (sum_ke / n - exposure * mean_e) / spread
+    a = theta[samples + STEP] + change
+    residual = sum_ee / n - mean_e * mean_e - change * change * spread
+    if not (a > 0.0 and math.isfinite(a)):
+        return False
+    copy(theta, out)
+    for j in range(samples):
+        own = at[j, SUMS, SUM_K] / pixel.facts[j, N_FRAMES]
+        out[j] = max(limits.bound, math.log(own)) if own > 0.0 else limits.bound
+    out[samples + STEP] = a
+    out[samples + BIAS] = theta[samples + BIAS] + mean_e - change * exposure
+    out[samples + LOG_VARIANCE] = max(min_log_variance(a, limits.cells), math.log(max(residual, 1e-3)))
+    return True
+
+
+@kernel
+def newton_step(
+    at: FloatArray, share: float, least: float, scratch: Scratch, step: FloatArray
+) -> tuple[float, float]:
+    """Fill the damped step of the parameters that are not held.
+
+    Returns:
+        Half the squared Newton decrement, the expected rise of the log-likelihood (NaN without a step), and
+        the share of the damping matrix that it took. Only with a share of 0 does the former say how far the
+        maximum is.
+    """
+    squared = solve_arrow(at, share, scratch, step)
+    while not squared >= 0.0:
+        share = max(least, 3.0 * share)
+        if share > _MOST_SHARE:
+            return math.nan, share
+        squared = solve_arrow(at, share, scratch, step)
+    return 0.5 * squared, share
+
+
+@kernel
+def _take_step(theta: FloatArray, step: FloatArray, goal: Goal, limits: Limits, out: FloatArray) -> float:
+    """Take a Newton step, shortened to stay where the quadratic can be trusted; return the factor."""
+    n = theta.size - N_BLOCK + 1
+    a = theta[n + STEP]
+    longest = max(abs(step[n + STEP]) / (0.1 * a), abs(step[n + BIAS]) / (0.4 * a))
+    longest = max(longest, abs(step[n + LOG_VARIANCE]) / 0.5, abs(step[n + SATELLITE]) / 0.3)
+    for j in range(n):
+        longest = max(longest, abs(step[j]) / 0.5)
+    factor = 1.0 if longest <= 1.0 else 1.0 / longest
+    for i in range(theta.size):
+        out[i] = theta[i] + factor * step[i]
+    if goal.tied:
+        _tie(theta, limits, out)
+    keep_inside(out, limits)
+    return factor
+
+
+@kernel(inline=True)
+def _tie(theta: FloatArray, limits: Limits, out: FloatArray) -> None:
+    """Set v so that the read noise in e-, quantisation included, is that of ``theta``."""
+    n = theta.size - N_BLOCK + 1
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+    ratio = out[n + STEP] / theta[n + STEP]
+    variance = (math.exp(theta[n + LOG_VARIANCE]) + rounding) * ratio * ratio - rounding
+    out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
+
+
+@kernel(inline=True)
+def tie_noise(theta: FloatArray, at: FloatArray, limits: Limits) -> None:
+    """Turn score and information in 1/g at known sigma into those at known ``sigma g``, in place.
+
+    With ``v = log(a^2 w - r)``, r the variance of rounding where v leaves it out: ``dv/da = 2 k / a`` and
+    ``d2v/da2 = (2 k - 4 k^2) / a^2`` with ``k = 1 + r exp(-v)``.
+    """
+    n = theta.size - N_BLOCK + 1
+    a, step, noise = theta[n + STEP], 1 + STEP, 1 + LOG_VARIANCE
+    k = 1.0 + (QUANTISATION_VARIANCE if limits.cells else 0.0) * math.exp(-theta[n + LOG_VARIANCE])
+    slope, bend = 2.0 * k / a, (2.0 * k - 4.0 * k * k) / (a * a)
+    for j in range(n):
+        block = at[j]
+        for first in (INFORMATION, DAMPING):
+            corner, across = block[first + noise, noise], block[first + noise, step]
+            block[first + step, 0] += slope * block[first + noise, 0]
+            block[first + step, step] += slope * (2.0 * across + slope * corner)
+            block[first + noise - 1, step] += slope * block[first + noise, noise - 1]
+            block[first + noise, step] += slope * corner
+            block[first + noise + 1, step] += slope * block[first + noise + 1, noise]
+        block[INFORMATION + step, step] -= bend * block[SCORE, noise]
+        block[SCORE, step] += slope * block[SCORE, noise]
+
+
+def climb(
+    pixel: Pixel,
+    evaluate: Any,
+    limits: Limits,
+    goal: Goal,
+    known: FloatArray,
+    theta: FloatArray,
+    scratch: Scratch,
+) -> tuple[int, float, int]:
+    """Climb to the maximum near ``theta``, which is updated in place.
+
+    Args:
+        pixel: histograms and law.
+        evaluate: the likelihood.
+        limits: bounds and limits.
+        goal: what the climb is for.
+        known: a maximum known already.
+        theta: start; out: the maximum.
+        scratch: room to work in; parameters that stay in its flags `FIXED`: without electrons, without
+            satellites, held for a profile; out: in its evaluation `AT` that at the last theta that was
+            evaluated.
+
+    Returns:
+        Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
+        that is trusted), number of evaluations.
+    """
+    trial, step = scratch.small[TRIAL], scratch.small[STEPS]
+    at, ahead, held = scratch.evaluations[AT], scratch.evaluations[AHEAD], scratch.flags[HELD]
+    keep_inside(theta, limits)
+    if not sensible(theta, pixel.longest_step, limits.cells):
+        return DEGENERATE, -math.inf, 0
+    loglik = evaluate(pixel, theta, False, scratch, at)
+    warm_up = limits.warm_up if goal.first else 0
+    only_em = goal.first and limits.only_em
+    used, damping, fresh = 1, 0.0, limits.most > 0
+    least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
+    while used < limits.most:
+        find_held(theta, at, scratch.flags[FIXED], limits, held)
+        if goal.tied and fresh:
+            tie_noise(theta, at, limits)
+        fresh = False
+        rise, share = newton_step(at, damping, least, scratch, step)
+        if not rise >= 0.0:
+            return NOT_CONVERGED, loglik, used
+        if damping > 0.0 and rise < limits.tolerance:
+            damping = 0.0  # only Newton's own step says that it has arrived
+            continue
+        if share == 0.0 and rise < limits.tolerance:
+            if not only_em:
+                copy(theta, trial)
+                _take_step(trial, step, goal, limits, theta)
+                loglik += rise
+            return CONVERGED, loglik, used
+        if share == 0.0 and loglik + 2.0 * rise + 1.0 < goal.to_beat:
+            return FAR_BELOW, loglik + rise, used
+        if share == 0.0 and loglik + rise > goal.known - 1.0 and same_place(known, theta, limits.cells):
+            return CONVERGED, goal.known, used
+        newton = limits.cells or goal.tied or (not only_em and used > warm_up and share <= _LARGEST_SHARE)
+        factor = 1.0
+        if newton:
+            factor = _take_step(theta, step, goal, limits, trial)
+        elif not em_step(pixel, theta, at, limits, trial):
+            return NOT_CONVERGED, loglik, used
+        risen = -math.inf
+        if sensible(trial, pixel.longest_step, limits.cells):
+            risen = evaluate(pixel, trial, False, scratch, ahead)
+            used += 1
+        elif not limits.cells:
+            return DEGENERATE, loglik, used
+        expected = (2.0 * factor - factor * factor) * rise
+        if newton and not risen >= loglik - 1e-11 * abs(loglik):
+            damping = max(4.0 * share, _REFUSED_CELLS if limits.cells else _REFUSED)
+            if damping > _MOST_SHARE:
+                return NOT_CONVERGED, loglik, used
+            continue
+        if not math.isfinite(risen):
+            return NOT_CONVERGED, loglik, used
+        fresh = True
+        if risen - loglik > 0.75 * expected:
+            damping = 0.1 * share if share > 10.0 * _LEAST_SHARE else 0.0
+        elif risen - loglik < 0.25 * expected and rise > 1e-3:
+            damping = max(4.0 * share, _LEAST_SHARE)
+        else:
+            damping = share
+        copy(trial, theta)
+        copy_evaluation(ahead, at)
+        loglik = risen
+    return NOT_CONVERGED, loglik, used

@@ -1,0 +1,72 @@
+"""The parts of the fit that are compiled by themselves: climb and searches, called by their addresses."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import callback, types_of
+from pchem_pipeline.model.fit import cells_search_numba, climb_numba, search_numba, starts_numba
+from pchem_pipeline.model.fit.climb_numba import Goal, Limits
+from pchem_pipeline.model.law.inputs import pack
+from pchem_pipeline.model.law.likelihood import evaluation_arguments
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = ["cells_search", "climb", "density_search", "regression_basis"]
+
+_VECTOR = np.zeros(1)
+_OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64, numba.types.int64))
+_FOUND = numba.types.UniTuple(numba.types.int64, 3)
+_LIMITS = Limits(0.0, 0.0, 0, 0, False, False, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, False, False)
+_GOAL = Goal(False, 0.0, 0.0, False)
+
+
+def _address(result: Any, arguments: tuple[Any, ...]) -> Any:
+    """Return the type of the address of a function."""
+    return numba.types.FunctionType(result(*types_of(arguments)))
+
+
+@functools.cache
+def _climb_arguments() -> tuple[Any, ...]:
+    pixel, _, _, scratch, _ = evaluation_arguments()
+    evaluate = _address(numba.types.float64, evaluation_arguments())
+    return pixel, evaluate, _LIMITS, _GOAL, _VECTOR, _VECTOR, scratch
+
+
+@functools.cache
+def _search_arguments() -> tuple[Any, ...]:
+    pixel, _, _, scratch, _ = evaluation_arguments()
+    evaluate = _address(numba.types.float64, evaluation_arguments())
+    climb_on = _address(_OUTCOME, _climb_arguments())
+    tools = numba.types.NamedTuple(
+        types_of((_LIMITS, evaluate, climb_on, np.zeros((1, 1)), scratch)), search_numba.Tools
+    )
+    return pixel, tools, pack([MarginalModel()], 1), 0, _VECTOR, _VECTOR, 0.0, _VECTOR, _VECTOR
+
+
+@functools.cache
+def climb() -> Any:
+    """Return the climb to the nearest maximum, :func:`.climb_numba.climb`."""
+    return callback(climb_numba.climb, _OUTCOME, _climb_arguments())
+
+
+@functools.cache
+def density_search() -> Any:
+    """Return the search with the density, :func:`.search_numba.search_density`."""
+    return callback(search_numba.search_density, _FOUND, _search_arguments())
+
+
+@functools.cache
+def cells_search() -> Any:
+    """Return the search with the cells, :func:`.cells_search_numba.search_cells`."""
+    return callback(cells_search_numba.search_cells, _FOUND, _search_arguments())
+
+
+@functools.cache
+def regression_basis() -> NDArray[np.float64]:
+    """Return the basis of the regression on the characteristic function."""
+    return starts_numba.regression_basis()

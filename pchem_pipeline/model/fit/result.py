@@ -1,0 +1,97 @@
+"""What a fit finds of a batch of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FitResult"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Estimates of a batch of ``n`` pixels; failed pixels hold NaN and a reason in ``fit_status``.
+
+    With several exposures of the same pixels, arrays of shape (n, J) have a column for each; with one
+    histogram for each pixel they are of shape (n,).
+
+    Attributes:
+        quanta_exposure: H, e-, shape (n, J) or (n,); 0 for samples without electrons.
+        conversion_gain: g, e-/DN, shape (n,).
+        bias: mu, DN, shape (n,).
+        read_noise_dn: sigma, DN, quantisation included, shape (n,); under a law with effects that of the
+            pixel alone, without the variance and the satellite peaks of the named effects.
+        covariance: of (H_1 ... H_J, g, mu, sigma), the inverse of the observed information (Louis 1982), or
+            the sandwich (White 1982), shape (n, J + 3, J + 3); NaN in the row and column of a sigma at its
+            bound, zeros for samples without electrons.
+        mean: mean of each sample, DN, shape (n, J) or (n,).
+        variance: variance of each sample, DN^2, shape (n, J) or (n,).
+        log_likelihood: ``sum_i c_i log f_X(x_i)``, or of the mass of the codes, of all samples, nats, shape
+            (n,).
+        likelihood_gap: nats between the likelihood kept and the runner-up, shape (n,). Runners-up are the
+            maxima reached from the neighbours (all H -+ 1, mu +- 1/g; of several samples also another gain
+            that gives the brightest an electron less or more), the other maxima found, and Gaussians of one
+            width, one at the mean of each sample (g to infinity). A gap below 30 is exact: the runner-up was
+            climbed to its maximum. A larger one says that the neighbour was given up when, by the quadratic
+            through it, twice its expected rise would have left it more than 30 below; its height is then
+            taken from that quadratic. Where the fit of one sample is good, 1/g above 5 DN, and the neighbour
+            expected to be more than 80 below (four gap thresholds if that is more), it is not visited: its
+            height is the one expected. Negative only with a reason in ``fit_status``: one Gaussian, or a
+            climb that did not converge, stands higher. A fit that starts from another has the gap of that
+            one unless that was below 30.
+        fit_status: bits of :class:`~pchem_pipeline.model.fit.status.FitStatus`, uint16, shape (n,). Of
+            several samples, ``NOT_INFORMATIVE`` says that the standard error of g is above 10 %.
+        n_iterations: evaluations of the likelihood, all starts and neighbours together, int32, shape (n,).
+        goodness_chi2: Pearson chi-square, adjacent DN merged until 5 counts are expected, shape (n,).
+        goodness_dof: its degrees of freedom, groups - 5 for one sample, shape (n,); 0 if there are none.
+            With few frames more, up to groups - 1: as far as the groups do not determine the four fitted
+            parameters (Chernoff and Lehmann 1954).
+        goodness_p: probability of a larger chi-square, shape (n,); NaN without degrees of freedom.
+        outlier_share: share of the samples that the tail guard left out of the likelihood, shape (n,).
+        lobe_amplitude_e: amplitude of the free satellite peaks found in the pixel, e-, shape (n,); NaN
+            without any.
+        lobe_weight: weight of these peaks, shape (n,); 0 without any.
+        intervals: ends of profile-likelihood intervals of H_1 ... H_J, g, mu, sigma and sigma g, shape
+            (n, J + 4, 2); None unless asked for.
+    """
+
+    quanta_exposure: FloatArray
+    conversion_gain: FloatArray
+    bias: FloatArray
+    read_noise_dn: FloatArray
+    covariance: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    log_likelihood: FloatArray
+    likelihood_gap: FloatArray
+    fit_status: NDArray[np.uint16]
+    n_iterations: NDArray[np.int32]
+    goodness_chi2: FloatArray
+    goodness_dof: FloatArray
+    goodness_p: FloatArray
+    outlier_share: FloatArray
+    lobe_amplitude_e: FloatArray
+    lobe_weight: FloatArray
+    intervals: FloatArray | None = None
+
+    @property
+    def columns(self) -> FloatArray:
+        """(H_1 ... H_J, g, mu, sigma), shape (n, J + 3)."""
+        n = self.bias.size
+        shared = [each.reshape(n, 1) for each in (self.conversion_gain, self.bias, self.read_noise_dn)]
+        return np.concatenate([self.quanta_exposure.reshape(n, -1), *shared], axis=1)
+
+    def with_pixels(self, pixels: NDArray[np.intp], part: FitResult) -> FitResult:
+        """Return a copy with the fit of some pixels in their places."""
+        arrays: dict[str, Any] = {}
+        for each in fields(self):
+            mine, theirs = getattr(self, each.name), getattr(part, each.name)
+            if mine is not None and theirs is not None:
+                arrays[each.name] = mine.copy()
+                arrays[each.name][pixels] = theirs
+        return replace(self, **arrays)

@@ -1,0 +1,384 @@
+"""The search for free satellite peaks: levels of one amplitude, with a weight of its own in each pixel.
+
+Strong satellites lead a fit without them astray: it takes one for the peak of no electron, or the distance of
+the satellites for that of the peaks. Where it describes the histogram badly, other starts are tried that have
+the mean, the variance and the third cumulant of the histogram with the satellites in place: satellites on
+    both
+sides alike, and the read noise, add nothing to the third cumulant ``a^3 H``. The best amplitude is refined.
+All samples of a pixel share amplitude and weight; the other combs are those of a single sample.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, find_held, newton_step, sensible
+from pchem_pipeline.model.fit.search_numba import CLEAR_GAP, Tools, climb_neighbours, climb_on
+from pchem_pipeline.model.law.cells_numba import CORE, Law, cells_of, fill_masses, own_theta, set_peaks
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    BIAS,
+    DARK,
+    FIXED,
+    HELD,
+    HERE,
+    LOG_VARIANCE,
+    MASS,
+    N_BINS,
+    OWN,
+    RATIO,
+    SATELLITE,
+    SLOPES,
+    STEP,
+    STEPS,
+    WEIGHT,
+    Histogram,
+    Pixel,
+    Scratch,
+    copy,
+    histogram_of,
+)
+
+FloatArray = NDArray[np.float64]
+
+_SCREEN = 0.2  # of the rise asked of free satellites, seen from the fit without them
+#: steps of the other starts in units of that of a Poisson law without noise, third cumulant over variance
+_SCALES = (1.04, 1.14, 1.24, 1.35, 1.47, 1.6, 1.75, 1.9, 2.1, 2.3, 2.55, 2.85, 3.3)
+_NOISE_E = 0.29  # read noise there
+_LEAST_WEIGHT, _MOST_WEIGHT = 0.02, 0.6  # of the satellites there
+_LEAST_SKEWNESS = 0.15
+_SHORTFALL = 0.25  # of the electrons, by which their variance may exceed that of the histogram
+_N_ATTEMPTS = 4  # from the fit, one electron more and less, another comb
+_FINER, _N_REFINED = 0.12, 4  # first step of log amplitude, and steps at most
+_LEAST_MASS = 1e-9  # of a sample that must not decide between starts
+_ROW = SLOPES + 1 + SATELLITE  # of the slopes in the weight
+
+
+@kernel
+def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
+    """Fill mass and slopes of the cells of all samples, only as far out as most samples lie."""
+    own = scratch.small[OWN]
+    for j in range(pixel.facts.shape[0]):
+        own_theta(pixel, j, theta, own)
+        fill_masses(own, cells_of(pixel, j), np.int64(CORE), scratch.numbers, scratch.cells[j])
+
+
+@kernel
+def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tuple[float, int]:
+    """Climb with the weight of the satellites free; return log-likelihood, or -inf, and evaluations."""
+    goal = Goal(np.bool_(True), to_beat, math.inf, np.bool_(False))
+    outcome, loglik, used = climb_on(pixel, tools, goal, theta, theta)
+    return (loglik if outcome == CONVERGED else -math.inf), used
+
+
+@kernel
+def _weight(pixel: Pixel, scratch: Scratch) -> tuple[float, float]:
+    """Return the likeliest weight of the free satellites, and the rise of the log-likelihood.
+
+    The masses are linear in the weight, so the log-likelihood is concave: Newton steps, halved inside 0..1.
+    """
+    weight, low, high = 0.02, 0.0, 1.0
+    for _ in range(30):
+        slope = bend = 0.0
+        for j in range(pixel.facts.shape[0]):
+            weights, room = pixel.bins[j, WEIGHT], scratch.cells[j]
+            for i in range(int(pixel.facts[j, N_BINS])):
+                if weights[i] > 0.0 and room[MASS, i] > 0.0:
+                    ratio = room[_ROW, i] / (room[MASS, i] + weight * room[_ROW, i])
+                    slope += weights[i] * ratio
+                    bend += weights[i] * ratio * ratio
+        if slope > 0.0:
+            low = weight
+        else:
+            high = weight
+        following = weight + slope / bend if bend > 0.0 else 0.5 * (low + high)
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        if abs(following - weight) < 1e-4 * weight + 1e-7:
+            break
+        weight = following
+    rise = 0.0
+    for j in range(pixel.facts.shape[0]):
+        weights, room = pixel.bins[j, WEIGHT], scratch.cells[j]
+        for i in range(int(pixel.facts[j, N_BINS])):
+            if weights[i] > 0.0 and room[MASS, i] > 0.0:
+                rise += weights[i] * math.log1p(weight * room[_ROW, i] / room[MASS, i])
+    return weight, rise
+
+
+@kernel(inline=True)
+def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, int]:
+    """Fit the weight of the free satellites too, from the fit without; ``theta`` is updated.
+
+    Returns:
+        The log-likelihood, -inf where nothing speaks for these satellites; evaluations.
+    """
+    scratch = tools.scratch
+    at, held = scratch.evaluations[AT], scratch.flags[HELD]
+    tools.evaluate(pixel, theta, False, scratch, at)
+    weight, rise = _weight(pixel, scratch)
+    find_held(theta, at, scratch.flags[FIXED], tools.limits, held)
+    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
+    least = _SCREEN * tools.limits.satellite_rise
+    if not (rise > least or expected > least):
+        return -math.inf, 1
+    theta[-1] = max(weight, 0.005)
+    loglik, used = _climb(pixel, tools, -math.inf, theta)
+    return loglik, used + 1
+
+
+@kernel(inline=True)
+def _beside(direction: float, pixel: Pixel, scratch: Scratch, theta: FloatArray) -> float:
+    """Move ``theta`` by one electron (H + direction, mu - direction/g); return the log-likelihood there.
+
+    A satellite below the peak of no electron is taken for that peak by a fit without satellites. -inf where
+    H would end.
+    """
+    n = pixel.facts.shape[0]
+    for j in range(n):
+        exposure = math.exp(theta[j]) + direction
+        if pixel.facts[j, DARK] == 0.0:
+            if not exposure > 0.03:
+                return -math.inf
+            theta[j] = math.log(exposure)
+    theta[n + BIAS] -= direction * theta[n + STEP]
+    fill_core(pixel, theta, scratch)
+    weight, _ = _weight(pixel, scratch)
+    theta[n + SATELLITE] = min(max(weight, 0.005), 0.5)
+    loglik = 0.0
+    for j in range(n):
+        weights, room = pixel.bins[j, WEIGHT], scratch.cells[j]
+        for i in range(int(pixel.facts[j, N_BINS])):
+            if weights[i] > 0.0:
+                mass = room[MASS, i] + theta[n + SATELLITE] * room[_ROW, i]
+                loglik += weights[i] * math.log(max(mass, _LEAST_MASS))
+    return loglik
+
+
+@kernel(inline=True)
+def third_cumulant(histogram: Histogram) -> float:
+    """Return the third cumulant, DN^3, but at least that of a small skewness."""
+    third = 0.0
+    for i in range(histogram.n_bins):
+        third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
+    least = _LEAST_SKEWNESS * histogram.variance * math.sqrt(histogram.variance)
+    return max(third / histogram.n, least)
+
+
+@kernel(inline=True)
+def _with_cumulants(
+    a: float,
+    third: float,
+    histogram: Histogram,
+    moments: tuple[float, float, float],
+    theta: FloatArray,
+) -> bool:
+    """Fill ``theta`` of a single sample from the cumulants of its histogram, given the step.
+
+    Args:
+        a: DN per electron.
+        third: third cumulant, DN^3.
+        histogram: of the sample.
+        moments: first three moments of the levels beside the quiet one, e-.
+        theta: out.
+
+    Returns:
+        Whether such satellites can have these cumulants, chance aside.
+    """
+    m1, m2, m3 = moments
+    weight, exposure, spread = 0.1, 0.0, 0.0
+    for _ in range(4 if m1 != 0.0 or m3 != 0.0 else 1):
+        own = weight * (m3 - weight * m1 * (3.0 * m2 - 2.0 * weight * m1 * m1))
+        exposure = third / a**3 - own
+        spread = histogram.variance / (a * a) - exposure - _NOISE_E * _NOISE_E
+        weight = min(max(spread / (m2 - weight * m1 * m1), _LEAST_WEIGHT), _MOST_WEIGHT)
+    if not exposure > 0.03 or spread < -_SHORTFALL * exposure:
+        return False
+    theta[0] = math.log(exposure)
+    theta[1 + STEP] = a
+    theta[1 + BIAS] = histogram.mean - a * (exposure + weight * m1)
+    theta[1 + LOG_VARIANCE] = 2.0 * math.log(_NOISE_E * a)
+    theta[1 + SATELLITE] = weight
+    fine: bool = sensible(theta, math.inf, np.bool_(True))
+    return fine
+
+
+@kernel(inline=True)
+def _height(amplitude: float, theta: FloatArray, pixel: Pixel, law: Law, room: FloatArray) -> float:
+    """Return the log-likelihood with satellites: the masses without, moved by whole and part DN."""
+    n, weight = int(pixel.facts[0, N_BINS]), theta[1 + SATELLITE]
+    mass, moved, weights = room[MASS], room[RATIO], pixel.bins[0, WEIGHT]
+    for i in range(n):
+        moved[i] = (1.0 - weight) * mass[i]
+    for side in range(law.pattern.shape[0]):
+        shift = amplitude * law.pattern[side, 0] * theta[1 + STEP]
+        whole = math.floor(shift)
+        part, share = shift - whole, weight * law.pattern[side, 1]
+        move = int(whole)
+        for i in range(max(move, 0), min(n + move, n)):
+            moved[i] += share * (1.0 - part) * mass[i - move]
+        for i in range(max(move + 1, 0), min(n + move + 1, n)):
+            moved[i] += share * part * mass[i - move - 1]
+    loglik = 0.0
+    for i in range(n):
+        if weights[i] > 0.0:
+            loglik += weights[i] * math.log(max(moved[i], _LEAST_MASS))
+    return loglik
+
+
+@kernel(inline=True)
+def _scan(
+    pixel: Pixel, law: Law, amplitudes: FloatArray, scratch: Scratch, trial: FloatArray, starts: FloatArray
+) -> None:
+    """Fill the likeliest of a row of starts of the histogram's mean, variance and third cumulant.
+
+    Args:
+        pixel: of one sample, without free satellites.
+        law: of all pixels.
+        amplitudes: of the satellites, e-.
+        scratch: room to work in.
+        trial: room for parameters.
+        starts: out, theta for each amplitude; NaN where there is none.
+
+    """
+    histogram = histogram_of(pixel, np.int64(0))
+    heights = np.full(amplitudes.size, -math.inf)
+    third = third_cumulant(histogram)
+    starts[:] = math.nan
+    for scale in _SCALES:
+        exposure = math.nan
+        for place in range(amplitudes.size):
+            amplitude = amplitudes[place]
+            m1 = m2 = m3 = 0.0
+            for side in range(law.pattern.shape[0]):
+                shift = law.pattern[side, 0] * amplitude
+                m1 += law.pattern[side, 1] * shift
+                m2 += law.pattern[side, 1] * shift * shift
+                m3 += law.pattern[side, 1] * shift * shift * shift
+            if abs(m1) < 1e-9 * amplitude:
+                m1 = m3 = 0.0
+            a = scale * third / histogram.variance
+            if not _with_cumulants(a, third, histogram, (m1, m2, m3), trial):
+                continue
+            if trial[0] != exposure:
+                exposure = trial[0]
+                fill_core(pixel, trial, scratch)
+            loglik = _height(amplitude, trial, pixel, law, scratch.cells[0])
+            if loglik > heights[place]:
+                heights[place] = loglik
+                copy(trial, starts[place])
+
+
+@kernel(inline=True)
+def _refine(
+    amplitude: float, theta: FloatArray, highest: float, pixel: Pixel, law: Law, index: int, tools: Tools
+) -> tuple[float, float, int]:
+    """Climb in the amplitude too; ``theta`` is updated.
+
+    Returns:
+        Amplitude, e-, log-likelihood there, evaluations.
+    """
+    trial = tools.scratch.small[HERE]
+    heights = np.empty(2)
+    used, step, target = 0, _FINER, 0.0
+    for attempt in range(_N_REFINED):
+        start = amplitude
+        for side in range(3):
+            if side == 2:
+                # the vertex of the parabola through the three, where both sides are lower
+                bend = heights[0] + heights[1] - 2.0 * highest
+                if amplitude != start or not -math.inf < bend < 0.0:
+                    break
+                target = 0.5 * step * (heights[0] - heights[1]) / bend
+            else:
+                target = (2.0 * side - 1.0) * step
+            tried = start * math.exp(target)
+            set_peaks(law, index, tried, pixel)
+            copy(theta, trial)
+            found, count = _climb(pixel, tools, -math.inf, trial)
+            used += count
+            if side < 2:
+                heights[side] = found
+            if found > highest:
+                amplitude, highest = tried, found
+                copy(trial, theta)
+        if amplitude == start or target not in (-step, step):
+            step *= 0.3
+        if attempt > 0 and step < 0.02:
+            break
+    return amplitude, highest, used
+
+
+@kernel(inline=True)
+def search_satellites(
+    theta: FloatArray,
+    loglik: float,
+    pixel: Pixel,
+    law: Law,
+    index: int,
+    amplitudes: FloatArray,
+    unsure: bool,
+    thorough: bool,
+    tools: Tools,
+) -> tuple[float, int]:
+    """Try free satellites of each amplitude; keep the best in ``theta`` where the likelihood rises by enough.
+
+    Args:
+        theta: the fit without satellites; out: that with them.
+        loglik: its log-likelihood.
+        pixel: its samples; the levels of the noise are overwritten.
+        law: of all pixels.
+        index: the pixel's place in it.
+        amplitudes: e-.
+        unsure: a start with one electron more is tried too; one with one less always is.
+        thorough: both are however unlikely, and starts on other combs.
+        tools: of the search.
+
+    Returns:
+        The amplitude kept, e-, 0 without one; evaluations.
+    """
+    scratch, weight, best = tools.scratch, theta.size - 1, theta.copy()
+    trial, fixed = scratch.small[HERE], scratch.flags[FIXED]
+    kept, highest, used = 0.0, loglik + tools.limits.satellite_rise, 0
+    starts = np.full((amplitudes.size, theta.size), math.nan)
+    if thorough and pixel.facts.shape[0] == 1:
+        _scan(pixel, law, amplitudes, scratch, trial, starts)
+    fixed[weight] = False
+    for which in range(amplitudes.size):
+        amplitude = amplitudes[which]
+        set_peaks(law, index, amplitude, pixel)
+        for attempt in range(_N_ATTEMPTS if thorough else _N_ATTEMPTS - 1):
+            copy(theta, trial)
+            if attempt == 0:
+                found, count = _from_fit(pixel, tools, trial)
+            else:
+                if attempt < _N_ATTEMPTS - 1:
+                    # a satellite above the others is no one's peak of no electron: only an unsure fit may be
+                    # below
+                    likely = loglik - CLEAR_GAP if not thorough else -math.inf
+                    usable = attempt > 1 or unsure or thorough
+                    usable = usable and _beside(3.0 - 2.0 * attempt, pixel, scratch, trial) > likely
+                else:
+                    usable = math.isfinite(starts[which, 0])
+                    copy(starts[which], trial)
+                if not usable:
+                    continue
+                found, count = _climb(pixel, tools, highest, trial)
+            used += count
+            if thorough and found > highest - CLEAR_GAP:
+                found, _, count = climb_neighbours(pixel, tools, trial, found)
+                used += count
+            if found > highest:
+                kept, highest = amplitude, found
+                copy(trial, best)
+    if kept > 0.0:
+        copy(best, theta)
+        kept, highest, count = _refine(kept, theta, highest, pixel, law, index, tools)
+        used += count
+    fixed[weight] = kept == 0.0
+    set_peaks(law, index, kept, pixel)
+    return kept, used

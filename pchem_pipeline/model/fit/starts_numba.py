@@ -1,0 +1,702 @@
+"""Starting points: from the empirical characteristic function (ECF), from cumulants, from several exposures.
+
+``phi(f) = mean exp(2 pi i f y)`` of a PCD has ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f a)`` and
+the phase ``2 pi f m + H sin 2 pi f a`` (f in cycles/DN, ``a = 1/g``). Frequencies and steps are counted in
+units of 1/sd and sd of the pixel: the side lobes then always have a width near 0.16.
+
+Between exposures the photon-transfer relation ``var_j = sigma^2 + (mean_j - mu) / g`` gives 1/g as a slope
+whatever the read noise; without a sample of no electrons the read noise that splits the intercept is
+scanned. Where the peaks are resolved, the starts of the single samples are better.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.fit.climb_numba import (
+    MIN_STEP,
+    min_log_variance,
+    same_place,
+    sensible,
+)
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    BIAS,
+    CENTRE,
+    DARK,
+    HEIGHTS,
+    HERE,
+    KEPT_STARTS,
+    LOG_VARIANCE,
+    MEAN,
+    N_FRAMES,
+    N_KEPT,
+    OCCUPIED,
+    SATELLITE,
+    STEP,
+    VARIANCE,
+    Histogram,
+    Pixel,
+    Scratch,
+    copy,
+    histogram_of,
+    load,
+    make_pixel,
+    make_scratch,
+)
+from pchem_pipeline.model.law.simd_numba import LANES, counting, fused, load_lanes, store_lanes
+
+FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a lobe
+N_FREQUENCIES = 48  # up to 4.8/sd, the lobe of H = 22
+N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the lobe of H = 200
+LOBE_STEP = 0.05
+LOBE_FIRST = 0.25  # lowest lobe frequency tried, 1/sd: the step a is at most 4 sd
+N_LOBES = 90
+_SIDE_BY_SIDE = 3  # vectors of frequencies at a time
+_HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
+
+_TWO_PI = 2.0 * math.pi
+
+#  Attempts at one sample: its first start, and those of a suspicious pixel: side lobe, cumulants, scan, and
+# the
+#: best with its gain scaled; at several samples: the likeliest of some, and of all.
+_GAIN_SCALES = (2.0, 0.5, 1.5, 0.67, 1.22, 0.82)
+_N_ATTEMPTS_SINGLE, _N_ATTEMPTS_JOINT = 4 + len(_GAIN_SCALES), 2
+_N_GAINS = 25  # of the scan over the gain, from a fifth of the sd to 2.5 sd
+_GAIN_NOISE = 0.1225  # e-^2
+
+_LINE_NOISES = (0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 0.95, 1.15)  # e-
+_LINE_SCALES = (1.0, 0.85, 1.18, 0.7, 1.4)  # of the slope of the line
+_N_CLOSED = 3  # starts of each sample
+_SMALLEST_EXPOSURE = 0.02
+_SMALL_STEP = 2.0  # DN per electron, below which starts are ranked by the cells
+_N_STEPS, _FIRST_STEP, _STEP_RATIO = (
+    50,
+    0.62,
+    1.035,
+)  # of a scan at few DN per electron, finer than a maximum in g
+_STEP_NOISES = (0.2, 0.36)  # e-
+
+
+def regression_basis() -> NDArray[np.float64]:
+    """Return ``1 - cos(2 pi f a)`` for every frequency f (rows) and every trial step a (columns)."""
+    frequency = FREQUENCY_STEP * np.arange(1, N_FREQUENCIES + 1)
+    lobe = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
+    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / lobe[None, :]))
+
+
+@kernel
+def ecf_power(
+    histogram: Histogram,
+    step: float,
+    n_frequencies: int,
+    work: NDArray[np.float64],
+) -> None:
+    """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``.
+
+    By Clenshaw's recurrence ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all
+    frequencies side by side; ``|sum c_i exp(i angle)|^2 = b_0^2 + b_1^2 - 2 cos(angle) b_0 b_1``.
+    """
+    weights, n_bins = histogram.weights, histogram.n_bins
+    base = 2.0 * math.cos(_TWO_PI * step)
+    before, present = 2.0, base
+    for m in range(n_frequencies + _SIDE_BY_SIDE * LANES):
+        work[1, m] = present
+        before, present = present, base * present - before
+    share = 1.0 / (histogram.n * histogram.n)
+    for m in range(0, n_frequencies, _SIDE_BY_SIDE * LANES):
+        turn1, turn2 = load_lanes(work, 1, m), load_lanes(work, 1, m + LANES)
+        turn3 = load_lanes(work, 1, m + 2 * LANES)
+        odd1 = odd2 = odd3 = counting() * 0.0
+        even1 = even2 = even3 = odd1 + (weights[n_bins - 1] if n_bins % 2 == 1 else 0.0)
+        for i in range(n_bins // 2 * 2 - 1, 0, -2):
+            right, left = weights[i], weights[i - 1]
+            odd1 = fused(turn1, even1, right - odd1)
+            odd2 = fused(turn2, even2, right - odd2)
+            odd3 = fused(turn3, even3, right - odd3)
+            even1 = fused(turn1, odd1, left - even1)
+            even2 = fused(turn2, odd2, left - even2)
+            even3 = fused(turn3, odd3, left - even3)
+        store_lanes(work, 0, m, share * (even1 * even1 + odd1 * odd1 - turn1 * even1 * odd1))
+        store_lanes(work, 0, m + LANES, share * (even2 * even2 + odd2 * odd2 - turn2 * even2 * odd2))
+        store_lanes(work, 0, m + 2 * LANES, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
+
+
+@kernel
+def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
+    """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
+    weights = histogram.weights
+    angle = _TWO_PI * frequency
+    co, si = math.cos(angle * histogram.first), math.sin(angle * histogram.first)
+    turn_c, turn_s = math.cos(angle), math.sin(angle)
+    real = imag = 0.0
+    for i in range(histogram.n_bins):
+        real += weights[i] * co
+        imag += weights[i] * si
+        co, si = co * turn_c - si * turn_s, co * turn_s + si * turn_c
+    return math.hypot(real, imag), math.atan2(imag, real)
+
+
+@kernel(inline=True)
+def _regress(
+    basis: NDArray[np.float64],
+    power: NDArray[np.float64],
+    floor: float,
+    sums: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Return (lobe frequency in 1/sd, H) of the best weighted regression over all trial steps.
+
+    The sums of all trial steps grow side by side, frequency by frequency: that needs no other order of the
+    additions to run in vector registers.
+
+    Args:
+        basis: from `regression_basis`.
+        power: squared modulus of the ECF; its frequencies are those of the basis.
+        floor: power below which a frequency does not count.
+        sums: scratch, three rows of at least `N_LOBES`.
+    """
+    bb, bq, by = sums[0, :N_LOBES], sums[1, :N_LOBES], sums[2, :N_LOBES]
+    for p in range(N_LOBES):
+        bb[p] = 0.0
+        bq[p] = 0.0
+        by[p] = 0.0
+    qq = qy = 0.0
+    for m in range(power.size):
+        weight = power[m]
+        if not weight > floor:
+            continue
+        f = FREQUENCY_STEP * (m + 1)
+        quadratic = 0.5 * _TWO_PI * _TWO_PI * f * f
+        target = -0.5 * math.log(min(weight, 1.0))
+        weighted_q, weighted_y = weight * quadratic, weight * target
+        qq += weighted_q * quadratic
+        qy += weighted_q * target
+        row = basis[m]
+        for p in range(N_LOBES):
+            b = row[p]
+            bb[p] += weight * b * b
+            bq[p] += weighted_q * b
+            by[p] += weighted_y * b
+    best, place = 0.0, -1
+    best_exposure = 1.0
+    before = after = last = 0.0
+    for p in range(N_LOBES):
+        determinant = qq * bb[p] - bq[p] * bq[p]
+        gain = 0.0
+        exposure = 0.0
+        if determinant > 1e-9 * qq * bb[p]:
+            exposure = (qq * by[p] - bq[p] * qy) / determinant
+            noise = (bb[p] * qy - bq[p] * by[p]) / determinant
+            if exposure > 0.0 and noise > 0.0:
+                gain = exposure * by[p] + noise * qy
+        if place == p - 1:
+            after = gain
+        if gain > best:
+            best, place, before, best_exposure = gain, p, last, exposure
+        last = gain
+    if place < 0:
+        return 0.0, 0.0
+    lobe = LOBE_FIRST + LOBE_STEP * place
+    bend = before - 2.0 * best + after
+    if before > 0.0 and after > 0.0 and bend < 0.0:  # vertex of the parabola through the three best
+        lobe += LOBE_STEP * 0.5 * (before - after) / bend
+    return lobe, best_exposure
+
+
+@kernel
+def assemble(
+    histogram: Histogram,
+    a: float,
+    exposure: float,
+    theta: NDArray[np.float64],
+) -> tuple[bool, bool]:
+    """Turn a step and a rough H into a start: noise from the lobe's height, bias from its phase.
+
+    Returns:
+        Whether there is a start, and whether the lobe stands clear of the noise.
+    """
+    if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
+        return False, False
+    _, _, _, _, n, mean, variance = histogram
+    modulus, phase = ecf_at(histogram, 1.0 / a)
+    modulus /= n
+    s2 = max(variance - exposure * a * a, 0.16 * a * a)
+    bias = mean - exposure * a
+    clear = modulus > 3.0 / math.sqrt(n)
+    if clear:
+        s2 = -math.log(min(modulus, 0.999)) * a * a / (2.0 * math.pi * math.pi)
+        from_variance = (variance - s2) / (a * a)
+        if from_variance > 0.0:
+            exposure = from_variance
+        anchor = phase * a / _TWO_PI
+        bias = anchor + a * math.floor((mean - exposure * a - anchor) / a + 0.5)
+        if bias > mean - 0.01 * a:
+            bias -= a * math.ceil((bias - mean + 0.01 * a) / a)
+        # a lobe that leans on the centre, H < 1, has a phase of its own: trust it only to a few tenths
+        if exposure < 0.5 and abs(mean - bias - exposure * a) > 0.2 * a:
+            bias = mean - exposure * a
+        exposure = (mean - bias) / a
+    theta[0] = math.log(exposure)
+    theta[1] = a
+    theta[2] = bias
+    theta[3] = math.log(
+        min(max(s2, QUANTISATION_VARIANCE, 0.0025 * a * a), max(variance, QUANTISATION_VARIANCE))
+    )
+    return True, clear
+
+
+@kernel
+def start_regression(
+    histogram: Histogram,
+    basis: NDArray[np.float64],
+    work: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> tuple[bool, bool]:
+    """Start from the regression on log|phi|; ``work`` has seven rows.
+
+    Returns:
+        Whether there is a start, and whether the side lobe at its frequency stands clear of the noise.
+    """
+    n, variance = histogram.n, histogram.variance
+    sd = math.sqrt(variance)
+    n_used = np.int64(min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP)))
+    ecf_power(histogram, FREQUENCY_STEP / sd, n_used, work)
+    lobe, exposure = _regress(basis, work[0, :n_used], 9.0 / n, work[4:7])
+    if lobe <= 0.0:
+        return False, False
+    answer: tuple[bool, bool] = assemble(histogram, sd / lobe, exposure, theta)
+    return answer
+
+
+@kernel
+def start_peak(
+    histogram: Histogram,
+    work: NDArray[np.float64],
+    theta: NDArray[np.float64],
+) -> bool:
+    """Start from the highest side lobe of the ECF; False where none stands out of the noise."""
+    n, variance = histogram.n, histogram.variance
+    sd = math.sqrt(variance)
+    ecf_power(histogram, FREQUENCY_STEP / sd, np.int64(N_FREQUENCIES_WIDE), work)
+    modulus = work[0]
+    for m in range(N_FREQUENCIES_WIDE):
+        modulus[m] = math.sqrt(max(modulus[m], 0.0))
+    best, place = 3.0 / math.sqrt(n), -1
+    highest = min(N_FREQUENCIES_WIDE - 1, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP) - 1)
+    for m in range(1, highest):
+        if modulus[m] > best and modulus[m] >= modulus[m - 1] and modulus[m] >= modulus[m + 1]:
+            best, place = modulus[m], m
+    if place < 0:
+        return False
+    left, right = modulus[place - 1], modulus[place + 1]
+    bend = left - 2.0 * best + right
+    vertex = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
+    electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
+    exposure = max(0.05, variance / (a * a) - electron_noise)
+    found: bool = assemble(histogram, a, exposure, theta)[0]
+    return found
+
+
+@kernel
+def start_cumulants(
+    histogram: Histogram,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Start from the third and fourth cumulants, ``a = k4/k3`` and ``H = k3/a^3``; good below H = 1."""
+    weights, _, n_bins, first, n, mean, variance = histogram
+    third = fourth = 0.0
+    for i in range(n_bins):
+        d = first + i - mean
+        third += weights[i] * d * d * d
+        fourth += weights[i] * d * d * d * d
+    third /= n
+    fourth = fourth / n - 3.0 * variance * variance
+    if third <= 0.0 or fourth <= 0.0:
+        return False
+    a = fourth / third
+    exposure = third / (a * a * a)
+    s2 = variance - exposure * a * a
+    if s2 <= QUANTISATION_VARIANCE:
+        s2 = max(QUANTISATION_VARIANCE, 0.05 * a * a)
+        exposure = max(1e-3, (variance - s2) / (a * a))
+    theta[0] = math.log(max(exposure, 1e-3))
+    theta[1] = a
+    theta[2] = mean - exposure * a
+    theta[3] = math.log(s2)
+    return math.isfinite(theta[1])
+
+
+@kernel(inline=True)
+def n_attempts(n_samples: int) -> int:
+    """Return how many times :func:`fill_starts` has something to say."""
+    return _N_ATTEMPTS_SINGLE if n_samples == 1 else _N_ATTEMPTS_JOINT
+
+
+@kernel
+def _likeliest(
+    pixel: Pixel, evaluate: Any, scratch: Scratch, height: float, theta: NDArray[np.float64]
+) -> float:
+    """Put the trial `HERE` in the place of ``theta`` if it is higher than ``height``; return the larger."""
+    trial = scratch.small[HERE]
+    if not trial[STEP + 1] > MIN_STEP:
+        return height
+    loglik: float = evaluate(pixel, trial, False, scratch, scratch.evaluations[AT])
+    if loglik > height:
+        copy(trial, theta)
+        return loglik
+    return height
+
+
+@kernel(inline=True)
+def _first_start(
+    pixel: Pixel, basis: NDArray[np.float64], evaluate: Any, scratch: Scratch, theta: NDArray[np.float64]
+) -> bool:
+    """Fill ``theta`` with the regression's start, or, if that sees no side lobe, the likeliest of three."""
+    trial = scratch.small[HERE]
+    histogram = histogram_of(pixel, np.int64(0))
+    usable, clear = start_regression(histogram, basis, scratch.rows, theta)
+    if usable and clear:
+        return True
+    best = -math.inf
+    if usable:
+        copy(theta, trial)
+        best = _likeliest(pixel, evaluate, scratch, best, theta)
+    if start_peak(histogram, scratch.rows, trial):
+        best = _likeliest(pixel, evaluate, scratch, best, theta)
+    if start_cumulants(histogram, trial):
+        best = _likeliest(pixel, evaluate, scratch, best, theta)
+    return best > -math.inf
+
+
+@kernel(inline=True)
+def _scan_gains(pixel: Pixel, evaluate: Any, scratch: Scratch, theta: NDArray[np.float64]) -> bool:
+    """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
+    trial = scratch.small[HERE]
+    histogram = histogram_of(pixel, np.int64(0))
+    best = -math.inf
+    for place in range(_N_GAINS):
+        a = math.sqrt(histogram.variance) * 0.2 * 12.5 ** (place / (_N_GAINS - 1.0))
+        exposure = histogram.variance / (a * a) - _GAIN_NOISE
+        if exposure > 0.0 and a > MIN_STEP:
+            assemble(histogram, a, exposure, trial)
+            trial[3] = math.log(max(_GAIN_NOISE * a * a, QUANTISATION_VARIANCE))
+            best = _likeliest(pixel, evaluate, scratch, best, theta)
+    return best > -math.inf
+
+
+@kernel(inline=True)
+def _other_start(
+    which: int,
+    pixel: Pixel,
+    best: NDArray[np.float64],
+    evaluate: Any,
+    scratch: Scratch,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Fill ``theta`` with one of the starts kept for a suspicious pixel; tell whether there is one.
+
+    Args:
+        which: 0 side lobe, 1 cumulants, 2 scan over the gain, further ones the best with 1/g scaled, the
+            mean and the variance of the signal kept.
+        pixel: of one sample.
+        best: best maximum so far; its step is 0 where there is none.
+        evaluate: the density.
+        scratch: room to work in.
+        theta: out, the start.
+    """
+    histogram = histogram_of(pixel, np.int64(0))
+    found: bool
+    if which == 0:
+        found = start_peak(histogram, scratch.rows, theta)
+        return found
+    if which == 1:
+        found = start_cumulants(histogram, theta)
+        return found
+    if which == 2:
+        found = _scan_gains(pixel, evaluate, scratch, theta)
+        return found
+    if not best[1] > 0.0:
+        return False
+    # the read noise in e- is kept, the exposure takes up the rest of the variance
+    a = best[1] * _GAIN_SCALES[which - 3]
+    noise2 = min(math.exp(best[3]) / (best[1] * best[1]), 0.25)
+    exposure = histogram.variance / (a * a) - noise2
+    if exposure < 0.03 or a < MIN_STEP:
+        return False
+    assemble(histogram, a, exposure, theta)
+    theta[3] = math.log(max(noise2 * a * a, QUANTISATION_VARIANCE))
+    return True
+
+
+@kernel
+def fill_theta(
+    pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, theta: NDArray[np.float64]
+) -> bool:
+    """Fill ``theta`` for a step, a bias and a read noise: exposures from the means.
+
+    Args:
+        pixel: its samples.
+        a: 1/g, DN.
+        bias: mu less the centre, DN.
+        noise2: sigma^2, DN^2; negative: what the variances leave.
+        cells: bounds of the cells.
+        theta: out.
+
+    Returns:
+        Whether that makes sense.
+    """
+    if not (a > 0.0 and math.isfinite(a) and math.isfinite(bias)):
+        return False
+    n_samples = pixel.facts.shape[0]
+    n = rest = 0.0
+    brightest = 0.0
+    for j in range(n_samples):
+        facts = pixel.facts[j]
+        exposure = 0.0
+        if facts[DARK] == 0.0:
+            exposure = max((facts[CENTRE] + facts[MEAN] - bias) / a, _SMALLEST_EXPOSURE)
+        brightest = max(brightest, exposure)
+        theta[j] = math.log(max(exposure, 1e-6))
+        weight = facts[N_FRAMES] / (1.0 + exposure)
+        rest += weight * (facts[VARIANCE] - exposure * a * a)
+        n += weight
+    if noise2 < 0.0:
+        noise2 = max(rest / n, 0.02 * a * a)
+    theta[n_samples + STEP] = a
+    theta[n_samples + BIAS] = bias
+    theta[n_samples + LOG_VARIANCE] = max(math.log(max(noise2, 1e-6)), min_log_variance(a, cells))
+    theta[n_samples + SATELLITE] = 0.0
+    return brightest > _SMALLEST_EXPOSURE
+
+
+@kernel(inline=True)
+def variance_line(pixel: Pixel) -> tuple[float, float, float]:
+    """Return the slope of the variances against the means, and the point (mean, variance) that it is through.
+
+    Weighted by the inverse variance of a variance near a normal law. The slope is 0 where the means do not
+    differ.
+    """
+    weight_sum = x_sum = y_sum = 0.0
+    for j in range(pixel.facts.shape[0]):
+        facts = pixel.facts[j]
+        weight = facts[N_FRAMES] / max(facts[VARIANCE] ** 2, 1e-6)
+        weight_sum += weight
+        x_sum += weight * (facts[CENTRE] + facts[MEAN])
+        y_sum += weight * facts[VARIANCE]
+    x0, y0 = x_sum / weight_sum, y_sum / weight_sum
+    xx = xy = 0.0
+    for j in range(pixel.facts.shape[0]):
+        facts = pixel.facts[j]
+        weight = facts[N_FRAMES] / max(facts[VARIANCE] ** 2, 1e-6)
+        x = facts[CENTRE] + facts[MEAN] - x0
+        xx += weight * x * x
+        xy += weight * x * (facts[VARIANCE] - y0)
+    return (xy / xx if xx > 0.0 else 0.0), x0, y0
+
+
+@kernel(inline=True)
+def _line_start(
+    scale: float,
+    noise: float,
+    first: bool,
+    pixel: Pixel,
+    line: tuple[float, float, float],
+    cells: bool,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Fill ``theta`` with a start on the line of variance against mean, at a read noise in e-."""
+    slope, x0, y0 = line
+    a = slope * scale
+    if not a > 0.0:
+        return False
+    noise2 = (noise * a) ** 2
+    bias = x0 - (y0 - noise2) / a
+    for j in range(pixel.facts.shape[0]):
+        if pixel.facts[j, DARK] > 0.0:  # it knows bias and read noise by itself
+            if not first:
+                return False
+            bias = pixel.facts[j, CENTRE] + pixel.facts[j, MEAN]
+            noise2 = pixel.facts[j, VARIANCE]
+    answer: bool = fill_theta(pixel, a, bias, noise2, cells, theta)
+    return answer
+
+
+@kernel(inline=True)
+def _closed_start(
+    which: int, j: int, pixel: Pixel, basis: NDArray[np.float64], scratch: Scratch, theta: NDArray[np.float64]
+) -> tuple[bool, bool]:
+    """Fill ``theta`` with one of the closed-form starts of sample j.
+
+    Returns:
+        Whether there is one, and whether its side lobe stands clear of the noise.
+    """
+    facts = pixel.facts
+    if facts[j, DARK] > 0.0 or facts[j, OCCUPIED] < 3:
+        return False, False
+    own = np.empty(4)
+    histogram = histogram_of(pixel, j)
+    clear = False
+    if which == 0:
+        found, clear = start_regression(histogram, basis, scratch.rows, own)
+    elif which == 1:
+        found = start_peak(histogram, scratch.rows, own)
+    else:
+        found = start_cumulants(histogram, own)
+    if not found:
+        return False, False
+    bias = facts[j, CENTRE] + own[2]
+    noise2 = math.exp(own[3])
+    for i in range(facts.shape[0]):
+        if facts[i, DARK] > 0.0:
+            bias = facts[i, CENTRE] + facts[i, MEAN]
+            noise2 = facts[i, VARIANCE]
+    return fill_theta(pixel, own[1], bias, noise2, np.bool_(False), theta), clear
+
+
+@kernel
+def _keep(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
+    """Put the start `HERE` among the likeliest, which lie apart; return 1 if it was evaluated."""
+    trial, kept, heights = scratch.small[HERE], scratch.small[KEPT_STARTS:HEIGHTS], scratch.small[HEIGHTS]
+    if not sensible(trial, pixel.longest_step, cells):
+        return 0
+    loglik: float = evaluate(pixel, trial, False, scratch, scratch.evaluations[AT])
+    place = -1
+    for i in range(N_KEPT):
+        if heights[i] > -math.inf and same_place(kept[i], trial, cells):
+            if loglik <= heights[i]:
+                return 1
+            place = i
+            break
+    if place < 0:
+        place = 0
+        for i in range(1, N_KEPT):
+            if heights[i] < heights[place]:
+                place = i
+        if loglik <= heights[place]:
+            return 1
+    heights[place] = loglik
+    copy(trial, kept[place])
+    return 1
+
+
+@kernel(inline=True)
+def fill_starts(
+    attempt: int,
+    pixel: Pixel,
+    basis: NDArray[np.float64],
+    evaluate: Any,
+    best: NDArray[np.float64],
+    scratch: Scratch,
+) -> tuple[bool, int]:
+    """Fill the starts of an attempt, and their heights: -inf where there are fewer.
+
+    Args:
+        attempt: 0 ... n_attempts - 1.
+        pixel: its samples.
+        basis: from `regression_basis`.
+        evaluate: the density.
+        best: best maximum so far; its step is 0 where there is none.
+        scratch: room to work in; out: in its ``small`` the starts from `KEPT_STARTS` on, and `HEIGHTS`.
+
+    Returns:
+        Whether a side lobe of one of several samples stands clear of the noise; evaluations.
+    """
+    n_samples = pixel.facts.shape[0]
+    trial, heights = scratch.small[HERE], scratch.small[HEIGHTS]
+    for i in range(N_KEPT):
+        heights[i] = -math.inf
+    if n_samples == 1:
+        start = scratch.small[KEPT_STARTS]
+        start[1 + SATELLITE] = trial[1 + SATELLITE] = 0.0
+        if attempt == 0:
+            found = _first_start(pixel, basis, evaluate, scratch, start)
+        else:
+            found = _other_start(attempt - 1, pixel, best, evaluate, scratch, start)
+        if found:
+            heights[0] = 0.0
+        return False, 0
+    any_clear, used = False, 0
+    for which in range(_N_CLOSED if attempt > 0 else 1):
+        for j in range(n_samples):
+            found, clear = _closed_start(which, j, pixel, basis, scratch, trial)
+            any_clear = any_clear or (found and clear)
+            if found:
+                used += _keep(pixel, evaluate, np.bool_(False), scratch)
+    if attempt > 0 or not any_clear:
+        no = np.bool_(False)
+        used += add_line_starts(pixel, evaluate, no, attempt > 0, scratch)
+    return any_clear, used
+
+
+@kernel
+def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, scratch: Scratch) -> int:
+    """Put starts on the line of variance against mean among the likeliest; return the evaluations."""
+    line, used, trial = variance_line(pixel), 0, scratch.small[HERE]
+    for scale in _LINE_SCALES:
+        if scale != 1.0 and not thorough:
+            break
+        for place in range(len(_LINE_NOISES)):
+            if _line_start(scale, _LINE_NOISES[place], place == 0, pixel, line, cells, trial):
+                used += _keep(pixel, evaluate, cells, scratch)
+    return used
+
+
+@kernel(inline=True)
+def add_scan_starts(pixel: Pixel, evaluate: Any, scratch: Scratch) -> int:
+    """Put starts of a single sample at few DN per electron among the likeliest; return the evaluations.
+
+    Whole numbers hide the side lobes of its characteristic function there. Mean and variance leave a curve
+    in (H, mu) for each step and read noise.
+    """
+    used, trial = 0, scratch.small[HERE]
+    facts = pixel.facts[0]
+    for place in range(_N_STEPS):
+        a = _FIRST_STEP * _STEP_RATIO**place
+        for noise in _STEP_NOISES:
+            exposure = (facts[VARIANCE] - QUANTISATION_VARIANCE) / (a * a) - noise * noise
+            if exposure < 0.03:
+                continue
+            bias = facts[CENTRE] + facts[MEAN] - exposure * a
+            if fill_theta(pixel, a, bias, (noise * a) ** 2, np.bool_(True), trial):
+                used += _keep(pixel, evaluate, np.bool_(True), scratch)
+    return used
+
+
+@kernel
+def start_tile(
+    counts: NDArray[np.generic],
+    origin: NDArray[np.int64],
+    basis: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """Fill ``out`` (n, 3, 4), which comes as NaN, with (H, g, mu, sigma) of the three closed-form starts."""
+    n_most = counts.shape[1]
+    mask, theta = np.zeros(n_most, np.uint8), np.empty(4)
+    scratch, pixel = (
+        make_scratch(1, n_most, False),
+        make_pixel(np.zeros(1, np.bool_), n_most, 0, 0, np.zeros((0, 2))),
+    )
+    for row in range(counts.shape[0]):
+        centre = load(counts[row], mask, pixel.bins[0], pixel.facts[0])
+        if pixel.facts[0, OCCUPIED] < 3:
+            continue
+        histogram = histogram_of(pixel, np.int64(0))
+        for which in range(3):
+            if which == 0:
+                found, _ = start_regression(histogram, basis, scratch.rows, theta)
+            elif which == 1:
+                found = start_peak(histogram, scratch.rows, theta)
+            else:
+                found = start_cumulants(histogram, theta)
+            if found:
+                out[row, which, 0] = math.exp(theta[0])
+                out[row, which, 1] = 1.0 / theta[1]
+                out[row, which, 2] = float(origin[row] + centre) + theta[2]
+                out[row, which, 3] = math.exp(0.5 * theta[3])

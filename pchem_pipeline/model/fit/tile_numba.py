@@ -1,0 +1,255 @@
+"""The loop over the pixels of a tile: load the histograms, search, write parameters and errors."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.errors.algebra_numba import enclose, invert_arrow, to_natural
+from pchem_pipeline.model.errors.information_numba import fill_squared_scores
+from pchem_pipeline.model.fit.climb_numba import Limits, min_log_variance
+from pchem_pipeline.model.fit.search_numba import FIT_NOT_CONVERGED, NO_DATA, TOO_FEW_BINS, Tools
+from pchem_pipeline.model.law.cells_numba import Law, resolve
+from pchem_pipeline.model.law.pixel_numba import (
+    AT_BEST,
+    BIAS,
+    CENTRE,
+    DARK,
+    FIRST,
+    FIXED,
+    LOG_VARIANCE,
+    MEAN,
+    N_BINS,
+    N_FRAMES,
+    N_SHARED,
+    OCCUPIED,
+    SATELLITE,
+    STEP,
+    VARIANCE,
+    Pixel,
+    Scratch,
+    load,
+    make_pixel,
+    make_scratch,
+)
+
+FloatArray = NDArray[np.float64]
+
+# columns of `words`
+STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN, FRAMES = range(6)
+N_WORDS = 6
+
+
+class Histograms(NamedTuple):
+    """The histograms of n pixels at J exposures.
+
+    Attributes:
+        counts: of the samples of each pixel, one after the other, shape (n, all bins).
+        places: where each sample begins among the bins, and the end, shape (J + 1,).
+        origin: DN of the first bin of each sample, shape (n, J).
+        dark: which samples hold no electrons, shape (J,).
+        mask: codes that do not count, see `COUNTED`, shape (n, all bins).
+    """
+
+    counts: NDArray[np.integer]
+    places: NDArray[np.int64]
+    origin: NDArray[np.int64]
+    dark: NDArray[np.bool_]
+    mask: NDArray[np.uint8]
+
+
+class Starts(NamedTuple):
+    """What is known of n pixels.
+
+    Attributes:
+        parameters: (H_1 ... H_J, g, mu, sigma) near the answer, shape (n, J + 3), NaN where not known; or
+            (0, J + 3).
+        gaps: nats of that answer above its runner-up, shape (n,).
+        amplitudes: of free satellites to try, e-.
+    """
+
+    parameters: FloatArray
+    gaps: FloatArray
+    amplitudes: FloatArray
+
+
+class Answers(NamedTuple):
+    """What the loop fills.
+
+    Attributes:
+        parameters: (H_1 ... H_J, g, mu, sigma), shape (n, J + 3); comes as NaN.
+        covariance: shape (n, J + 3, J + 3); comes as NaN.
+        moments: mean (DN) and variance (DN^2) of each sample, shape (n, J, 2); comes as NaN.
+        out: shape (n, N_OUT), see :mod:`.search_numba`; comes as NaN.
+        words: shape (n, N_WORDS); comes as 0.
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    moments: FloatArray
+    out: FloatArray
+    words: NDArray[np.int64]
+
+
+@kernel
+def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
+    """Load the samples of a pixel; return the pixel, which shares the room's arrays."""
+    centre, widest = int(np.int64(0)), 0.0
+    for j in range(given.dark.size):
+        first, end = given.places[j], given.places[j + 1]
+        own = load(given.counts[index, first:end], given.mask[index, first:end], room.bins[j], room.facts[j])
+        own += given.origin[index, j]
+        if j == 0:
+            centre = own
+        room.facts[j, CENTRE] = float(own - centre)
+        widest = max(widest, room.facts[j, N_BINS])
+    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, room.table, centre, 4.0 * widest + 10.0)
+
+
+@kernel(inline=True)
+def describe(pixel: Pixel, moments: FloatArray, words: NDArray[np.int64]) -> tuple[float, float]:
+    """Fill moments, frames and extreme codes; return the fewest frames and the most occupied bins."""
+    lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
+    for j in range(pixel.facts.shape[0]):
+        facts = pixel.facts[j]
+        n += facts[N_FRAMES]
+        least = min(least, facts[N_FRAMES])
+        if facts[DARK] == 0.0:
+            occupied = max(occupied, facts[OCCUPIED])
+        if facts[N_FRAMES] > 0.0:
+            moments[j, 0] = pixel.centre + facts[CENTRE] + facts[MEAN]
+            moments[j, 1] = facts[VARIANCE]
+            first = pixel.centre + int(facts[CENTRE] + facts[FIRST])
+            lowest, highest = min(lowest, first), max(highest, first + int(facts[N_BINS]) - 1)
+    words[LOWEST_DN], words[HIGHEST_DN], words[FRAMES] = lowest, highest, int(n)
+    return least, occupied
+
+
+@kernel
+def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatArray) -> bool:
+    """Fill theta, v with the rounding, from (H_1 ... H_J, g, mu, sigma); False unless they are known."""
+    n = pixel.facts.shape[0]
+    theta[n + STEP] = 0.0
+    known = 0.0
+    for i in range(n + 3):
+        known += parameters[i]
+    if not math.isfinite(known):
+        return False
+    for j in range(n):
+        dark = pixel.facts[j, DARK] > 0.0 or not parameters[j] > 0.0
+        theta[j] = limits.bound if dark else math.log(parameters[j])
+    theta[n + STEP] = 1.0 / parameters[n]
+    theta[n + BIAS] = parameters[n + 1] - pixel.centre
+    theta[n + LOG_VARIANCE] = 2.0 * math.log(parameters[n + 2])
+    theta[n + SATELLITE] = 0.0
+    return True
+
+
+@kernel(inline=True)
+def _write(
+    pixel: Pixel,
+    theta: FloatArray,
+    limits: Limits,
+    scratch: Scratch,
+    parameters: FloatArray,
+    covariance: FloatArray,
+) -> bool:
+    """Fill parameters and covariance at a maximum; tell whether the information is positive definite."""
+    n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
+    held = fixed.copy()
+    floor = min_log_variance(theta[n + STEP], limits.cells)
+    held[n + LOG_VARIANCE] = theta[n + LOG_VARIANCE] <= floor + 1e-9
+    full = np.empty((n + N_SHARED, n + N_SHARED))
+    regular: bool = invert_arrow(at, theta, held, full)
+    if limits.sandwich and regular:
+        if not limits.cells:
+            fill_squared_scores(pixel, theta, at)
+        enclose(at, theta, full)
+    absolute = theta.copy()
+    absolute[n + BIAS] += pixel.centre
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+    to_natural(absolute, fixed[:n], held, rounding, full, parameters, covariance)
+    if not regular:
+        for row in range(n + 3):
+            for column in range(n + 3):
+                covariance[row, column] = math.nan
+    return regular
+
+
+@kernel
+def make_room(given: Histograms, law: Law) -> Pixel:
+    """Return room for the histograms of a pixel."""
+    most = np.int64(0)
+    for j in range(given.dark.size):
+        most = max(most, given.places[j + 1] - given.places[j])
+    n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
+    n_exposures = max(law.exposures.shape[2], law.added.shape[3])
+    room: Pixel = make_pixel(given.dark, most, n_peaks, n_exposures, law.table)
+    return room
+
+
+@kernel
+def fit_tile(
+    given: Histograms,
+    chosen: NDArray[np.int64],
+    law: Law,
+    starts: Starts,
+    limits: Limits,
+    evaluate: Any,
+    climb: Any,
+    search: Any,
+    basis: FloatArray,
+    answers: Answers,
+) -> None:
+    """Fit pixels; they do not influence each other.
+
+    Args:
+        given: histograms; codes left out by the tail guard do not count.
+        chosen: pixels to fit.
+        law: of the samples.
+        starts: what is known.
+        limits: bounds and limits.
+        evaluate: the likelihood.
+        climb: the climb on it.
+        search: the search for its maximum.
+        basis: of the regression on the characteristic function.
+        answers: out.
+    """
+    n = given.dark.size
+    room = make_room(given, law)
+    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
+    tools = Tools(limits, evaluate, climb, basis, scratch)
+    near, best = np.zeros(n + N_SHARED), np.zeros(n + N_SHARED)
+    fixed = scratch.flags[FIXED]
+    fixed[n + SATELLITE] = True
+    for j in range(n):
+        fixed[j] = given.dark[j]
+    for index in chosen:
+        pixel = load_pixel(given, index, room)
+        out, words = answers.out[index], answers.words[index]
+        least, occupied = describe(pixel, answers.moments[index], words)
+        for i in range(out.size):
+            out[i] = math.nan
+        if least == 0.0 or occupied < 3.0:
+            words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
+            continue
+        if limits.cells:
+            resolve(law, index, 0.0, pixel)
+        near[n + STEP], gap = 0.0, math.inf
+        if starts.parameters.shape[0] > 0:
+            theta_of(starts.parameters[index], pixel, limits, near)
+            gap = starts.gaps[index]
+        status, used, words[FREEDOM] = search(
+            pixel, tools, law, index, starts.amplitudes, near, gap, best, out
+        )
+        words[EVALUATIONS] += used
+        if best[n + STEP] > 0.0:
+            parameters, covariance = answers.parameters[index], answers.covariance[index]
+            if not _write(pixel, best, limits, scratch, parameters, covariance):
+                status |= FIT_NOT_CONVERGED
+        words[STATUS] = status

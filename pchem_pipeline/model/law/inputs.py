@@ -1,0 +1,174 @@
+"""What the loops over cells are given: the law of the samples, the parameters, the free satellites."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.model.law import electron_laws_numba
+from pchem_pipeline.model.law.cells_numba import Law
+from pchem_pipeline.model.law.sample_law import CountLaw, MarginalModel
+
+__all__ = ["HasLobes", "HasParameters", "Parameters", "columns_of", "kernel_counts", "lobes_of", "pack"]
+
+FloatArray = NDArray[np.float64]
+
+_LAWS: dict[CountLaw, int] = {
+    "poisson": electron_laws_numba.POISSON,
+    "negative_binomial": electron_laws_numba.NEGATIVE_BINOMIAL,
+    "borel": electron_laws_numba.BOREL,
+}
+_NO_LIMIT = 2**40  # DN
+_PEAK_FIELDS = ("weights", "shift_e", "shift_dn", "shift_sigma", "width")
+
+
+class HasParameters(Protocol):
+    """Maps of the four parameters: ``PixelMaps``, ``PixelParameters``, a :class:`FitResult`."""
+
+    @property
+    def quanta_exposure(self) -> FloatArray:
+        """H, e-."""
+
+    @property
+    def conversion_gain(self) -> FloatArray:
+        """g, e-/DN."""
+
+    @property
+    def bias(self) -> FloatArray:
+        """mu, DN."""
+
+    @property
+    def read_noise_dn(self) -> FloatArray:
+        """sigma, quantisation included, DN."""
+
+
+@runtime_checkable
+class HasLobes(Protocol):
+    """Free lobes of the pixels."""
+
+    @property
+    def lobe_amplitude_e(self) -> FloatArray:
+        """Amplitude, e-; NaN without any."""
+
+    @property
+    def lobe_weight(self) -> FloatArray:
+        """Weight; 0 without any."""
+
+
+Parameters = HasParameters | Sequence[ArrayLike]
+
+
+@functools.cache
+def _normal_table() -> FloatArray:
+    table = np.empty((int(electron_laws_numba.FARTHEST * electron_laws_numba.STEPS) + 2, 2))
+    electron_laws_numba.fill_normal_table(table)
+    return table
+
+
+def pack(models: Sequence[MarginalModel], n: int) -> Law:
+    """Return the laws of the samples of n pixels as the loops take them.
+
+    Args:
+        models: the law of each sample.
+        n: number of pixels.
+
+    Raises:
+        ValueError: if an array has neither 1 nor n rows, or the weights of a mixture do not sum to 1.
+    """
+    parts = [_pack_one(model, n) for model in models]
+    return Law(
+        np.stack([part.numbers for part in parts]),
+        _stacked([part.own for part in parts]),
+        _stacked([part.peaks for part in parts]),
+        np.array([part.peaks.shape[2] for part in parts], np.int64),
+        _stacked([part.exposures for part in parts]),
+        _stacked([part.added for part in parts]),
+        _stacked([part.edge_shift for part in parts]),
+        np.array(models[0].free_lobe_pattern, np.float64).reshape(-1, 2),
+        _normal_table(),
+    )
+
+
+class _Part(NamedTuple):
+    """The law of one sample: numbers, and arrays of one row, or a row for each pixel."""
+
+    numbers: FloatArray
+    own: FloatArray
+    peaks: FloatArray
+    exposures: FloatArray
+    added: FloatArray
+    edge_shift: FloatArray
+
+
+def _pack_one(model: MarginalModel, n: int) -> _Part:
+    def per_pixel(*names: str) -> FloatArray:
+        values = [np.asarray(getattr(model, name), np.float64) for name in names]
+        for name, rows in zip(names, values, strict=True):
+            if rows.shape[0] not in (1, n):
+                raise ValueError(f"{name} has {rows.shape[0]} rows for {n} pixels")
+        return np.stack(np.broadcast_arrays(*values), axis=1)
+
+    peaks = per_pixel(*(f"lobe_{name}" for name in _PEAK_FIELDS))
+    added = per_pixel("added_weights", "added_exposure")
+    for weights in (model.exposure_weights[None], added[:, 0], peaks[:, 0]):
+        if not np.allclose(weights.sum(axis=1), 1.0, rtol=0, atol=1e-6):
+            raise ValueError("the weights of a mixture do not sum to 1")
+    numbers = (
+        _LAWS[model.law],
+        model.dispersion,
+        model.curvature,
+        model.variance_per_electron,
+        model.variance_per_electron2,
+        -_NO_LIMIT if model.clip_low is None else model.clip_low,
+        _NO_LIMIT if model.clip_high is None else model.clip_high,
+        model.outlier_share,
+        model.outlier_share / model.outlier_codes,
+        model.edge_first,
+    )
+    own = per_pixel("level_scale", "level_shift_e", "extra_variance_e2", "extra_variance_dn2")
+    exposures = np.stack([model.exposure_weights, model.exposure_factors])
+    return _Part(np.array(numbers, np.float64), own, peaks, exposures, added, np.asarray(model.edge_shift))
+
+
+def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
+    """Return arrays of the samples in one, as large as the largest, 0 in columns beyond."""
+    rank = parts[0].ndim
+    most = tuple(max(part.shape[axis] for part in parts) for axis in range(rank))
+    found = np.zeros((len(parts), *most))
+    for own, part in zip(found, parts, strict=True):
+        own[..., : part.shape[-1]] = part
+    return found
+
+
+def columns_of(parameters: Parameters) -> FloatArray:
+    """Return (H, g, mu, sigma) as an array of shape (n, 4)."""
+    if isinstance(parameters, Sequence):
+        columns = [np.asarray(values, np.float64).ravel() for values in parameters]
+    else:
+        names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+        columns = [np.asarray(getattr(parameters, name), np.float64).ravel() for name in names]
+    return np.stack(np.broadcast_arrays(*columns), axis=1)
+
+
+def lobes_of(parameters: Parameters, lobes: tuple[ArrayLike, ArrayLike] | None, n: int) -> FloatArray:
+    """Return amplitude and weight of the pixels' free lobes, shape (n, 2), 0 without any."""
+    if lobes is None and isinstance(parameters, HasLobes):
+        lobes = parameters.lobe_amplitude_e, parameters.lobe_weight
+    found = np.zeros((n, 2))
+    if lobes is not None:
+        found[:] = np.stack([np.asarray(values, np.float64).ravel() for values in lobes], axis=1)
+    return np.nan_to_num(found)
+
+
+def kernel_counts(counts: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Return histograms in the one type that the kernels are compiled for.
+
+    Machine code for another type would round differently in the last bit. Only counts beyond 32 bits keep a
+    type of their own.
+    """
+    wide = counts.dtype.itemsize > 4 and counts.size > 0 and int(counts.max()) > np.iinfo(np.uint32).max
+    return np.ascontiguousarray(counts, np.int64 if wide else np.uint32)

@@ -1,0 +1,36 @@
+"""The likelihoods of the density and of the cells, compiled by themselves and called by their addresses."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numba
+import numpy as np
+
+from pchem_pipeline.base.kernel import callback
+from pchem_pipeline.model.law import cells_numba, density_numba
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
+
+__all__ = ["cells_likelihood", "density_likelihood", "evaluation_arguments"]
+
+
+@functools.cache
+def evaluation_arguments() -> tuple[Any, ...]:
+    """Return an example of each argument of a likelihood."""
+    vector, rows, stack = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1))
+    pixel = Pixel(stack, rows, stack, stack, rows, 0, 0.0)
+    flags, evaluations = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1))
+    return pixel, vector, False, Scratch(rows, rows, rows, stack, rows, flags, evaluations), stack
+
+
+@functools.cache
+def density_likelihood() -> Any:
+    """Return the likelihood of the density at whole DN, :func:`.density_numba.evaluate_density`."""
+    return callback(density_numba.evaluate_density, numba.types.float64, evaluation_arguments())
+
+
+@functools.cache
+def cells_likelihood() -> Any:
+    """Return the likelihood of the cells, integrated, :func:`.cells_numba.evaluate_cells`."""
+    return callback(cells_numba.evaluate_cells, numba.types.float64, evaluation_arguments())

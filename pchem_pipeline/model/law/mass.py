@@ -1,0 +1,108 @@
+"""The mass of codes under any law of a pixel's samples, and the likelihood of histograms."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.model.law import mass_numba
+from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
+from pchem_pipeline.model.law.inputs import Parameters, columns_of, kernel_counts, lobes_of, pack
+from pchem_pipeline.model.law.sample_law import MarginalModel
+
+__all__ = ["log_likelihood", "marginal_mass", "marginal_slopes"]
+
+FloatArray = NDArray[np.float64]
+
+
+def log_likelihood(
+    counts: NDArray[np.integer],
+    origin: NDArray[np.integer],
+    parameters: Parameters,
+    model: MarginalModel,
+    *,
+    lobes: tuple[ArrayLike, ArrayLike] | None = None,
+) -> FloatArray:
+    """Return ``sum_i c_i log P(x_i)`` of every pixel, nats, shape (n,); NaN without parameters.
+
+    Comparable between models, the neutral one included, and between frames that were and were not fitted.
+
+    Args:
+        counts: histograms, shape (n, B), any unsigned type.
+        origin: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma) of the pixels, each (n,).
+        model: the law.
+        lobes: ``lobe_amplitude_e`` and ``lobe_weight`` of the pixels; by default those of ``parameters``
+            where it has any, else none.
+    """
+    counts = kernel_counts(counts)
+    out = np.full(counts.shape[0], np.nan)
+    mass_numba.score_tile(
+        counts,
+        np.ascontiguousarray(origin, np.int64),
+        columns_of(parameters),
+        lobes_of(parameters, lobes, out.size),
+        pack([model], out.size),
+        out,
+    )
+    return out
+
+
+def marginal_mass(
+    model: MarginalModel,
+    maps: Parameters,
+    codes: ArrayLike,
+    *,
+    lobes: tuple[ArrayLike, ArrayLike] | None = None,
+    far_tails: bool = True,
+) -> FloatArray:
+    """Return the probability of each code in each pixel, exact to the ends of the tails.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
+        codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
+        lobes: as in :func:`log_likelihood`.
+        far_tails: also what is below 1e-50, which takes several times as long.
+
+    Returns:
+        P(x), shape (n, n_codes); NaN where a parameter is.
+
+    Raises:
+        ValueError: if the codes do not increase by 1.
+    """
+    wanted = np.atleast_2d(np.asarray(codes, np.int64))
+    if (np.diff(wanted, axis=1) != 1).any():
+        raise ValueError("codes must increase by 1")
+    columns = columns_of(maps)
+    n = columns.shape[0]
+    out = np.full((n, wanted.shape[1]), np.nan)
+    if out.size:
+        first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
+        stage = EXACT if far_tails else NEAR
+        none = np.empty((0, 4, out.shape[1]))
+        mass_numba.mass_tile(first, columns, lobes_of(maps, lobes, n), pack([model], n), stage, out, none)
+    return out
+
+
+def marginal_slopes(
+    model: MarginalModel, maps: Parameters, first: NDArray[np.integer], n_codes: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the probability of successive codes down to 1e-50, and its slopes.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels.
+        first: first code of each pixel, DN, shape (n,).
+        n_codes: number of codes.
+
+    Returns:
+        P(x), shape (n, n_codes), and its derivatives in log H, 1/g, mu and log sigma_R^2, (n, 4, n_codes).
+    """
+    columns = columns_of(maps)
+    n = columns.shape[0]
+    mass, slopes = np.full((n, n_codes), np.nan), np.full((n, 4, n_codes), np.nan)
+    start = np.ascontiguousarray(first, np.int64)
+    law = pack([model], n)
+    mass_numba.mass_tile(start, columns, lobes_of(maps, None, n), law, NEAR, mass, slopes)
+    return mass, slopes

@@ -1,0 +1,141 @@
+"""Loops of :mod:`pchem_pipeline.model.law.mass`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.cells_numba import (
+    LEAST_MASS,
+    Law,
+    cells_of,
+    fill_far_enough,
+    fill_masses,
+    resolve,
+)
+from pchem_pipeline.model.law.pixel_numba import (
+    FIRST,
+    MASS,
+    N_BINS,
+    N_BLOCK,
+    OWN,
+    SLOPES,
+    WEIGHT,
+    Pixel,
+    Scratch,
+    load,
+    make_pixel,
+    make_scratch,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+_LEAST_VARIANCE = 1e-6  # DN^2
+
+
+@kernel
+def _make_room(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
+    """Return room for one sample of so many bins."""
+    n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
+    n_exposures = max(law.exposures.shape[2], law.added.shape[3])
+    pixel = make_pixel(np.zeros(1, np.bool_), n_bins, n_peaks, n_exposures, law.table)
+    return pixel, make_scratch(np.int64(1), n_bins, np.bool_(True))
+
+
+@kernel
+def _at(room: Pixel, centre: int) -> Pixel:
+    """Return the pixel counted from a code."""
+    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, room.table, centre, 0.0)
+
+
+@kernel
+def _theta_of(parameters: FloatArray, centre: int, weight: float, theta: FloatArray) -> bool:
+    """Fill a sample's own theta from (H, g, mu, sigma); False unless they are known."""
+    if not math.isfinite(parameters.sum()):
+        return False
+    theta[0] = math.log(parameters[0])
+    theta[1] = 1.0 / parameters[1]
+    theta[2] = parameters[2] - centre
+    theta[3] = math.log(max(parameters[3] * parameters[3] - QUANTISATION_VARIANCE, _LEAST_VARIANCE))
+    theta[4] = weight
+    return True
+
+
+@kernel
+def score_tile(
+    counts: NDArray[np.generic],
+    origin: NDArray[np.int64],
+    parameters: FloatArray,
+    satellites: FloatArray,
+    law: Law,
+    out: FloatArray,
+) -> None:
+    """Fill the log-likelihood of every row of ``counts`` whose parameters are finite.
+
+    Args:
+        counts: shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4).
+        satellites: amplitude (e-) and weight of each pixel's free satellite peaks, shape (n, 2).
+        law: of the samples.
+        out: out, nats, shape (n,); comes as NaN.
+    """
+    room, scratch = _make_room(counts.shape[1], law)
+    mask, theta = np.zeros(counts.shape[1], np.uint8), scratch.small[OWN]
+    for index in range(counts.shape[0]):
+        centre = origin[index] + load(counts[index], mask, room.bins[0], room.facts[0])
+        if not _theta_of(parameters[index], centre, satellites[index, 1], theta):
+            continue
+        pixel = _at(room, centre)
+        resolve(law, index, satellites[index, 0], pixel)
+        cells = cells_of(pixel, np.int64(0))
+        fill_far_enough(theta, cells, scratch.numbers, scratch.cells[0])
+        total = 0.0
+        for i in range(cells.n_bins):
+            if room.bins[0, WEIGHT, i] > 0.0:
+                total += room.bins[0, WEIGHT, i] * math.log(max(scratch.cells[0, MASS, i], LEAST_MASS))
+        out[index] = total
+
+
+@kernel
+def mass_tile(
+    first: NDArray[np.int64],
+    parameters: FloatArray,
+    satellites: FloatArray,
+    law: Law,
+    stage: int,
+    out: FloatArray,
+    slopes: FloatArray,
+) -> None:
+    """Fill the mass of successive codes of every pixel whose parameters are finite, and its slopes.
+
+    Args:
+        first: first code of each pixel, DN, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4).
+        satellites: amplitude (e-) and weight of each pixel's free satellite peaks, shape (n, 2).
+        law: of the samples.
+        stage: how far the tails go, see :func:`.cells_numba.fill_masses`.
+        out: out, shape (n, n_codes); comes as NaN.
+        slopes: out, in log H, 1/g, mu and log sigma_R^2, shape (n, 4, n_codes), comes as NaN; or (0, 4,
+            n_codes).
+    """
+    n_codes = out.shape[1]
+    room, scratch = _make_room(n_codes, law)
+    theta = scratch.small[OWN]
+    room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_codes), 0.0
+    for index in range(parameters.shape[0]):
+        if not _theta_of(parameters[index], first[index], satellites[index, 1], theta):
+            continue
+        pixel = _at(room, first[index])
+        resolve(law, index, satellites[index, 0], pixel)
+        fill_masses(theta, cells_of(pixel, np.int64(0)), stage, scratch.numbers, scratch.cells[0])
+        for i in range(n_codes):
+            out[index, i] = scratch.cells[0, MASS, i]
+        for j in range(N_BLOCK - 1 if slopes.shape[0] > 0 else 0):
+            for i in range(n_codes):
+                slopes[index, j, i] = scratch.cells[0, SLOPES + j, i]

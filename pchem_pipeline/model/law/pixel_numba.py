@@ -1,0 +1,289 @@
+"""What the loops of the fit hand to each other: the histograms of one pixel, room to work in, an evaluation.
+
+A pixel seen at J exposures has ``theta = (log H_1 ... log H_J, 1/g, mu - centre, v, q)`` with ``v = log
+sigma^2`` where the density at whole DN is taken and ``log sigma_R^2``, the analog part, where cells are
+integrated; q is the weight of free satellite peaks. No two exposures share a sample, so the information is an
+arrow: one block of (log H_j, 1/g, mu, v, q) for each sample, coupled through the last four alone.
+
+An evaluation is one array of shape (J, N_ROWS, N_BLOCK): see the names of its rows below.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.simd_numba import LANES
+
+FloatArray = NDArray[np.float64]
+
+#: Shared parameters 1/g, mu - centre, v, q: their number, and their places after the last exposure.
+N_SHARED = 4
+STEP, BIAS, LOG_VARIANCE, SATELLITE = range(N_SHARED)
+#: A sample's own parameters: log H, and the shared ones.
+N_BLOCK = N_SHARED + 1
+
+# rows of an evaluation: gradient of the log-likelihood; observed information; a matrix of the same size that
+# is never indefinite (complete-data information of the density, sum of the squared scores of the cells); and
+# with the density the sums over frames of E[k], E[k^2], E[k e], E[e], E[e^2], e = x - mu - k/g
+SCORE, INFORMATION, DAMPING, SUMS = 0, 1, 1 + N_BLOCK, 1 + 2 * N_BLOCK
+N_ROWS = 2 + 2 * N_BLOCK
+SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(5)
+
+# rows of `Pixel.bins`
+WEIGHT, CUMULATIVE, EXPECTED, EDGE, KEPT = range(5)
+N_BIN_ROWS = 5
+
+# columns of `Pixel.facts`: the histogram ...
+DARK, N_BINS, FIRST, N_FRAMES, MEAN, VARIANCE, CENTRE, OCCUPIED, CONDITIONAL = range(9)
+# ... and its law, see `Cells`
+(
+    COUNT_LAW,
+    DISPERSION,
+    CURVATURE,
+    PER_ELECTRON,
+    PER_ELECTRON2,
+    CLIP_LOW,
+    CLIP_HIGH,
+    OUTLIER_SHARE,
+    OUTLIER_MASS,
+    EDGE_FIRST,
+    LEVEL_SCALE,
+    LEVEL_SHIFT,
+    EXTRA_E2,
+    EXTRA_DN2,
+    BOTTOM,
+    TOP,
+    MARGIN,
+    N_PEAKS,
+) = range(9, 27)
+N_FACTS = 27
+
+# rows of `Pixel.peaks`: levels of the noise beside the comb's own
+SHARE, SHARE_SLOPE, SHIFT_E, SHIFT_DN, SHIFT_SIGMA, WIDTH = range(6)
+N_PEAK_ROWS = 6
+# rows of `Pixel.mixtures`
+EXPOSURE_WEIGHT, EXPOSURE_FACTOR, ADDED_WEIGHT, ADDED_EXPOSURE = range(4)
+N_MIXTURE_ROWS = 4
+
+# codes of a mask: counted; left out by the tail guard; set aside, the likelihood being given the others
+COUNTED, LEFT_OUT, SET_ASIDE = range(3)
+
+# rows of `Scratch.small`: of an evaluation and a climb, vectors, then matrices of N_BLOCK rows; of the
+# search: room for parameters, and starts with their heights
+OWN, TRIAL, STEPS, RIGHT, SCHUR, LOWER = 0, 1, 2, 3, 4, 4 + N_BLOCK
+HERE, OTHER, KEPT_STARTS = 4 + 2 * N_BLOCK, 5 + 2 * N_BLOCK, 6 + 2 * N_BLOCK
+N_KEPT = 4
+HEIGHTS = KEPT_STARTS + N_KEPT
+N_SMALL = HEIGHTS + 1
+# rows of `Scratch.flags`: parameters that stay in a step, and all the time
+HELD, FIXED = range(2)
+# places in `Scratch.evaluations`: of the last climb, of its trials, at the best maximum
+AT, AHEAD, AT_BEST = range(3)
+N_DENSITY_ROWS = 9
+CAPACITY = 256  # columns of the table of an evaluation; a longer histogram goes through in pieces
+MAX_COMPONENTS = 201  # of which a value may be a mixture
+_MIN_COLUMNS = 256  # the frequencies of the starting points, a value's components, a table's columns
+# rows of `Scratch.cells` of a sample: mass, counts over mass, slopes in theta; tail, density and z times the
+# density at each edge
+MASS, RATIO, SLOPES, AT_EDGES = 0, 1, 2, 2 + N_BLOCK
+N_CELL_ROWS = 5 + N_BLOCK
+
+
+class Histogram(NamedTuple):
+    """One sample's histogram without its empty ends, values counted from a centre near its mean.
+
+    Attributes:
+        weights: counts of successive DN, at least ``n_bins`` long.
+        cumulative: ``cumulative[i]`` is the sum of the first i weights.
+        n_bins: number of DN in use.
+        first: first DN minus the centre.
+        n: number of frames.
+        mean: mean minus the centre, DN.
+        variance: variance, DN^2.
+    """
+
+    weights: FloatArray
+    cumulative: FloatArray
+    n_bins: int
+    first: float
+    n: float
+    mean: float
+    variance: float
+
+
+class Pixel(NamedTuple):
+    """The histograms of one pixel and what the law says of this pixel.
+
+    Attributes:
+        bins: by sample: counts, their sums before each DN, the counts expected (out of an evaluation), lower
+            edges of the cells, 1 for codes that are not set aside; shape (J, N_BIN_ROWS, bins + 1).
+        facts: numbers of each sample, shape (J, N_FACTS).
+        peaks: satellite peaks of each sample, shape (J, N_PEAK_ROWS, enough); weight 0 where there are fewer.
+        mixtures: of exposures, shape (J, N_MIXTURE_ROWS, enough); weight 0 where there are fewer.
+        table: of the normal law.
+        centre: DN that all is counted from.
+        longest_step: 1/g beyond which there is one Gaussian, DN.
+    """
+
+    bins: NDArray[np.float64]
+    facts: NDArray[np.float64]
+    peaks: NDArray[np.float64]
+    mixtures: NDArray[np.float64]
+    table: NDArray[np.float64]
+    centre: int
+    longest_step: float
+
+
+class Scratch(NamedTuple):
+    """Room to work in, and the evaluations of a pixel.
+
+    Attributes:
+        rows: of the density and of the starts, shape (N_DENSITY_ROWS, enough).
+        table: a column for each DN, of the density.
+        numbers: electron numbers in use with P(k) and its two derivatives, shape (enough, 4).
+        cells: of each sample, shape (J, N_CELL_ROWS, bins + 1).
+        small: vectors and matrices, shape (N_SMALL, J + N_SHARED).
+        flags: parameters that stay, shape (2, J + N_SHARED).
+        evaluations: shape (3, J, N_ROWS, N_BLOCK).
+    """
+
+    rows: FloatArray
+    table: FloatArray
+    numbers: FloatArray
+    cells: NDArray[np.float64]
+    small: FloatArray
+    flags: NDArray[np.bool_]
+    evaluations: NDArray[np.float64]
+
+
+@kernel
+def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
+    """Return room for so many samples of at most so many bins; ``cells``: also to integrate them."""
+    width = n_bins + 1 if cells else 0
+    return Scratch(
+        np.empty((N_DENSITY_ROWS, n_bins + _MIN_COLUMNS)),
+        np.empty((MAX_COMPONENTS + 5, CAPACITY + LANES)),
+        np.empty((n_bins + 512 if cells else 0, 4)),
+        np.empty((n_samples, N_CELL_ROWS, width)),
+        np.zeros((N_SMALL, n_samples + N_SHARED)),
+        np.zeros((2, n_samples + N_SHARED), np.bool_),
+        np.zeros((3, n_samples, N_ROWS, N_BLOCK)),
+    )
+
+
+@kernel
+def make_pixel(
+    dark: NDArray[np.bool_], n_bins: int, n_peaks: int, n_exposures: int, table: FloatArray
+) -> Pixel:
+    """Return room for the histograms of a pixel.
+
+    Args:
+        dark: which samples hold no electrons.
+        n_bins: bins at most.
+        n_peaks: levels of the noise at most.
+        n_exposures: exposures at most that H is a mixture of.
+        table: of the normal law.
+    """
+    n = dark.size
+    facts = np.zeros((n, N_FACTS))
+    for j in range(n):
+        facts[j, DARK] = 1.0 if dark[j] else 0.0
+    return Pixel(
+        np.zeros((n, N_BIN_ROWS, n_bins + 1)),
+        facts,
+        np.zeros((n, N_PEAK_ROWS, n_peaks)),
+        np.zeros((n, N_MIXTURE_ROWS, n_exposures)),
+        table,
+        0,
+        0.0,
+    )
+
+
+@kernel
+def copy(source: FloatArray, target: FloatArray) -> None:
+    """Copy a vector; a plain loop, since slice assignment compiles slowly."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@kernel
+def copy_evaluation(source: FloatArray, target: FloatArray) -> None:
+    """Copy an evaluation."""
+    for j in range(source.shape[0]):
+        for row in range(N_ROWS):
+            for column in range(N_BLOCK):
+                target[j, row, column] = source[j, row, column]
+
+
+@kernel
+def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray, facts: FloatArray) -> int:
+    """Fill the histogram of one sample without its empty ends, and sum it up.
+
+    Args:
+        counts: of all bins.
+        mask: of all bins, see `COUNTED`.
+        bins: out, rows of a pixel's ``bins``.
+        facts: out, of that sample; but for ``CENTRE``.
+
+    Returns:
+        The centre, bins after bin 0.
+    """
+    low, high = 0, counts.size
+    worst = np.uint8(COUNTED)
+    for i in range(counts.size):
+        worst = max(worst, mask[i])
+    aside, plain = worst == SET_ASIDE, worst == COUNTED
+    weights, cumulative, kept = bins[WEIGHT], bins[CUMULATIVE], bins[KEPT]
+    if not aside:  # given the other codes, empty ones tell, too
+        while low < high and (counts[low] == 0 or (not plain and mask[low] != COUNTED)):
+            low += 1
+        while high > low and (counts[high - 1] == 0 or (not plain and mask[high - 1] != COUNTED)):
+            high -= 1
+    n_bins = high - low
+    cumulative[0] = 0.0
+    occupied = 0
+    moment = 0.0
+    for i in range(n_bins):
+        c = float(counts[low + i])
+        kept[i] = 1.0
+        if not plain and mask[low + i] != COUNTED:
+            c = 0.0
+            kept[i] = 0.0 if mask[low + i] == SET_ASIDE else 1.0
+        weights[i] = c
+        cumulative[i + 1] = cumulative[i] + c
+        moment += c * i
+        if c > 0.0:
+            occupied += 1
+    n = cumulative[n_bins]
+    facts[N_BINS], facts[N_FRAMES], facts[OCCUPIED] = float(n_bins), n, float(occupied)
+    facts[CONDITIONAL] = 1.0 if aside else 0.0
+    if n == 0.0:
+        facts[N_BINS] = facts[FIRST] = facts[MEAN] = facts[VARIANCE] = 0.0
+        return 0
+    mean = moment / n
+    square = 0.0
+    for i in range(n_bins):
+        square += weights[i] * (i - mean) ** 2
+    middle = math.floor(mean)
+    facts[FIRST], facts[MEAN], facts[VARIANCE] = -float(middle), mean - middle, square / n
+    return int(low + middle)
+
+
+@kernel
+def histogram_of(pixel: Pixel, j: int) -> Histogram:
+    """Return one sample's histogram, counted from its own centre."""
+    facts = pixel.facts[j]
+    return Histogram(
+        pixel.bins[j, WEIGHT],
+        pixel.bins[j, CUMULATIVE],
+        int(facts[N_BINS]),
+        facts[FIRST],
+        facts[N_FRAMES],
+        facts[MEAN],
+        facts[VARIANCE],
+    )
