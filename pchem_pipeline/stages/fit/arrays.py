@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
-from pchem_pipeline.base.variables import variables_of
+from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.run.stage import StageContext
 
 __all__ = ["create_fit_maps"]
 
 
-def create_fit_maps(context: StageContext, left_out: Collection[str] = ()) -> None:
-    """Make the maps of the fit, but for those that it does not have; its words are explained with them."""
-    skipped = {"fit_status", *left_out}
-    context.create_maps([v.path for v in variables_of("fit") if v.name not in skipped])
+def create_fit_maps(context: StageContext) -> None:
+    """Make the maps that the fit will have; the words of its status are explained with them."""
+    left_out = {"fit_status", *(() if context.model.effects else FREE_LOBES)}
+    if context.config.fit.intervals == "normal":
+        left_out |= {path for name in INTERVALS for path in interval_names(name)}
+    context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])
     context.create_maps(
         ["fit/fit_status"],
         flag_masks=[int(bit) for bit in MEANINGS],

@@ -10,21 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.errors.fisher import correlations
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.excluding_codes import Interval
-from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
 from pchem_pipeline.stages.fit.samples import fit_samples
 from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
 from pchem_pipeline.stages.fit.together import judge_sensor
@@ -35,8 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["fit_tile", "run"]
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
-#: Pixels of which effects are told nothing: no value, or one electron off.
-_UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
 
 
 def fit_tile(
@@ -65,38 +60,16 @@ def fit_tile(
     shape = counts.shape[:2]
     rows = counts.reshape(-1, counts.shape[2])
     origin, under, over = (histogram[name].ravel() for name in ("origin", "under", "over"))
-    fit = functools.partial(
-        fit_histograms, rows, origin, under, over, adc_limits=adc_limits, excluding=set_aside
+    result = fit_model(
+        functools.partial(fit_histograms, rows, origin, under, over, adc_limits=adc_limits),
+        settings,
+        effects,
+        set_aside,
+        start=None if start is None else start.reshape(-1, start.shape[2]),
+        added=added,
     )
-    known = None if start is None else start.reshape(-1, start.shape[2])
-    if not effects:
-        result = fit(settings=settings, start=known)
-    else:
-        # the law is what the effects make of the pixels as the plain fit sees them
-        simple = settings.model_copy(update={"likelihood": "density", "intervals": "normal"})
-        plain = fit_histograms(rows, origin, under, over, settings=simple, adc_limits=adc_limits, start=known)
-        result = fit(settings=settings, start=plain, law=_law(plain, effects, added))
-    variances = np.diagonal(result.covariance, axis1=1, axis2=2)
-    arrays = {f"{name}_stderr": np.sqrt(variances[:, index]) for index, name in enumerate(PARAMETERS)}
-    arrays["correlation"] = correlations(result.covariance)
-    if result.intervals is not None:
-        arrays |= {
-            path: result.intervals[:, place, side]
-            for place, name in enumerate(INTERVALS)
-            for side, path in enumerate(interval_names(name))
-        }
-    arrays |= {
-        v.name: getattr(result, v.name)
-        for v in variables_of("fit")
-        if v.name not in arrays and hasattr(result, v.name) and (effects or v.name not in FREE_LOBES)
-    }
+    arrays = fit_arrays(result, effects=bool(effects))
     return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
-
-
-def _law(plain: FitResult, effects: Sequence[Effect], added: AddedExposure | None) -> MarginalModel:
-    """Return the law that the effects compose, as they see the pixels after the plain fit."""
-    usable = (plain.fit_status & int(_UNUSABLE)) == 0
-    return marginal_model(effects, pixel_maps([getattr(plain, name) for name in PARAMETERS], usable), added)
 
 
 def run(context: StageContext) -> None:
@@ -108,15 +81,9 @@ def run(context: StageContext) -> None:
     if context.sensor.samples:
         fit_samples(context)
         return
-    model = context.model.settings
-    effects = model.effects
-    left_out = set(() if effects else FREE_LOBES)
-    settings, plain = context.config.fit, not (effects or model.set_aside_e)
-    if settings.intervals == "normal" or not plain:
-        left_out |= {path for name in INTERVALS for path in interval_names(name)}
-    create_fit_maps(context, left_out)
+    create_fit_maps(context)
     if not context.executor.shares_memory:
-        _compile(context.store.array("histogram/counts").dtype, effects)
+        _compile(context.store.array("histogram/counts").dtype, context.model.effects)
     task = functools.partial(
         _do_tile,
         store=context.store.path,

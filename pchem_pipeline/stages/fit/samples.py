@@ -8,73 +8,86 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names
-from pchem_pipeline.model.errors.fisher import correlations
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.excluding_codes import Interval
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["fit_samples", "fit_samples_tile"]
+__all__ = ["SampleFit", "fit_samples", "fit_samples_tile"]
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
 _OF_SAMPLES = ("quanta_exposure", "quanta_exposure_stderr", "mean", "variance")
-_OF_PIXELS = (
-    "log_likelihood", "likelihood_gap", "fit_status", "n_iterations", "goodness_chi2", "goodness_dof",
-    "goodness_p", "outlier_share",
-)  # fmt: skip
 _SUSPICIOUS_SHARE = 0.2  # of pixels in poor agreement, from which the samples themselves are in doubt
 
 Histogram = Mapping[str, NDArray[Any]]
 
 
-def fit_samples_tile(
-    histograms: Sequence[Histogram],
-    bias: Sequence[bool],
-    shown: int,
-    settings: FitSettings,
-    adc_limits: tuple[int, int] | None,
-) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the groups ``fit`` and ``samples`` of a tile, by path.
+@dataclass(frozen=True)
+class SampleFit:
+    """How the samples of a tile are fitted.
 
-    Args:
-        histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
+    Attributes:
         bias: which samples hold no electrons.
         shown: the sample whose H stands in ``fit``.
         settings: of the fit.
         adc_limits: first and last code of the ADC, DN, or None where they are not known.
+        effects: of the run's model.
+        set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
+    """
+
+    bias: Sequence[bool]
+    shown: int
+    settings: FitSettings
+    adc_limits: tuple[int, int] | None = None
+    effects: Sequence[Effect] = ()
+    set_aside: Sequence[Interval] = ()
+
+
+def fit_samples_tile(histograms: Sequence[Histogram], how: SampleFit) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the groups ``fit`` and ``samples`` of a tile, by path.
+
+    Args:
+        histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
+        how: they are fitted.
     """
     shape = histograms[0]["counts"].shape[:2]
-    found = _fitted(histograms, bias, settings, adc_limits)
-    n_samples = len(histograms)
+    fit = functools.partial(
+        fit_histograms,
+        [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms],
+        [each["origin"].ravel() for each in histograms],
+        under=np.ravel(sum(each["under"].astype(np.int64) + each["over"] for each in histograms)),
+        dark=list(how.bias),
+        adc_limits=how.adc_limits,
+    )
+    found = fit_model(fit, how.settings, how.effects, how.set_aside)
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    fit: dict[str, NDArray[Any]] = {"quanta_exposure": found.quanta_exposure[:, shown]}
-    fit |= {name: getattr(found, name) for name in (*PARAMETERS[1:], *_OF_PIXELS)}
-    places = [shown, *range(n_samples, n_samples + 3)]
-    fit |= {f"{name}_stderr": errors[:, i] for name, i in zip(PARAMETERS, places, strict=True)}
-    fit["correlation"] = correlations(found.covariance[:, places][:, :, places])
     own = {
         "quanta_exposure": found.quanta_exposure,
-        "quanta_exposure_stderr": errors[:, :n_samples],
+        "quanta_exposure_stderr": errors[:, : len(histograms)],
         "mean": found.mean,
         "variance": found.variance,
     }
-    arrays = {f"fit/{name}": values.reshape(shape + values.shape[1:]) for name, values in fit.items()}
+    arrays = {
+        f"fit/{name}": values.reshape(shape + values.shape[1:])
+        for name, values in fit_arrays(found, how.shown, effects=bool(how.effects)).items()
+    }
     arrays |= {
         f"samples/{name}": np.ascontiguousarray(values.T).reshape(-1, *shape) for name, values in own.items()
     }
@@ -82,51 +95,30 @@ def fit_samples_tile(
     return arrays
 
 
-def _fitted(
-    histograms: Sequence[Histogram],
-    bias: Sequence[bool],
-    settings: FitSettings,
-    adc_limits: tuple[int, int] | None,
-) -> FitResult:
-    """Fit the pixels of a tile in all samples together."""
-    outside = sum(each["under"].astype(np.int64) + each["over"] for each in histograms)
-    return fit_histograms(
-        [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms],
-        [each["origin"].ravel() for each in histograms],
-        dark=list(bias),
-        settings=settings,
-        adc_limits=adc_limits,
-        under=np.ravel(outside),
-    )
-
-
 def fit_samples(context: StageContext) -> None:
     """Fit every tile, all samples together.
 
     Raises:
-        ConfigError: the model holds effects.
         StoreError: histograms of a sample are missing, or the store refuses.
     """
-    if context.model.effects or context.model.settings.set_aside_e:
-        raise ConfigError("model: several samples are fitted with the plain model; remove model.effects")
     samples, tile, shape = context.sensor.samples, context.config.run.tile, context.sensor.shape
-    create_fit_maps(context, {*FREE_LOBES, *(path for name in INTERVALS for path in interval_names(name))})
+    create_fit_maps(context)
     for name in _OF_SAMPLES:
         context.create(f"samples/{name}", (len(samples), *shape), chunks=(len(samples), tile, tile))
     rest = (len(samples) + 3,) * 2
     context.create("samples/covariance", (*shape, *rest), chunks=(tile, tile, *rest))
-    bias = [sample.bias for sample in samples]
-    if not context.executor.shares_memory:
-        _compile(bias, context.sensor.shown, context.config.fit)
-    task = functools.partial(
-        _do_tile,
-        store=context.store.path,
-        stores=[target.store for target in sample_targets(context.config, context.base_dir)],
-        bias=bias,
-        shown=context.sensor.shown,
-        settings=context.config.fit,
-        adc_limits=context.adc_limits,
+    how = SampleFit(
+        [sample.bias for sample in samples],
+        context.sensor.shown,
+        context.config.fit,
+        context.adc_limits,
+        context.model.effects,
+        context.model.settings.set_aside_e,
     )
+    if not context.executor.shares_memory:
+        _compile(how)
+    stores = [target.store for target in sample_targets(context.config, context.base_dir)]
+    task = functools.partial(_do_tile, store=context.store.path, stores=stores, how=how)
     done = context.run_units(context.tiles(), task, needs="histogram")
     pixels, poor = (sum(tile.get(key, 0) for tile in done.values()) for key in ("pixels", "poor"))
     if poor > _SUSPICIOUS_SHARE * pixels:
@@ -136,29 +128,20 @@ def fit_samples(context: StageContext) -> None:
         )
 
 
-def _compile(bias: Sequence[bool], shown: int, settings: FitSettings) -> None:
+def _compile(how: SampleFit) -> None:
     """Compile the kernels once, into the cache, before other processes do it all at the same time."""
     histogram = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
     histogram["counts"] = np.ones((1, 1, 8), np.uint32)
-    fit_samples_tile([histogram] * len(bias), bias, shown, settings, None)
+    fit_samples_tile([histogram] * len(how.bias), how)
 
 
-def _do_tile(
-    tile: Tile,
-    *,
-    store: Path,
-    stores: Sequence[Path],
-    bias: Sequence[bool],
-    shown: int,
-    settings: FitSettings,
-    adc_limits: tuple[int, int] | None,
-) -> dict[str, Any]:
+def _do_tile(tile: Tile, *, store: Path, stores: Sequence[Path], how: SampleFit) -> dict[str, Any]:
     """Fit one tile; the summary counts its pixels."""
     histograms = []
     for path in stores:
         sample = RunStore.open(path)
         histograms.append({name: sample.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM})
-    arrays = fit_samples_tile(histograms, bias, shown, settings, adc_limits)
+    arrays = fit_samples_tile(histograms, how)
     target = open_store(store)
     for path_, values in arrays.items():
         along = path_.startswith("samples/") and path_ != "samples/covariance"
