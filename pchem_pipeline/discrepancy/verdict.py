@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -205,7 +205,7 @@ class Examined(_Part):
         frames: number of them; of histograms the samples of the fullest.
         rows, columns: first, and end, on the sensor.
         train, test, final: frames (of histograms: samples) to find with, to score on, and for the last gap.
-        histograms: number of those compared, where frames are not known.
+        histograms: number of those compared, where frames are not known; of several samples all count.
     """
 
     frames: int
@@ -344,24 +344,24 @@ class Verdict(_Part):
             return ""
         return f"nearest: {rivals[0]}" if self.verdict == "unexplained" else " or ".join(rivals)
 
-    def on_sensor(self, rows: tuple[int, int], columns: tuple[int, int]) -> Verdict:
-        """Return it with pixels counted from the corner of the sensor, not from that of a window.
+    def on_sensor(
+        self, rows: tuple[int, int], columns: tuple[int, int], pixel: Callable[[int, int], tuple[int, int]]
+    ) -> Verdict:
+        """Return it with pixels counted from the corner of the sensor.
 
         Args:
-            rows: of the window, first and end.
+            rows: that were looked at, first and end.
             columns: likewise.
+            pixel: from the place (y, x) of a pixel among those looked at to that on the sensor.
         """
 
-        def moved(places: tuple[Place, ...]) -> tuple[Place, ...]:
-            return tuple(
-                place.model_copy(
-                    update={"pixels": tuple((y + rows[0], x + columns[0]) for y, x in place.pixels)}
-                )
-                for place in places
-            )
+        def moved(place: Place) -> Place:
+            pixels = tuple(dict.fromkeys(pixel(y, x) for y, x in place.pixels))
+            return place.model_copy(update={"pixels": pixels})
 
         examined = self.examined.model_copy(update={"rows": rows, "columns": columns})
-        return self.model_copy(update={"examined": examined, "where": moved(self.where)})
+        where = tuple(moved(place) for place in self.where)
+        return self.model_copy(update={"examined": examined, "where": where})
 
 
 def read_verdict(folder: Path) -> Verdict | None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
+from pchem_pipeline.discrepancy.by_likelihood.explainer import SampleHistograms, find_in_histograms
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.registry import effect_class
 
@@ -36,7 +36,7 @@ def histograms(seed, *, hidden="", sigma_e=0.25, strength=0.0):
     rng = np.random.default_rng(seed)
     exposure = rng.uniform(0.6, 4.0, PIXELS)
     step, bias = rng.uniform(13.0, 15.0, PIXELS), rng.uniform(80.0, 120.0, PIXELS)
-    counts, size = [], (PIXELS, SAMPLES)
+    size = (PIXELS, SAMPLES)
     h = np.broadcast_to(exposure[:, None], size)
     if hidden == "branching_counts":
         k = branching_numbers(rng, h, strength, size)
@@ -47,16 +47,19 @@ def histograms(seed, *, hidden="", sigma_e=0.25, strength=0.0):
     noise = rng.normal(size=size) * sigma_e
     if hidden == "signal_dependent_noise":
         noise += rng.normal(size=size) * np.sqrt(k) * strength
-    x = np.rint(bias[:, None] + step[:, None] * (k + noise)).astype(np.int64)
+    return counted(np.rint(bias[:, None] + step[:, None] * (k + noise)).astype(np.int64))
+
+
+def counted(x, **sample):
+    """Samples of codes (pixel, sample) as histograms."""
     origin = x.min(axis=1)
     width = int((x.max(axis=1) - origin).max()) + 1
-    for row, first in zip(x, origin, strict=True):
-        counts.append(np.bincount(row - first, minlength=width))
-    return np.array(counts, np.uint32), origin
+    counts = [np.bincount(row - first, minlength=width) for row, first in zip(x, origin, strict=True)]
+    return SampleHistograms(np.array(counts, np.uint32), origin, **sample)
 
 
 def test_nothing_hidden_is_consistent():
-    found = find_in_histograms(*histograms(1), SETTINGS).verdict
+    found = find_in_histograms([histograms(1)], SETTINGS).verdict
     assert found.verdict == "consistent"
     assert found.model_effects == ()
     assert found.effects == ()
@@ -70,7 +73,7 @@ def test_nothing_hidden_is_consistent():
     [("branching_counts", 0.08, "branching"), ("signal_dependent_noise", 0.11, "noise_e")],
 )
 def test_what_is_hidden_is_named(hidden, strength, name):
-    found = find_in_histograms(*histograms(7, hidden=hidden, strength=strength), SETTINGS).verdict
+    found = find_in_histograms([histograms(7, hidden=hidden, strength=strength)], SETTINGS).verdict
     assert found.verdict == "named", found.sentence
     assert found.effects == (hidden,)
     [step] = found.steps
@@ -85,7 +88,9 @@ def test_what_is_hidden_is_named(hidden, strength, name):
 
 
 def test_a_near_twin_is_told_apart_or_listed_beside_the_right_name():
-    found = find_in_histograms(*histograms(7, hidden="overdispersed_counts", strength=0.06), SETTINGS).verdict
+    found = find_in_histograms(
+        [histograms(7, hidden="overdispersed_counts", strength=0.06)], SETTINGS
+    ).verdict
     assert found.verdict in ("named", "ambiguous"), found.sentence
     listed = {c.effect for s in found.steps for c in s.candidates[:2]}
     assert "overdispersed_counts" in listed
@@ -96,7 +101,7 @@ def test_a_near_twin_is_told_apart_or_listed_beside_the_right_name():
 def test_an_effect_of_the_model_is_not_added_again_and_the_rest_is_consistent():
     present = effect_class("branching_counts")(branching=0.08)
     found = find_in_histograms(
-        *histograms(7, hidden="branching_counts", strength=0.08), SETTINGS, model=(present,)
+        [histograms(7, hidden="branching_counts", strength=0.08)], SETTINGS, model=(present,)
     )
     assert found.verdict.gap.before < 2 * found.verdict.gap.floor
     assert found.verdict.effects == ()
@@ -104,13 +109,13 @@ def test_an_effect_of_the_model_is_not_added_again_and_the_rest_is_consistent():
 
 
 def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
-    counts, origin = histograms(11, hidden="branching_counts", strength=0.2, sigma_e=0.12)
+    sample = histograms(11, hidden="branching_counts", strength=0.2, sigma_e=0.12)
     # a trigger that drops nine of ten samples without electrons
     rng = np.random.default_rng(2)
-    for row in counts:
+    for row in sample.counts:
         zero = np.argmax(row[:14]) + 7
         row[:zero] = rng.binomial(row[:zero], 0.1)
-    found = find_in_histograms(counts, origin, SETTINGS).verdict
+    found = find_in_histograms([sample], SETTINGS).verdict
     assert "branching_counts" in found.effects, found.sentence
     assert found.set_aside == ((None, 0.5),)
     fitted = next(s for s in found.steps if s.effect == "branching_counts")
@@ -123,4 +128,107 @@ def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
 
 def test_too_few_samples_are_refused_in_one_line():
     with pytest.raises(InputError, match="fewer than 900"):
-        find_in_histograms(np.ones((4, 50), np.uint32), np.zeros(4, np.int64), SETTINGS)
+        find_in_histograms([SampleHistograms(np.ones((4, 50), np.uint32), np.zeros(4, np.int64))], SETTINGS)
+
+
+# -- several exposures of the same pixels, all pixels alike ---------------------------------------------
+
+
+def exposures(seed, levels, *, hidden="", strength=0.0, sigma_e=0.25, times=(None, None, None)):
+    """A bias and three exposures of a sensor whose pixels differ by some percent, every sample drawn."""
+    rng = np.random.default_rng(seed)
+    step, bias = rng.uniform(13.9, 14.1, PIXELS), rng.uniform(80.0, 120.0, PIXELS)
+    scale = rng.uniform(0.98, 1.02, PIXELS)
+    samples = []
+    for level, time in zip((0.0, *levels), (None, *times), strict=True):
+        h = np.broadcast_to((level * scale)[:, None], (PIXELS, 6000))
+        if hidden == "spurious_charge" and level:
+            h = h + strength
+        k = rng.poisson(h)
+        if hidden == "branching_counts":
+            k = branching_numbers(rng, h, strength, h.shape)
+        elif hidden == "overdispersed_counts":
+            k = rng.poisson(h * rng.gamma(1 / strength, strength, h.shape))
+        noise = rng.normal(size=k.shape) * sigma_e
+        if hidden == "signal_dependent_noise":
+            noise += rng.normal(size=k.shape) * np.sqrt(k) * strength
+        x = np.rint(bias[:, None] + step[:, None] * (k + noise)).astype(np.int64)
+        samples.append(counted(x, bias=level == 0.0, integration_time=time))
+    return samples
+
+
+def strength_of(step, name):
+    fitted = step.parameters[name]
+    assert 0 < fitted.stderr < 0.2 * fitted.value
+    return fitted.value, fitted.stderr
+
+
+@pytest.mark.parametrize(
+    ("hidden", "strength", "name"),
+    [("branching_counts", 0.08, "branching"), ("overdispersed_counts", 0.06, "relative_variance")],
+)
+def test_several_exposures_tell_branching_from_overdispersion(hidden, strength, name):
+    samples = exposures(1, (0.5, 1.5, 4.5), hidden=hidden, strength=strength)
+    single = find_in_histograms(samples[2:3], SETTINGS).verdict
+    assert single.verdict == "ambiguous", single.sentence
+    [step] = single.steps
+    assert {c.effect for c in step.candidates} == {"branching_counts", "overdispersed_counts"}
+    joint = find_in_histograms(samples, SETTINGS).verdict
+    assert joint.verdict == "named", joint.sentence
+    assert joint.effects == (hidden,)
+    value, stderr = strength_of(joint.steps[0], name)
+    assert abs(value - strength) < 5 * stderr
+    assert joint.gap.after < joint.gap.before / 5
+
+
+def test_several_exposures_tell_signal_dependent_noise_from_a_gain_error():
+    """Where peaks overlap, var = H / g^2 (1 + s^2): one exposure takes such noise for another gain."""
+    samples = exposures(1, (0.7, 2.5, 8.0), hidden="signal_dependent_noise", strength=0.15, sigma_e=0.35)
+    single = find_in_histograms(samples[3:], SETTINGS)
+    assert single.verdict.verdict == "consistent", single.verdict.sentence
+    steps = 1.0 / single.maps.conversion_gain
+    # DN per electron is too large by s^2, half of it and more
+    assert np.median(steps) / 14.0 - 1.0 > 0.15**2 / 2
+    joint = find_in_histograms(samples, SETTINGS)
+    assert joint.verdict.effects == ("signal_dependent_noise",), joint.verdict.sentence
+    value, stderr = strength_of(joint.verdict.steps[0], "noise_e")
+    assert abs(value - 0.15) < 5 * stderr
+    steps = 1.0 / joint.maps.conversion_gain[:, 0]
+    assert abs(np.median(steps) / 14.0 - 1.0) < 0.15**2 / 4
+
+
+def test_integration_times_tell_spurious_charge_from_dark_current():
+    settings = SETTINGS.model_copy(update={"candidates": (*CANDIDATES, "spurious_charge")})
+    levels, times = (0.5, 1.5, 4.5), (1.0, 3.0, 9.0)
+    hidden = {"hidden": "spurious_charge", "strength": 0.1}
+    found = find_in_histograms(exposures(1, levels, times=times, **hidden), settings).verdict
+    assert found.effects == ("spurious_charge",), found.sentence
+    value, stderr = strength_of(found.steps[0], "mean_e")
+    assert abs(value - 0.1) < 5 * stderr
+    assert "spurious_charge" not in found.untestable
+    # dark current alone, exposures that are no matter of time, and the same charge without times
+    alone = find_in_histograms(exposures(1, levels, times=times), settings).verdict
+    other = find_in_histograms(exposures(1, levels, times=(1.0, 2.0, 9.0)), settings).verdict
+    timeless = find_in_histograms(exposures(1, levels, **hidden), settings).verdict
+    for verdict in (alone, other, timeless):
+        assert verdict.verdict == "consistent", verdict.sentence
+    assert "spurious_charge" in timeless.untestable
+
+
+def test_samples_of_other_pixels_are_refused():
+    first, second = histograms(1), histograms(2)
+    with pytest.raises(InputError, match="different numbers of pixels"):
+        find_in_histograms([first, SampleHistograms(second.counts[:5], second.origin[:5])], SETTINGS)
+
+
+def test_places_are_those_of_the_sensor():
+    """Pixel 13 of a sensor of 6 columns, whichever of its samples shows it."""
+    samples = exposures(1, (0.5, 1.5, 4.5))
+    for sample in samples[1:]:
+        row = sample.counts[13]
+        row[:] = 0
+        row[::2] = 200
+    found = find_in_histograms(samples, SETTINGS, width=6).verdict
+    assert found.examined.rows == (0, 4)
+    assert found.examined.columns == (0, 6)
+    assert all(y < 4 and x < 6 for place in found.where for y, x in place.pixels)

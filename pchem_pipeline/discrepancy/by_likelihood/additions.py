@@ -14,7 +14,7 @@ from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.residuals import find_residuals, set_aside_residual
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
-from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
 from pchem_pipeline.discrepancy.by_likelihood.views import electrons_of
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel
@@ -54,7 +54,7 @@ class AddedSets:
         carried = 0.0 if kept.all() else carried_over(self.plain.log_masses, self.parts[2], kept)
         old = self.found.sets
         self.both = self.parts[0] + self.parts[1]
-        self.sets = SetComparison(self.both, old.test, old.origin, kept, old.present, old.start)
+        self.sets = replace(old.on(kept, old.start), train=self.both)
         self.gaps = LikelihoodGap(self.parts[2], kept, carried, self.replicates, self.rng)
 
     def close(
@@ -117,7 +117,8 @@ class AddedSets:
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
         code = evidence.code
-        expected, origin = self._expected(fitted), self.sets.origin
+        lit = np.tile(~np.array(self.sets.samples.dark), self.both.shape[0] // self.sets.samples.n)
+        expected, origin = self._expected(fitted)[lit], self.sets.origin[lit]
         if evidence.maps.usable.sum() != expected.shape[0]:
             return None
         found = np.zeros(code.observed.size)
@@ -125,7 +126,7 @@ class AddedSets:
             at = first + np.arange(row.size)
             within = (at >= 0) & (at < found.size)
             np.add.at(found, at[within], row[within])
-        return np.asarray(found * code.observed.sum() / max(float(self.both.sum()), 1.0))
+        return np.asarray(found * code.observed.sum() / max(float(self.both[lit].sum()), 1.0))
 
     def _expected(self, fitted: FittedSet) -> FloatArray:
         """Return the samples of train and test expected at each code given those in codes that are kept."""
@@ -211,11 +212,11 @@ def _stderr(extended: FittedSet, member: Member, apart: float) -> float:
 
 
 def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
-    """Return how far the parameters of the pixels moved: median, and in standard errors."""
+    """Return how far the parameters of the pixels moved: median over the rows, and in standard errors."""
     change = after.fit.parameters - before.fit.parameters
     h, g, _, sigma = after.fit.parameters.T
-    slopes = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(after.fit.theta[:, 3]) / sigma], axis=1)
-    error = np.sqrt(np.maximum(np.einsum("naa->na", after.fit.own_covariance), 0.0)) * np.abs(slopes)
+    slopes = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(after.fit.row_theta[:, 3]) / sigma], axis=1)
+    error = np.sqrt(np.maximum(after.fit.row_variance, 0.0)) * np.abs(slopes)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error > 0, change / error, np.nan)
     return {

@@ -17,22 +17,25 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
-from pchem_pipeline.discrepancy.by_likelihood.members import find_members
+from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
 from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, split_samples
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.observe import observe_histograms
+from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
+from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.fit.joint import fit_joint
+from pchem_pipeline.model.fit.shared import Samples
 
-__all__ = ["HistogramExplainer", "find_in_histograms"]
+__all__ = ["HistogramExplainer", "SampleHistograms", "find_in_histograms"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -41,52 +44,84 @@ _FEWEST_SAMPLES = 300  # of a pixel
 _MOST_PIXELS = 256  # looked at; more add nothing about what all have in common
 _FEWEST_REPLICATES = 40
 _LARGEST_TOTAL = 10**9 - 1  # samples of a pixel that can be split at random
+_SIGMAS, _PRICE = 3.0, 3.0  # standard errors, and nats, by which a set must improve the score
+_CONVINCING = 6.0  # nats, where no statistic deviates by itself
+
+
+@dataclass(frozen=True)
+class SampleHistograms:
+    """Histograms of n pixels in one sample (exposure).
+
+    Attributes:
+        counts: one histogram per pixel, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        bias: frames without electrons, H = 0.
+        integration_time: s; where all samples have one, and their exposures lie on a line over it, spurious
+            charge is told from dark current.
+    """
+
+    counts: NDArray[np.integer]
+    origin: NDArray[np.integer]
+    bias: bool = False
+    integration_time: float | None = None
 
 
 def find_in_histograms(
-    counts: NDArray[np.integer],
-    origin: NDArray[np.integer],
+    samples: Sequence[SampleHistograms],
     settings: DiscrepancySettings | None = None,
     *,
     model: Sequence[Effect] = (),
+    width: int | None = None,
 ) -> Discrepancy:
     """Find where histograms disagree with the fitted model, name the effects, and add them.
 
+    Several samples of the same pixels share g, mu and sigma: what looks alike in one exposure (branching and
+    over-dispersion, say) depends on the exposure in its own way.
+
     Args:
-        counts: histograms of n pixels, shape (n, B).
-        origin: DN of bin 0, shape (n,).
+        samples: one or more, of the same pixels.
         settings: the section ``discrepancy``; the defaults if None.
         model: effects that the model has already; none of them is added again.
+        width: pixels in a row of the sensor; None: it has one row.
 
     Returns:
         The verdict, with everything that supports it.
 
     Raises:
-        InputError: the samples are too few.
+        InputError: the samples are too few, or not of the same pixels.
         PchEmError: no pixel has a usable fit.
         ConfigError: a candidate is unknown.
     """
-    _check(counts)
-    return search(HistogramExplainer(counts, origin, settings or DiscrepancySettings(), tuple(model)))
+    _check(samples)
+    found = search(HistogramExplainer(tuple(samples), settings or DiscrepancySettings(), tuple(model)))
+    n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
+    row = width or n
+    verdict = found.verdict.on_sensor((0, n // row), (0, row), lambda _, x: divmod(x // n_lit, row))
+    return replace(found, verdict=verdict)
 
 
-def _check(counts: NDArray[np.integer]) -> None:
-    most = int(counts.sum(axis=1).max()) if counts.size else 0
-    if most < 3 * _FEWEST_SAMPLES:
-        raise InputError(
-            f"the fullest histogram holds {most} samples, fewer than {3 * _FEWEST_SAMPLES}: nothing can be "
-            "compared; take more frames"
-        )
-    if most > _LARGEST_TOTAL:
-        raise InputError(f"a histogram holds {most} samples; at most {_LARGEST_TOTAL} can be split")
+def _check(samples: Sequence[SampleHistograms]) -> None:
+    if len({sample.counts.shape[0] for sample in samples}) != 1 or all(sample.bias for sample in samples):
+        raise InputError("the samples hold different numbers of pixels, or no electrons; give one exposure")
+    for sample in samples:
+        most = int(sample.counts.sum(axis=1).max()) if sample.counts.size else 0
+        if most < 3 * _FEWEST_SAMPLES:
+            raise InputError(
+                f"the fullest histogram holds {most} samples, fewer than {3 * _FEWEST_SAMPLES}: nothing can "
+                "be compared; take more frames"
+            )
+        if most > _LARGEST_TOTAL:
+            raise InputError(f"a histogram holds {most} samples; at most {_LARGEST_TOTAL} can be split")
 
 
 @dataclass
 class HistogramExplainer:
-    """Tells effects apart in histograms; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`."""
+    """Tells effects apart in histograms; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
 
-    counts: NDArray[np.integer]
-    origin: NDArray[np.integer]
+    Arrays have a row for each sample of each pixel, those of a pixel one after the other.
+    """
+
+    data: tuple[SampleHistograms, ...]
     settings: DiscrepancySettings
     model: tuple[Effect, ...]
     samples: str = "histograms"
@@ -101,24 +136,36 @@ class HistogramExplainer:
         self.classes = candidate_classes(self.settings)
         self.rng = np.random.default_rng(self.settings.seed)
         self.present = self.model
+        self.layout = Samples(tuple(sample.bias for sample in self.data))
+        self.n_pixels = self.data[0].counts.shape[0]
+
+    @property
+    def joint(self) -> bool:
+        """Whether there are several samples."""
+        return len(self.data) > 1
 
     def split(self) -> tuple[Evidence, Examined]:
-        """Split the samples at random, and choose the pixels to look at."""
-        parts = split_samples(self.counts, 3, self.rng)
-        self.evidence = _observe(parts[0], self.origin)
-        chosen = _choose(self.evidence, self.counts.sum(axis=1))
-        self.chosen = chosen
-        self.parts = tuple(part[chosen] for part in parts)
-        self.places = np.asarray(self.origin, np.int64)[chosen]
+        """Split the samples at random, fit the train part, and choose the pixels to look at."""
+        counts, origin = _rows(self.data)
+        parts = split_samples(counts, 3, self.rng)
+        together = self._fitted_together(parts[0], origin) if self.joint else None
+        self.evidence = self._observe(parts[0], origin, together)
+        start = _parameters(self.evidence.maps) if together is None else together
+        self.chosen = _choose(start, counts.sum(axis=1), self.layout.n)
+        self.start = start[self.chosen]
+        self.parts = tuple(part[self.chosen] for part in parts)
+        self.origin = origin[self.chosen]
+        self._compare_on_a_line()
         self.members, untestable, self.left_out = find_members(self.classes, self.evidence, self.present)
         always = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
-        self.untestable = dict(sorted((always | untestable).items()))
+        found = {tag: why for tag, why in (always | untestable).items() if tag not in self.classes}
+        self.untestable = dict(sorted((found | untestable).items()))
         sizes = [int(part.sum()) for part in self.parts]
         return self.evidence, Examined(
-            histograms=chosen.size,
+            histograms=self.chosen.size,
             frames=int(sum(part.sum(axis=1).max() for part in self.parts)),
             rows=(0, 1),
-            columns=(0, self.counts.shape[0]),
+            columns=(0, self.n_pixels),
             train=sizes[0],
             test=sizes[1],
             final=sizes[2],
@@ -126,36 +173,38 @@ class HistogramExplainer:
 
     def null(self) -> tuple[NullModel, Measured]:
         """Fit the model to the train part, and observe histograms drawn from it, each with its own fit."""
-        train, test, _ = self.parts
-        maps = self.evidence.maps
-        columns = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
-        start = np.stack([values.ravel()[self.chosen] for values in columns], axis=1)
-        every = np.ones(train.shape, np.bool_)
-        self.sets = SetComparison(train, test, self.places, every, self.present, start)
+        self.sets = self._sets(self.layout)
         plain = self.sets.fit(())
-        own = [_observe(part, self.places).z for part in self.parts]
+        self.bare = replace(self.sets, present=(), start=plain.fit.parameters)
+        own = [self._observed(part) for part in self.parts]
         vectors = self._drawn(plain.log_masses)
         common = set(STATISTICS).intersection(*vectors, *own)
         names = tuple(name for name in STATISTICS if name in common)
         z = Measured(*(as_matrix(names, [row])[0] for row in own))
-        self.plain = self.sets.fit((), plain.fit.parameters, train + test)
+        self.plain = self.sets.fit((), plain.fit.parameters, self.parts[0] + self.parts[1])
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
         return self.first, z
 
     def gap(self, null: NullModel, z: Measured) -> Gap:
         """Measure the gap of the likelihood on the final part."""
         whole = LikelihoodGap(self.parts[2], self.sets.kept, 0.0, self._count, self.rng)
-        return whole.gap(self.sets.problem((), self.parts[0] + self.parts[1]), self.plain.fit)
+        self.before = whole.gap(self.sets.problem((), self.parts[0] + self.parts[1]), self.plain.fit)
+        return self.before
 
     def suspects(self, null: NullModel, z: Measured) -> bool:
-        """Return False: what no statistic shows is not looked for."""
-        return False
+        """Tell whether several samples fit badly together although no statistic of one deviates."""
+        return self.joint and not self.before.at_floor
 
     def explain(self, null: NullModel, z: Measured, disagrees: bool) -> Explanation | None:
         """Find the set of effects that best predicts the test part, on the codes that are understood."""
-        self.found = explain(self.sets, self.members, self._count, self.rng)
-        self.left_out |= self.sets.failed | self.found.sets.failed
-        return self.found if self.found.named else None
+        found = explain(self.sets, self.members, self._count, self.rng)
+        self.left_out |= self.sets.failed | found.sets.failed
+        if not disagrees:
+            rise, error = found.sets.difference(found.judged, found.sets.fit(()))
+            if not found.named or rise < max(_CONVINCING, _SIGMAS * error):
+                return None
+        self.found = found
+        return found if found.named else None
 
     def add(self, explanation: Explanation, null: NullModel, z: Measured) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
@@ -178,11 +227,11 @@ class HistogramExplainer:
         return added
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
-        """Return the parameters of the pixels looked at, NaN elsewhere, shape (1, n)."""
-        n = self.counts.shape[0]
-        columns = np.full((4, n), np.nan)
+        """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
+        columns = np.full((4, self.n_pixels * self.layout.n), np.nan)
         columns[:, self.chosen] = self.final_fit.fit.parameters.T
-        exposure, gain, bias, noise = columns.reshape(4, 1, n)
+        shape = (self.n_pixels, self.layout.n) if self.joint else (1, self.n_pixels)
+        exposure, gain, bias, noise = columns.reshape(4, *shape)
         return Fitted(PixelMaps(exposure, gain, bias, noise, np.isfinite(exposure)), self.code)
 
     # -- pieces ---------------------------------------------------------------------------------
@@ -191,6 +240,51 @@ class HistogramExplainer:
     def _count(self) -> int:
         return max(self.settings.extended_replicates, _FEWEST_REPLICATES)
 
+    def _sets(self, layout: Samples) -> SetComparison:
+        """Return what fits the chosen rows, begun at the fit that they were observed with."""
+        train, test, _ = self.parts
+        every = np.ones(train.shape, np.bool_)
+        return SetComparison(train, test, self.origin, every, self.present, self.start, layout)
+
+    def _fitted_together(self, counts: IntArray, origin: IntArray) -> FloatArray:
+        """Fit the PCD to all samples of each pixel; return (H, g, mu, sigma) of the rows, NaN if unusable."""
+        j = self.layout.n
+        by_sample = [counts[k::j].astype(np.uint32) for k in range(j)]
+        fit = fit_joint(by_sample, [origin[k::j] for k in range(j)], dark=self.layout.dark)
+        usable = (fit.fit_status & UNTRUSTWORTHY) == 0
+        shared = np.stack([fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+        shared = np.repeat(shared[:, None], j, axis=1)
+        rows = np.concatenate([fit.quanta_exposure[:, :, None], shared], axis=2)
+        return np.asarray(np.where(usable[:, None, None], rows, np.nan).reshape(-1, 4))
+
+    def _compare_on_a_line(self) -> None:
+        """Let the exposures be in proportion to time, with spurious charge a candidate, where a line fits."""
+        times = [sample.integration_time for sample in self.data if not sample.bias]
+        tag = SpuriousCharge.model_fields["tag"].default
+        wanted = self.settings.candidates is None or tag in self.settings.candidates
+        if None in times or len(set(times)) < 2 or not wanted or tag in self.settings.exclude:
+            return
+        if tag in {effect.tag for effect in self.present}:
+            return
+        line = Samples(self.layout.dark, tuple(sample.integration_time or 0.0 for sample in self.data))
+        free, straight = self._sets(self.layout), self._sets(line)
+        best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
+        rise, error = free.difference(free.fit(()), best)
+        if rise <= max(_PRICE, _SIGMAS * error):
+            self.layout = line
+            self.classes = {**self.classes, tag: SpuriousCharge}
+
+    def _observed(self, counts: IntArray) -> Mapping[str, float]:
+        """Return the statistics of histograms of the chosen pixels, fitted with the PCD alone."""
+        parameters = self.bare.fit((), None, counts).fit.parameters if self.joint else None
+        return self._observe(counts, self.origin, parameters).z
+
+    def _observe(self, counts: IntArray, origin: IntArray, parameters: FloatArray | None) -> Evidence:
+        """Observe the rows with electrons; the others say nothing about how electrons come and are read."""
+        lit = np.tile(~np.array(self.layout.dark), origin.size // self.layout.n)
+        known = None if parameters is None else parameters[lit]
+        return observe_histograms(counts[lit].astype(np.uint32), origin[lit], parameters=known)
+
     def _drawn(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
         """Draw histograms from a law, and observe each, refit included."""
         mass = np.exp(log_masses)
@@ -198,7 +292,7 @@ class HistogramExplainer:
         total = self.parts[0].sum(axis=1)
         count = self.settings.replicates
         self.n_replicates += count
-        return [_observe(self.rng.multinomial(total, mass), self.places).z for _ in range(count)]
+        return [self._observed(self.rng.multinomial(total, mass)) for _ in range(count)]
 
     def _with_effects(self, found: Explanation) -> FloatArray:
         """Return the log masses of all codes: the plain law where codes are set aside, else with effects."""
@@ -209,15 +303,30 @@ class HistogramExplainer:
         return np.where(found.kept, best + share, plain)
 
 
-def _observe(counts: IntArray, origin: NDArray[np.integer]) -> Evidence:
-    return observe_histograms(counts.astype(np.uint32), np.asarray(origin, np.int64))
+def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:
+    """Return histograms (n J, B) and DN of bin 0, (n J,): the samples of a pixel one after the other."""
+    n, j = samples[0].counts.shape[0], len(samples)
+    counts = np.zeros((n, j, max(sample.counts.shape[1] for sample in samples)), np.int64)
+    for k, sample in enumerate(samples):
+        counts[:, k, : sample.counts.shape[1]] = sample.counts
+    origin = np.stack([np.asarray(sample.origin, np.int64) for sample in samples], axis=1)
+    return counts.reshape(n * j, -1), origin.ravel()
 
 
-def _choose(evidence: Evidence, total: NDArray[np.integer]) -> NDArray[np.intp]:
-    """Return pixels to look at: usable ones with samples enough, spread over the exposures."""
-    usable = np.flatnonzero(evidence.maps.usable.ravel() & (total >= 3 * _FEWEST_SAMPLES))
+def _parameters(maps: PixelMaps) -> FloatArray:
+    """Return (H, g, mu, sigma), (n, 4), NaN where not usable."""
+    columns = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    return np.stack([values.ravel() for values in columns], axis=1)
+
+
+def _choose(parameters: FloatArray, total: NDArray[np.integer], n_samples: int) -> NDArray[np.intp]:
+    """Return rows to look at: of usable pixels with samples enough, spread over the exposures."""
+    good = np.isfinite(parameters).all(axis=1) & (total >= 3 * _FEWEST_SAMPLES)
+    usable = np.flatnonzero(good.reshape(-1, n_samples).all(axis=1))
     if not usable.size:
         raise InputError("no histogram with enough samples has a usable fit; see fit_status")
-    order = usable[np.argsort(evidence.maps.quanta_exposure.ravel()[usable], kind="stable")]
+    exposure = parameters[:, 0].reshape(-1, n_samples).sum(axis=1)
+    order = usable[np.argsort(exposure[usable], kind="stable")]
     places = np.unique(np.linspace(0, order.size - 1, min(order.size, _MOST_PIXELS)).astype(np.intp))
-    return np.sort(order[places])
+    pixels = np.sort(order[places])
+    return np.asarray((pixels[:, None] * n_samples + np.arange(n_samples)).ravel(), np.intp)

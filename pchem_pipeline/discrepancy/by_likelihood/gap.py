@@ -8,12 +8,12 @@ contribution that they had under the plain model: what is not understood does no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_likelihood.sets import saturated
+from pchem_pipeline.discrepancy.by_likelihood.sets import chance_of_cells, saturated
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent
 
@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 
 
 def carried_over(log_masses: FloatArray, counts: IntArray, kept: NDArray[np.bool_]) -> float:
-    """Return what codes that were set aside, and their share, contribute to the gap of a model, nats.
+    """Return what codes that were set aside, and their share, contribute to the gap beyond chance, nats.
 
     With the gap among the kept codes it adds up to that of all codes (chain rule of the divergence).
 
@@ -40,7 +40,9 @@ def carried_over(log_masses: FloatArray, counts: IntArray, kept: NDArray[np.bool
     inside = np.where(kept, seen, 0.0).sum(axis=1)
     mass = np.where(kept, np.exp(log_masses), 0.0).sum(axis=1)
     share = inside * np.log(np.maximum(inside, 1.0) / total / np.maximum(mass, 1e-300))
-    return float((own + share).sum())
+    expected = np.where(kept, 0.0, np.exp(log_masses)) * total[:, None]
+    chance = chance_of_cells(expected) + chance_of_cells(mass * total)
+    return float((own + share).sum() - chance + 0.5 * total.size)
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,7 @@ class LikelihoodGap:
         return (self._distance(log_masses, self.counts) - chance + self.carried) / self.n_samples
 
     def _judged(self, problem: SharedProblem) -> SharedProblem:
-        return SharedProblem(
-            self.counts, problem.origin, self.kept, problem.law, problem.bounds, problem.scale
-        )
+        return replace(problem, counts=self.counts, kept=self.kept)
 
     def _distance(self, log_masses: FloatArray, counts: IntArray) -> float:
         return float((saturated(counts, self.kept) - (counts * log_masses).sum(axis=1)).sum())
@@ -110,7 +110,7 @@ class LikelihoodGap:
         )
         n_fitted = np.where(problem.kept, problem.counts, 0).sum(axis=1)
         n_compared = np.where(self.kept, self.counts, 0).sum(axis=1)
-        still, found = np.zeros(n_fitted.size), []
+        still, found = np.zeros(fit.theta.shape[0]), []
         for _ in range(self.replicates):
             drawn = self.rng.multinomial(n_fitted, fitted)
             own, shared, _ = tangent.slopes(drawn).step(still)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.model.fit.shared import Samples
 from pchem_pipeline.model.law.mass import marginal_mass
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
@@ -154,22 +155,31 @@ _ONE_PIXEL = pixel_maps([np.array([v]) for v in (2.0, 0.1, 100.0, 3.0)], np.ones
 
 
 def law_of(
-    present: Sequence[Effect], members: Sequence[Member], shared: FloatArray, own: FloatArray
+    present: Sequence[Effect],
+    members: Sequence[Member],
+    shared: FloatArray,
+    own: FloatArray,
+    samples: Samples,
 ) -> MarginalModel:
-    """Return the law of pixels with the effects present and the members at their coordinates.
+    """Return the law of rows of histograms with the effects present and the members at their coordinates.
 
     Args:
         present: effects of the model.
         members: candidates.
         shared: coordinates of all members, one after the other.
-        own: (H, g, mu, sigma) of the pixels, shape (n, 4).
+        own: (H, g, mu, sigma) of the rows, shape (n, 4).
+        samples: which rows are of one pixel; those without electrons get none from effects either.
     """
     effects, at = list(present), 0
     for member in members:
         n = len(member.coordinates)
         effects.append(member.at(shared[at : at + n]))
         at += n
-    return marginal_model(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
+    law = marginal_model(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
+    if any(samples.dark) and law.added_exposure.any():
+        lit = ~np.tile(np.array(samples.dark), own.shape[0] // samples.n)
+        law = replace(law, added_exposure=np.where(lit[:, None], law.added_exposure, 0.0))
+    return law
 
 
 def find_members(

@@ -153,8 +153,8 @@ def _narrowed(
     electrons = electrons_of(sets.origin, sets.train.shape[1], parameters)
     peak = _cut_peak(sets, electrons, candidates, whole)
     between = valleys(sets, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
-    wide = _narrow(sets, ~inside(peak, electrons), parameters)
-    view = _narrow(sets, ~inside(peak + between, electrons), parameters)
+    wide = sets.on(~inside(peak, electrons), parameters)
+    view = sets.on(~inside(peak + between, electrons), parameters)
     choice = compare_sets(view, candidates, coarse=True)
     steady, unsteady = _steady(wide, choice.best, candidates)
     rest = view.gap(choice.best) / max(view.gap(choice.plain), 1e-12)
@@ -180,7 +180,7 @@ def _cut_peak(
     """Return the peak without which known effects explain far more, if there is one."""
     best, found = _PAYS * sets.gap(whole.best) * sets.n_test, None
     for interval in doubtful_peaks(sets, electrons)[:_PEAKS_TRIED]:
-        view = _narrow(sets, ~interval.holds(electrons), whole.plain.fit.parameters)
+        view = sets.on(~interval.holds(electrons), whole.plain.fit.parameters)
         left = view.gap(compare_sets(view, candidates, largest=2, coarse=True).best) * view.n_test
         if left < best:
             best, found = left, interval
@@ -195,10 +195,6 @@ def _apart(member: Member, there: Member) -> float:
     """Return how far the strengths of two fits of an effect are apart."""
     name = member.effect.strength
     return abs(float(getattr(member.effect, name)) - float(getattr(there.effect, name))) if name else 0.0
-
-
-def _narrow(sets: SetComparison, kept: NDArray[np.bool_], start: FloatArray) -> SetComparison:
-    return SetComparison(sets.train, sets.test, sets.origin, kept, sets.present, start, dict(sets.failed))
 
 
 def _steady(

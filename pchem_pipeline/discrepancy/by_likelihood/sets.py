@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from scipy import special
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent, fit_shared, to_theta
+from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = [
@@ -134,11 +134,12 @@ class SetComparison:
     """Fits sets of effects to one part of the samples and scores them on another.
 
     Attributes:
-        train, test: histograms, shape (n, B).
+        train, test: histograms, shape (n, B); a row for each sample of each pixel.
         origin: DN of bin 0, shape (n,).
         kept: codes that count, shape (n, B).
         present: effects that the model has.
         start: (H, g, mu, sigma), shape (n, 4).
+        samples: which rows are of one pixel.
         failed: candidates that could not be fitted, and why.
     """
 
@@ -148,8 +149,18 @@ class SetComparison:
     kept: NDArray[np.bool_]
     present: tuple[Effect, ...]
     start: FloatArray
+    samples: Samples = field(default_factory=Samples)
     failed: dict[str, str] = field(default_factory=dict)
     _known: dict[frozenset[str], FittedSet] = field(default_factory=dict)
+
+    def on(self, kept: NDArray[np.bool_], start: FloatArray) -> SetComparison:
+        """Return the same on other codes, begun elsewhere.
+
+        Args:
+            kept: codes that count, shape (n, B).
+            start: (H, g, mu, sigma), shape (n, 4).
+        """
+        return replace(self, kept=kept, start=start, failed=dict(self.failed), _known={})
 
     @property
     def n_test(self) -> float:
@@ -160,7 +171,7 @@ class SetComparison:
         """Return what a set is fitted to: the train part, or other histograms."""
 
         def law(shared: FloatArray, own: FloatArray) -> MarginalModel:
-            return law_of(self.present, members, shared, own)
+            return law_of(self.present, members, shared, own, self.samples)
 
         coordinates = [c for m in members for c in m.coordinates]
         return SharedProblem(
@@ -170,6 +181,7 @@ class SetComparison:
             law,
             np.array([c.bounds for c in coordinates], np.float64).reshape(-1, 2),
             np.concatenate([np.zeros(0), *(m.scale for m in members)]),
+            self.samples,
         )
 
     def fit(
@@ -227,13 +239,14 @@ class SetComparison:
         total = np.where(self.kept, self.test, 0).sum(axis=1, keepdims=True)
         chance = chance_of_cells(np.where(self.kept, np.exp(found.log_masses), 0.0) * total)
         # a fitted parameter costs half a nat on samples that were not fitted; the fixed total saves as much
-        chance += 0.5 * (3.0 * total.size + found.fit.shared.size)
+        own = found.fit.theta.shape[0] * self.samples.n_free
+        chance += 0.5 * float(own - total.size + found.fit.shared.size)
         return float(saturated(self.test, self.kept).sum() - found.score - chance) / max(self.n_test, 1.0)
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
         """Return candidates, each moved by a first-order step, by the rise that this step promises."""
         problem = self.problem(base.members)
-        theta = to_theta(base.fit.parameters)
+        theta = self.samples.theta(base.fit.parameters)
         tangent = Tangent.at(problem, theta, base.fit.shared)
         seen = np.where(self.kept, self.train, 0).astype(np.float64)
         weights = tangent.masses * seen.sum(axis=1)[:, None]
@@ -250,7 +263,8 @@ class SetComparison:
             d = np.concatenate([tangent.derivatives, slope[:, None, :]], axis=1)
             information = (d * weights[:, None, :]) @ d.transpose(0, 2, 1)
             score = np.einsum("nab,nb->na", d, seen)
-            rise, length = _one_step(information, score, len(theta[0]))
+            information, score = self.samples.by_pixel(information, score)
+            rise, length = _one_step(information, score, theta.shape[1])
             if not member.coordinates:
                 ranked.append((np.inf, member))
             elif length * step > 0 or member.coordinates[0].bounds[0] < 0:

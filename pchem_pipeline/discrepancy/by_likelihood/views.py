@@ -8,7 +8,7 @@ and what is named must be found in all of these views.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,7 @@ def valleys(sets: SetComparison, electrons: FloatArray, sigma_e: float) -> tuple
 
 def _gap(sets: SetComparison, kept: NDArray[np.bool_]) -> float:
     """Return the gap of the plain law among some codes, nats per sample of all."""
-    view = SetComparison(sets.train, sets.train, sets.origin, kept, sets.present, sets.start)
+    view = replace(sets.on(kept, sets.start), test=sets.train)
     return float(saturated(view.train, kept).sum() - view.fit(()).score) / float(sets.train.sum())
 
 

@@ -7,7 +7,7 @@ whatever the model of the run.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,10 +80,10 @@ def observe(
     outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
     wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
     origin = histograms.origin.ravel().astype(np.int64)
-    evidence, laws = _marginal(
-        counts, origin, outside, wanted.ravel(), fit, (shape[0], shape[1]),
-        (histograms.minimum.ravel(), histograms.maximum.ravel()), start,
-    )  # fmt: skip
+    result, parameters, usable = _fitted(counts, origin, outside, wanted.ravel(), fit, start)
+    seen = _Seen(counts, origin, outside, histograms.minimum.ravel(), histograms.maximum.ravel())
+    evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]))
+    evidence = _with_fit(evidence, result)
     edges = blocks_of(numbers, block_frames)
     maps = evidence.maps
     pixels = pixel_statistics(
@@ -104,14 +104,20 @@ def observe(
 
 
 def observe_histograms(
-    counts: NDArray[np.unsignedinteger[Any]], origin: IntArray, *, fit: FitSettings | None = None
+    counts: NDArray[np.unsignedinteger[Any]],
+    origin: IntArray,
+    *,
+    fit: FitSettings | None = None,
+    parameters: FloatArray | None = None,
 ) -> Evidence:
     """Return the evidence of ready-made histograms: no time, no neighbours.
 
     Args:
-        counts: one histogram per pixel, (n, B).
+        counts: one histogram per pixel (and sample), (n, B).
         origin: DN of bin 0, (n,).
         fit: settings of the fit; the defaults if None.
+        parameters: (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not usable;
+            None: each histogram is fitted by itself.
 
     Returns:
         Evidence with maps of shape (1, n) and ``time`` None.
@@ -123,8 +129,12 @@ def observe_histograms(
     filled = counts > 0
     low = origin + np.argmax(filled, axis=1)
     high = origin + counts.shape[1] - 1 - np.argmax(filled[:, ::-1], axis=1)
+    seen = _Seen(counts, origin.astype(np.int64), np.zeros((n, 2)), low, high)
+    if parameters is not None:
+        return _compared(seen, parameters, np.asarray(np.isfinite(parameters).all(axis=1)), (1, n))[0]
     every = np.ones(n, np.bool_)
-    return _marginal(counts, origin.astype(np.int64), np.zeros((n, 2)), every, fit, (1, n), (low, high))[0]
+    result, parameters, usable = _fitted(counts, seen.origin, seen.outside, every, fit, None)
+    return _with_fit(_compared(seen, parameters, usable, (1, n))[0], result)
 
 
 def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
@@ -140,20 +150,24 @@ def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
         )
 
 
-def _marginal(
-    counts: NDArray[Any],
-    origin: IntArray,
-    outside: FloatArray,
-    wanted: NDArray[np.bool_],
-    fit: FitSettings | None,
-    shape: tuple[int, int],
-    extremes: tuple[NDArray[Any], NDArray[Any]],
-    near: PixelMaps | None = None,
+@dataclass(frozen=True)
+class _Seen:
+    """Histograms (n, B), DN of bin 0, samples below and above (n, 2), smallest and largest code of each."""
+
+    counts: NDArray[Any]
+    origin: IntArray
+    outside: FloatArray
+    minimum: NDArray[Any]
+    maximum: NDArray[Any]
+
+
+def _compared(
+    seen: _Seen, parameters: FloatArray, usable: NDArray[np.bool_], shape: tuple[int, int]
 ) -> tuple[Evidence, PixelLaws]:
-    """Fit the histograms and compare them with their laws."""
-    result, parameters, usable = _fitted(counts, origin, outside, wanted, fit, near)
+    """Compare histograms with the PCD at the parameters of a fit."""
+    counts, outside = seen.counts, seen.outside
     inside = counts.sum(axis=1)
-    laws = pixel_laws(counts, origin, outside, parameters, usable)
+    laws = pixel_laws(counts, seen.origin, outside, parameters, usable)
     good = laws.good
     if not good.any():
         raise PchEmError(
@@ -165,12 +179,12 @@ def _marginal(
         laws.first_code,
         laws.codes[0],
         laws.codes[1],
-        int(extremes[0][good].min()),
-        int(extremes[1][good].max()),
+        int(seen.minimum[good].min()),
+        int(seen.maximum[good].max()),
     )
 
-    def tail(seen: int) -> NDArray[np.uint32]:
-        return np.where(good, laws.moments[:, seen], 0.0).reshape(shape).astype(np.uint32)
+    def tail(moment: int) -> NDArray[np.uint32]:
+        return np.where(good, laws.moments[:, moment], 0.0).reshape(shape).astype(np.uint32)
 
     evidence = Evidence(
         maps=_maps(masked, good.reshape(shape)),
@@ -187,10 +201,18 @@ def _marginal(
         code=residuals,
         time=None,
         z=in_order(marginal_statistics(laws, parameters[:, 0], residuals)),
-        covariance=result.covariance.reshape(*shape, 4, 4),
-        ambiguous=float(np.mean((result.fit_status[good] & FitStatus.BIAS_AMBIGUOUS) != 0)),
     )
     return evidence, laws
+
+
+def _with_fit(evidence: Evidence, result: FitResult) -> Evidence:
+    """Return the evidence with covariances and doubts of the fit that it was compared with."""
+    good = evidence.maps.usable
+    return replace(
+        evidence,
+        covariance=result.covariance.reshape(*good.shape, 4, 4),
+        ambiguous=float(np.mean((result.fit_status[good.ravel()] & FitStatus.BIAS_AMBIGUOUS) != 0)),
+    )
 
 
 def _fitted(

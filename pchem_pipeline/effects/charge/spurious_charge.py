@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import MarginalModel
 
 __all__ = ["SpuriousCharge"]
 
@@ -53,6 +54,10 @@ class SpuriousCharge(Effect):
             return values.copy()
         result: NDArray[Any] = values + context.random.poisson(np.full(values.shape, self.mean_e))
         return result
+
+    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+        """Return the law with this charge on top of H, which is then the exposure without it."""
+        return model.with_added_exposure([[self.mean_e]], [[1.0]])
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

@@ -7,12 +7,15 @@ border for what they share, so a step costs no more than the pixels' own.
 
 Codes may be left out, pixel by pixel: the likelihood is then conditional on the other codes, so that what is
 not understood in one place (a cut, a contamination) does not bend the parameters found in another.
+
+A pixel may have several samples (exposures): they share g, mu and sigma, and each has an exposure of its own,
+or all lie in proportion to their integration times (:class:`Samples`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +24,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import marginal_mass, marginal_slopes
 from pchem_pipeline.model.law.sample_law import MarginalModel
 
-__all__ = ["SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared", "to_parameters", "to_theta"]
+__all__ = ["Samples", "SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared"]
 
 FloatArray = NDArray[np.float64]
 #: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
@@ -33,6 +36,102 @@ _REACH_EXPOSURE, _REACH_STEP = 2.0, 0.3  # logarithms
 _LOG_16 = float(np.log(16.0))  # a read noise of a quarter of a step
 _LOWEST_LOG_VARIANCE = float(np.log(1e-4))
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e8
+_NO_ELECTRONS = 1e-9  # e-: the exposure of a sample without any
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of a pixel: each is a row of the histograms, the rows of a pixel follow one another.
+
+    With J samples, P = J + 3 own parameters: (log H_1, ..., log H_J, log 1/g, mu, log sigma_R^2). With times,
+    ``H_j = D t_j`` and P = 4: (log D, log 1/g, mu, log sigma_R^2), D in e-/px/s.
+
+    Attributes:
+        dark: samples without electrons, H = 0.
+        times: integration times, s; None: every sample has an exposure of its own.
+    """
+
+    dark: tuple[bool, ...] = (False,)
+    times: tuple[float, ...] | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of samples of a pixel, J."""
+        return len(self.dark)
+
+    @property
+    def n_exposures(self) -> int:
+        """Own parameters that are exposures."""
+        return self.n if self.times is None else 1
+
+    @property
+    def n_free(self) -> int:
+        """Own parameters that are fitted."""
+        held = sum(map(self._empty, range(self.n))) if self.times is None else 0
+        return self.n_exposures + 3 - held
+
+    @property
+    def slopes(self) -> FloatArray:
+        """Derivatives of (log H, log 1/g, mu, log sigma_R^2) of each row in the own parameters, (J, 4, P)."""
+        m = self.n_exposures
+        found = np.zeros((self.n, 4, m + 3))
+        for j in range(self.n):
+            found[j, 0, 0 if self.times is not None else j] = 0.0 if self._empty(j) else 1.0
+            found[j, 1:, m:] = np.eye(3)
+        return found
+
+    def _empty(self, j: int) -> bool:
+        return self.dark[j] or (self.times is not None and self.times[j] == 0.0)
+
+    def rows(self, theta: FloatArray) -> FloatArray:
+        """Return (log H, log 1/g, mu, log sigma_R^2) of the rows, (n J, 4), of own parameters (n, P)."""
+        if self == Samples():
+            return theta
+        m = self.n_exposures
+        found = np.repeat(theta[:, None, m - 1 :], self.n, axis=1)
+        for j in range(self.n):
+            log_h = theta[:, j] if self.times is None else theta[:, 0]
+            if self._empty(j):
+                found[:, j, 0] = np.log(_NO_ELECTRONS)
+            else:
+                found[:, j, 0] = log_h + (0.0 if self.times is None else np.log(self.times[j]))
+        return np.asarray(found.reshape(-1, 4))
+
+    def theta(self, parameters: FloatArray) -> FloatArray:
+        """Return own parameters (n, P) of (H, g, mu, sigma), (n J, 4); g, mu, sigma of the first sample."""
+        rows = _to_theta(parameters)
+        if self == Samples():
+            return rows
+        by_sample = rows.reshape(-1, self.n, 4)
+        exposures = by_sample[:, :, 0]
+        if self.times is not None:
+            lit = [j for j in range(self.n) if not self._empty(j)]
+            total = np.exp(exposures[:, lit]).sum(axis=1) / sum(self.times[j] for j in lit)
+            exposures = np.log(total)[:, None]
+        return np.concatenate([exposures, by_sample[:, 0, 1:]], axis=1)
+
+    def by_pixel(self, information: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return information and score in own and shared parameters of each pixel.
+
+        Args:
+            information: of the rows, own parameters first, shape (n J, 4 + d, 4 + d).
+            score: likewise, shape (n J, 4 + d).
+
+        Returns:
+            Shapes (n, P + d, P + d) and (n, P + d).
+        """
+        if self == Samples():
+            return information, score
+        more = score.shape[1] - 4
+        slopes = np.zeros((self.n, 4 + more, self.n_exposures + 3 + more))
+        slopes[:, :4, : self.n_exposures + 3] = self.slopes
+        slopes[:, 4:, self.n_exposures + 3 :] = np.eye(more)
+        by_sample = information.reshape(-1, self.n, *information.shape[1:])
+        whole = np.einsum("jap,njab,jbq->npq", slopes, by_sample, slopes, optimize=True)
+        # an exposure that is held gets no score, and so no step, whatever its information
+        held = np.flatnonzero(~slopes.any(axis=(0, 1)))
+        whole[:, held, held] = 1.0
+        return whole, np.einsum("jap,nja->np", slopes, score.reshape(-1, self.n, 4 + more))
 
 
 @dataclass(frozen=True)
@@ -40,12 +139,13 @@ class SharedProblem:
     """Histograms and the law that they are to follow.
 
     Attributes:
-        counts: histograms, shape (n, B).
+        counts: histograms, shape (n, B); n counts the samples of all pixels.
         origin: DN of bin 0, shape (n,).
         kept: codes that count, shape (n, B).
-        law: from shared and own parameters to the law of the pixels.
+        law: from shared and own parameters to the law of the rows.
         bounds: lowest and highest value of each shared parameter, shape (d, 2).
         scale: natural scale of each shared parameter, shape (d,).
+        samples: which rows are of one pixel.
     """
 
     counts: NDArray[np.integer]
@@ -54,6 +154,7 @@ class SharedProblem:
     law: Law
     bounds: FloatArray
     scale: FloatArray
+    samples: Samples = field(default_factory=Samples)
 
     @property
     def n_shared(self) -> int:
@@ -62,7 +163,7 @@ class SharedProblem:
 
     def masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the mass of every code, those left out included, shape (n, B)."""
-        own = to_parameters(theta)
+        own = _to_parameters(self.samples.rows(theta))
         codes = self.origin[:, None] + np.arange(self.counts.shape[1])
         return marginal_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
 
@@ -73,11 +174,12 @@ class SharedProblem:
         return np.where(self.kept, np.log(np.maximum(mass, _LEAST_MASS) / inside), 0.0)
 
     def log_likelihood(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
-        """Return the log-likelihood of each pixel, nats, shape (n,); -inf where the law refuses."""
+        """Return the log-likelihood of each pixel, nats; -inf where the law refuses."""
         try:
-            found = (self.counts * self.log_masses(theta, shared)).sum(axis=1)
+            rows = (self.counts * self.log_masses(theta, shared)).sum(axis=1)
         except ValueError:  # fields that do not go together
             return np.full(theta.shape[0], -np.inf)
+        found = rows.reshape(-1, self.samples.n).sum(axis=1)
         return np.where(np.isfinite(found), found, -np.inf)
 
 
@@ -86,12 +188,13 @@ class SharedFit:
     """Estimates.
 
     Attributes:
-        theta: (log H, log 1/g, mu, log sigma_R^2) of the pixels, shape (n, 4).
+        theta: own parameters of the pixels (see :class:`Samples`), shape (n, P).
         shared: shared parameters, shape (d,).
-        own_covariance: of the pixels' parameters, the shared ones taken as known, shape (n, 4, 4).
+        own_covariance: of the own parameters, the shared ones taken as known, shape (n, P, P).
         covariance: of the shared parameters, shape (d, d), from the information; NaN for one at its bound.
         log_likelihood: nats, shape (n,).
         converged: whether the rise that a further step promises is below the tolerance.
+        samples: which rows are of one pixel.
     """
 
     theta: FloatArray
@@ -100,20 +203,35 @@ class SharedFit:
     covariance: FloatArray
     log_likelihood: FloatArray
     converged: bool
+    samples: Samples = field(default_factory=Samples)
+
+    @property
+    def row_theta(self) -> FloatArray:
+        """(log H, log 1/g, mu, log sigma_R^2) of the rows, shape (n J, 4)."""
+        return self.samples.rows(self.theta)
 
     @property
     def parameters(self) -> FloatArray:
-        """(H, g, mu, sigma) of the pixels, shape (n, 4); e-, e-/DN, DN, DN."""
-        return to_parameters(self.theta)
+        """(H, g, mu, sigma) of the rows, shape (n J, 4); e-, e-/DN, DN, DN."""
+        return _to_parameters(self.row_theta)
+
+    @property
+    def row_variance(self) -> FloatArray:
+        """Variances of (log H, log 1/g, mu, log sigma_R^2) of the rows, shape (n J, 4)."""
+        if self.samples == Samples():
+            return np.asarray(np.einsum("naa->na", self.own_covariance))
+        slopes = self.samples.slopes
+        found = np.einsum("jap,npq,jaq->nja", slopes, self.own_covariance, slopes, optimize=True)
+        return np.asarray(found.reshape(-1, 4))
 
 
-def to_parameters(theta: FloatArray) -> FloatArray:
+def _to_parameters(theta: FloatArray) -> FloatArray:
     """Return (H, g, mu, sigma), shape (n, 4), of (log H, log 1/g, mu, log sigma_R^2)."""
     variance = np.exp(theta[:, 3]) + QUANTISATION_VARIANCE
     return np.stack([np.exp(theta[:, 0]), np.exp(-theta[:, 1]), theta[:, 2], np.sqrt(variance)], axis=1)
 
 
-def to_theta(parameters: FloatArray) -> FloatArray:
+def _to_theta(parameters: FloatArray) -> FloatArray:
     """Return (log H, log 1/g, mu, log sigma_R^2), shape (n, 4), of (H, g, mu, sigma)."""
     h, g, mu, sigma = parameters.T
     analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.05 * sigma**2)
@@ -134,13 +252,14 @@ def fit_shared(
 
     Args:
         problem: histograms and law.
-        parameters: start of (H, g, mu, sigma), shape (n, 4), finite.
+        parameters: start of (H, g, mu, sigma) of the rows, shape (n J, 4), finite; g, mu and sigma are taken
+            from the first sample of a pixel.
         shared: start of the shared parameters, shape (d,).
         max_steps: scoring steps at most.
         tolerance: converged where a step promises a smaller rise, nats.
     """
-    theta = to_theta(parameters)
-    limits = _limits(theta)
+    theta = problem.samples.theta(parameters)
+    limits = _limits(theta, problem.samples.n_exposures)
     shared = np.clip(np.asarray(shared, np.float64), problem.bounds[:, 0], problem.bounds[:, 1])
     loglik = problem.log_likelihood(theta, shared)
     together = problem.n_shared > 0
@@ -170,7 +289,7 @@ def fit_shared(
     slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
     fine = bool(promised.sum() < tolerance) if together else bool((promised < tolerance).all())
     own, common = slopes.covariance()
-    return SharedFit(theta, shared, own, common, loglik, fine)
+    return SharedFit(theta, shared, own, common, loglik, fine, problem.samples)
 
 
 @dataclass(frozen=True)
@@ -180,7 +299,7 @@ class Tangent:
     Attributes:
         problem: histograms and law.
         log_masses: given that the code is kept, shape (n, B); 0 where it is not.
-        derivatives: of the log masses, own parameters first, shape (n, 4 + d, B).
+        derivatives: of the log masses of the rows, their own four parameters first, shape (n, 4 + d, B).
         shared: shared parameters, shape (d,).
     """
 
@@ -206,13 +325,15 @@ class Tangent:
         score = np.einsum("nab,nb->na", self.derivatives, seen)
         weighted = self.derivatives * (self.masses * seen.sum(axis=1)[:, None])[:, None, :]
         information = weighted @ self.derivatives.transpose(0, 2, 1)
-        shared_score = score[:, 4:].sum(axis=0)
+        information, score = self.problem.samples.by_pixel(information, score)
+        own = self.problem.samples.n_exposures + 3
+        shared_score = score[:, own:].sum(axis=0)
         low, high = self.problem.bounds[:, 0] >= self.shared, self.problem.bounds[:, 1] <= self.shared
         return Slopes(
-            information[:, :4, :4],
-            information[:, :4, 4:],
-            information[:, 4:, 4:].sum(axis=0),
-            score[:, :4],
+            information[:, :own, :own],
+            information[:, :own, own:],
+            information[:, own:, own:].sum(axis=0),
+            score[:, :own],
             shared_score,
             ~((low & (shared_score < 0)) | (high & (shared_score > 0))),
         )
@@ -223,8 +344,8 @@ class Slopes:
     """Score and information at a point.
 
     Attributes:
-        own, border, common: blocks of the information: (n, 4, 4), (n, 4, d), (d, d).
-        score, shared_score: gradients, shapes (n, 4) and (d,).
+        own, border, common: blocks of the information: (n, P, P), (n, P, d), (d, d).
+        score, shared_score: gradients, shapes (n, P) and (d,).
         free: shared parameters that may move, shape (d,).
     """
 
@@ -250,7 +371,7 @@ class Slopes:
         return own, shared, promised
 
     def covariance(self) -> tuple[FloatArray, FloatArray]:
-        """Return covariances of own, (n, 4, 4), and of shared parameters, (d, d), NaN for those at bounds.
+        """Return covariances of own, (n, P, P), and of shared parameters, (d, d), NaN for those at bounds.
 
         That of the own parameters takes the shared ones as known.
         """
@@ -278,29 +399,29 @@ def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:
     return np.asarray(information + more[:, :, None] * np.eye(information.shape[1]))
 
 
-def _limits(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far the own parameters may go from a start: not to another electron number, (n, 4) each.
+def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray]:
+    """Return how far the own parameters may go from a start: not to another electron number, (n, P) each.
 
     Beyond, the law would need ever more electron numbers, and each step ever more time.
     """
-    step = np.exp(theta[:, 1])
-    reach = np.stack(
-        [np.full_like(step, _REACH_EXPOSURE), np.full_like(step, _REACH_STEP), 1.2 * step], axis=1
-    )
-    low = np.concatenate([theta[:, :3] - reach, np.full((step.size, 1), _LOWEST_LOG_VARIANCE)], axis=1)
-    widest = np.maximum(2.0 * theta[:, 1:2] - _LOG_16, theta[:, 3:] + 1.0)
-    high = np.concatenate([theta[:, :3] + reach, widest], axis=1)
-    low[:, 0] -= _REACH_EXPOSURE
+    m = n_exposures
+    step = np.exp(theta[:, m])
+    reach = np.full((step.size, m + 2), _REACH_EXPOSURE)
+    reach[:, m], reach[:, m + 1] = _REACH_STEP, 1.2 * step
+    low = np.concatenate([theta[:, : m + 2] - reach, np.full((step.size, 1), _LOWEST_LOG_VARIANCE)], axis=1)
+    widest = np.maximum(2.0 * theta[:, m : m + 1] - _LOG_16, theta[:, m + 2 :] + 1.0)
+    high = np.concatenate([theta[:, : m + 2] + reach, widest], axis=1)
+    low[:, :m] -= _REACH_EXPOSURE
     return low, np.maximum(high, theta)
 
 
 def _differences(
     problem: SharedProblem, theta: FloatArray, shared: FloatArray, base: FloatArray
 ) -> FloatArray:
-    """Return the derivatives of the log masses, own parameters first, shape (n, 4 + d, B)."""
+    """Return the derivatives of the log masses of the rows, own parameters first, shape (n, 4 + d, B)."""
     n, width = base.shape
     slopes = np.zeros((n, 4 + problem.n_shared, width))
-    own = to_parameters(theta)
+    own = _to_parameters(problem.samples.rows(theta))
     mass, found = marginal_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
     found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
     kept = problem.kept[:, None, :]

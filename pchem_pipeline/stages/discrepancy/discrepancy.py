@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
-from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
+from pchem_pipeline.discrepancy.by_likelihood.explainer import SampleHistograms, find_in_histograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
 from pchem_pipeline.discrepancy.splits import block_length
@@ -44,6 +44,10 @@ class Window:
     numbers: NDArray[np.int64]
     rows: tuple[int, int]
     columns: tuple[int, int]
+
+    def pixel(self, y: int, x: int) -> tuple[int, int]:
+        """Return the place on the sensor of a pixel of the window."""
+        return y + self.rows[0], x + self.columns[0]
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ def run(context: StageContext) -> None:
         model=before,
         mapper=_Mapper(context),
     )
-    found = replace(found, verdict=found.verdict.on_sensor(window.rows, window.columns))
+    found = replace(found, verdict=found.verdict.on_sensor(window.rows, window.columns, window.pixel))
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 
@@ -134,10 +138,11 @@ def _run_histograms(context: StageContext, before: Sequence[Effect]) -> None:
         place = quoted(context.store.path)
         raise StoreError(f"{_STAGE} of histograms needs them in the store; run: pchem histogram {place}")
     counts = context.store.read("histogram/counts")
+    origin = context.store.read("histogram/origin").ravel()
     found = find_in_histograms(
-        counts.reshape(-1, counts.shape[2]),
-        context.store.read("histogram/origin").ravel(),
+        [SampleHistograms(counts.reshape(-1, counts.shape[2]), origin)],
         context.config.discrepancy,
+        width=counts.shape[1],
         model=before,
     )
     _write(context, found)
