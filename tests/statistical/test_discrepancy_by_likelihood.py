@@ -165,7 +165,7 @@ def strength_of(step, name):
 
 @pytest.mark.parametrize(
     ("hidden", "strength", "name"),
-    [("branching_counts", 0.08, "branching"), ("overdispersed_counts", 0.06, "relative_variance")],
+    [("branching_counts", 0.08, "branching"), ("overdispersed_counts", 0.1, "relative_variance")],
 )
 def test_several_exposures_tell_branching_from_overdispersion(hidden, strength, name):
     samples = exposures(1, (0.5, 1.5, 4.5), hidden=hidden, strength=strength)
