@@ -61,11 +61,11 @@ def find_and_add(target: Target, command: Command, *, refit: bool) -> str:
 
 
 def _of_histograms(target: Target) -> bool:
-    """Tell whether a run was made from ready-made histograms: the search looks at them, not at frames."""
+    """Tell whether the search looks at histograms, not at frames: ready-made ones, or several samples'."""
     if not (target.store / "zarr.json").exists():
         return False
     store = RunStore.open(target.store)
-    return store.has("frames") and SensorInfo.read(store).kind == "histograms"
+    return store.has("frames") and SensorInfo.read(store).kind != "frames"
 
 
 def without_choice(command: Command) -> Command:

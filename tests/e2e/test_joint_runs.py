@@ -17,6 +17,7 @@ from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.commands.joint import find_joint, run_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import make_server
+from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.run.session import Command, run_stages, run_status, up_to
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import find_run
@@ -342,3 +343,28 @@ def test_what_is_no_joint_fit_says_so(joint):
         find_joint([joint / "dark_1s.yaml", joint / "dark_2s.yaml"], store=joint / "dark.zarr")
     with pytest.raises(ConfigError, match="no such file"):
         find_joint([joint / "nothing.yaml"])
+
+
+def test_charge_that_does_not_grow_with_time_is_found_by_the_samples_together(tmp_path, kernels):
+    """One exposure takes it for dark current; three of different times tell it from that."""
+    shell = Shell(tmp_path, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    for seconds in (1.0, 3.0, 9.0):
+        name = f"dark_{seconds:g}s"
+        camera(tmp_path, name, int(seconds), seconds)
+        path = tmp_path / f"{name}.yaml"
+        text = path.read_text().replace("value: 0.6", "value: 0.25").replace("[8, 12]", "[6, 8]")
+        path.write_text(text + "  effects: [{tag: spurious_charge, mean_e: 0.2}]\n")
+        shell.ok("simulate", path.name)
+    runs = [(f"dark_{seconds}s.yaml", "bias: false") for seconds in (1, 3, 9)]
+    path = write(tmp_path, "together", runs)
+    search = "{replicates: 20, candidates: [branching_counts, nonlinearity, spurious_charge]}"
+    path.write_text(path.read_text() + f"discrepancy: {search}\n")
+    fit(path, "fit")
+    result = shell.ok("discrepancy", path.name, "--no-refit")
+    found = read_verdict(tmp_path / "together.zarr")
+    assert found.effects == ("spurious_charge",), result.stdout
+    fitted = found.steps[0].parameters["mean_e"]
+    assert abs(fitted.value - 0.2) < 5 * fitted.stderr < 0.1
+    assert found.examined.rows == (0, 6)
+    assert found.examined.columns == (0, 8)
+    assert "NAMED" in result.stdout

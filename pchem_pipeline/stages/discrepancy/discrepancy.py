@@ -24,6 +24,8 @@ from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
+from pchem_pipeline.stages.samples import open_samples
+from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["Window", "choose_window", "run"]
 
@@ -133,20 +135,38 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
 
 
 def _run_histograms(context: StageContext, before: Sequence[Effect]) -> None:
-    """Do the same with ready-made histograms, in one unit."""
-    if not context.store.has("histogram/counts"):
-        place = quoted(context.store.path)
-        raise StoreError(f"{_STAGE} of histograms needs them in the store; run: pchem histogram {place}")
-    counts = context.store.read("histogram/counts")
-    origin = context.store.read("histogram/origin").ravel()
-    found = find_in_histograms(
-        [SampleHistograms(counts.reshape(-1, counts.shape[2]), origin)],
-        context.config.discrepancy,
-        width=counts.shape[1],
-        model=before,
-    )
+    """Do the same with ready-made histograms, or with those of several samples together, in one unit."""
+    samples = _samples(context) if context.sensor.samples else [_histograms(context.store)]
+    found = find_in_histograms(samples, context.config.discrepancy, width=context.sensor.nx, model=before)
     _write(context, found)
     context.run_units([WHOLE], _nothing_left, by_tiles=False)
+
+
+def _samples(context: StageContext) -> list[SampleHistograms]:
+    """Return the histograms of the samples, with their integration times where H is drawn against these."""
+    of_time = context.config.input.against == "integration_time"
+    opened = open_samples(context.config, context.base_dir)
+    return [
+        replace(
+            _histograms(each.store),
+            bias=sample.bias,
+            integration_time=sample.integration_time if of_time else None,
+        )
+        for each, sample in zip(opened, context.sensor.samples, strict=True)
+    ]
+
+
+def _histograms(store: RunStore) -> SampleHistograms:
+    """Return the histograms of all pixels of a run.
+
+    Raises:
+        StoreError: it has none.
+    """
+    if not store.has("histogram/counts"):
+        place = quoted(store.path)
+        raise StoreError(f"{_STAGE} of histograms needs them in the store; run: pchem histogram {place}")
+    counts = store.read("histogram/counts")
+    return SampleHistograms(counts.reshape(-1, counts.shape[2]), store.read("histogram/origin").ravel())
 
 
 def _nothing_left(unit: Unit) -> None:
