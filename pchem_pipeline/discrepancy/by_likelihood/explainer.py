@@ -45,6 +45,7 @@ _MOST_PIXELS = 256  # looked at; more add nothing about what all have in common
 _FEWEST_REPLICATES = 40
 _LARGEST_TOTAL = 10**9 - 1  # samples of a pixel that can be split at random
 _SIGMAS, _PRICE = 3.0, 3.0  # standard errors, and nats, by which a set must improve the score
+_REACH = 7.0  # standard deviations: the law reaches no further
 _CONVINCING = 6.0  # nats, where no statistic deviates by itself
 
 
@@ -148,7 +149,10 @@ class HistogramExplainer:
         """Split the samples at random, fit the train part, and choose the pixels to look at."""
         counts, origin = _rows(self.data)
         parts = split_samples(counts, 3, self.rng)
-        together = self._fitted_together(parts[0], origin) if self.joint else None
+        together = None
+        if self.joint:
+            together = self._fitted_together(parts[0], origin)
+            parts, origin = _widened(parts, origin, together)
         self.evidence = self._observe(parts[0], origin, together)
         start = _parameters(self.evidence.maps) if together is None else together
         self.chosen = _choose(start, counts.sum(axis=1), self.layout.n)
@@ -311,6 +315,22 @@ def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:
         counts[:, k, : sample.counts.shape[1]] = sample.counts
     origin = np.stack([np.asarray(sample.origin, np.int64) for sample in samples], axis=1)
     return counts.reshape(n * j, -1), origin.ravel()
+
+
+def _widened(
+    parts: Sequence[IntArray], origin: IntArray, parameters: FloatArray
+) -> tuple[tuple[IntArray, ...], IntArray]:
+    """Return the histograms with all codes that the law reaches.
+
+    Histograms end at their extreme samples; replicates drawn within these ends would lack the tails that the
+    data have.
+    """
+    h, g, mu, sigma = parameters.T
+    last = origin + parts[0].shape[1] - 1
+    low = np.nanmax(origin - (mu - _REACH * sigma))
+    high = np.nanmax(mu + (h + _REACH * (np.sqrt(h) + 1.0)) / g + _REACH * sigma - last)
+    left, right = (max(int(np.ceil(more)), 0) for more in (low, high))
+    return tuple(np.pad(part, ((0, 0), (left, right))) for part in parts), origin - left
 
 
 def _parameters(maps: PixelMaps) -> FloatArray:
