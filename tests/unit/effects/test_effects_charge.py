@@ -297,8 +297,11 @@ def test_the_law_of_the_electron_number_and_what_leaves_it_alone():
     law = OpticalCrosstalk(probability=0.2).marginal(plain, None)
     assert law.exposure_factors.tolist() == [1.2]
     assert 0 < CosmicRays(tracks_per_frame=0.1).marginal(plain, None).outlier_share < 1e-5
-    for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion, SpuriousCharge):
+    for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion):
         assert cls.typical()[0].marginal(plain, None) is plain
+    # H is then the exposure without it
+    law = SpuriousCharge(mean_e=0.3).marginal(plain, None)
+    assert (law.added_exposure.tolist(), law.added_weights.tolist()) == ([[0.3]], [[1.0]])
 
 
 # -- tools -------------------------------------------------------------------------------------------
