@@ -32,7 +32,7 @@ from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.fit.joint import fit_joint
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.shared import Samples
 
 __all__ = ["HistogramExplainer", "SampleHistograms", "find_in_histograms"]
@@ -254,7 +254,7 @@ class HistogramExplainer:
         """Fit the PCD to all samples of each pixel; return (H, g, mu, sigma) of the rows, NaN if unusable."""
         j = self.layout.n
         by_sample = [counts[k::j].astype(np.uint32) for k in range(j)]
-        fit = fit_joint(by_sample, [origin[k::j] for k in range(j)], dark=self.layout.dark)
+        fit = fit_histograms(by_sample, [origin[k::j] for k in range(j)], dark=self.layout.dark)
         usable = (fit.fit_status & UNTRUSTWORTHY) == 0
         shared = np.stack([fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
         shared = np.repeat(shared[:, None], j, axis=1)
