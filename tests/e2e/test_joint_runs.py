@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.run.session import Command, run_stages, run_status, up_to
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.run_store import RunStore
 
@@ -251,6 +252,29 @@ def test_killed_it_ends_with_the_same_bits(joint, kernels):
     one, other = (RunStore.open(joint / f"{name}.zarr") for name in ("killed", "dark"))
     for name in ("fit/fit_status", "fit/bias", "samples/covariance", "maps/dark_current"):
         np.testing.assert_array_equal(one.read(name), other.read(name), err_msg=name)
+
+
+def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(joint, kernels):
+    """Two exposures tell branching from over-dispersion, which look alike in one."""
+    for seed, seconds in enumerate((1.0, 4.0)):
+        camera(joint, f"branching_{seconds:g}s", 30 + seed, seconds)
+        path = joint / f"branching_{seconds:g}s.yaml"
+        text = path.read_text().replace("value: 0.6", "value: 0.25")
+        path.write_text(f"{text}  effects: [{{tag: branching_counts, branching: 0.15}}]\n")
+    path = write(joint, "branching", [("branching_1s.yaml", ""), ("branching_4s.yaml", "")])
+    settings = "discrepancy: {candidates: [branching_counts, overdispersed_counts], replicates: 24}\n"
+    path.write_text(path.read_text() + settings)
+    before = fit(path)
+    assert (before.read("fit/goodness_p") < 0.01).mean() > 0.5
+    shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    said = shell.ok("discrepancy", "branching.yaml", "--quiet").stdout
+    assert said.startswith("NAMED: The model was missing branching")
+    store = RunStore.open(joint / "branching.zarr")
+    assert fitted_effects(store)[0].tag == "branching_counts"
+    p = store.read("fit/goodness_p")
+    assert abs(p.mean() - 0.5) < 5 / np.sqrt(12 * p.size)
+    assert "branching" in path.read_text()
+    assert shell.ok("status", "branching.zarr").stdout.count("complete") >= 5
 
 
 @pytest.mark.parametrize(
