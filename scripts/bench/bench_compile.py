@@ -18,12 +18,14 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from running import machine
 
-PCHEM = [sys.executable, "-c", "from pchem_pipeline.cli.app import main; main()"]
+# the command of any checkout, whatever module its pyproject.toml names
+PCHEM = [sys.executable, "-c", "import sys, importlib; importlib.import_module(sys.argv.pop(1)).main()"]
 RUN = "run: {store: run.zarr}\ninput: {files: [frames/*.tif], integration_time: 4.87, bit_depth: 14}\n"
 CAMERA = """run: {{store: {name}-truth.zarr}}
 simulate:
@@ -32,7 +34,7 @@ simulate:
   seed: {seed}
   output: {name}
   integration_time: 4.87
-  quanta_exposure: {{mean: {exposure}}}
+  parameters: {{quanta_exposure: {{kind: constant, value: {exposure}}}}}
 """
 
 
@@ -49,7 +51,11 @@ def pchem(checkout: Path, cache: Path, folder: Path, arguments: list[str]) -> Co
     """Run a command of a checkout with a cache of kernels of its own."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "NUMBA_CACHE_DIR": str(cache)}
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run([*PCHEM, *arguments], cwd=folder, env=environment, capture_output=True, text=True)
+    project = tomllib.loads((checkout / "pyproject.toml").read_text())["project"]
+    module = project["scripts"]["pchem"].partition(":")[0]
+    done = subprocess.run(
+        [*PCHEM, module, *arguments], cwd=folder, env=environment, capture_output=True, text=True
+    )
     wall = time.perf_counter() - start
     if done.returncode:
         raise SystemExit(f"pchem {' '.join(arguments)} in {checkout}:\n{done.stderr}")
@@ -59,7 +65,7 @@ def pchem(checkout: Path, cache: Path, folder: Path, arguments: list[str]) -> Co
 
 
 def prepare(checkout: Path, folder: Path, options: argparse.Namespace) -> None:
-    """Simulate two exposures of one camera, and fit both, with a cache that is thrown away."""
+    """Simulate two exposures of one camera, and fit both where that is needed; the cache is thrown away."""
     cache = folder / "preparing"
     for name, exposure in (("frames", 2.0), ("brighter", 5.0)):
         text = CAMERA.format(
@@ -69,7 +75,8 @@ def prepare(checkout: Path, folder: Path, options: argparse.Namespace) -> None:
         pchem(checkout, cache, folder, ["simulate", f"{name}.yaml", "--quiet"])
         given = RUN.replace("frames/", f"{name}/").replace("run.zarr", f"{name}.zarr")
         (folder / f"{name}-run.yaml").write_text(given)
-        pchem(checkout, cache, folder, ["run", f"{name}-run.yaml", "--quiet"])
+        if set(options.commands) != {"run"}:
+            pchem(checkout, cache, folder, ["run", f"{name}-run.yaml", "--quiet"])
 
 
 COMMANDS = {
