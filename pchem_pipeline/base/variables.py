@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 __all__ = [
-    "FREE_LOBES",
+    "FREE_SATELLITES",
     "INTERVALS",
     "LENGTHS",
     "PARAMETERS",
@@ -24,7 +24,7 @@ __all__ = [
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 
 #: Arrays of the group ``fit`` that exist only where the model holds effects.
-FREE_LOBES = ("lobe_amplitude_e", "lobe_weight")
+FREE_SATELLITES = ("satellite_amplitude_e", "satellite_weight")
 
 #: Quantities of the group ``fit`` that have profile intervals, where they were asked for.
 INTERVALS = (*PARAMETERS, "read_noise_e")
@@ -240,9 +240,9 @@ _ALL: list[Variable] = [
     Variable("fit/outlier_share", _MAP, "float64", "1", "share of the frames left out by the tail guard"),
     # where the model's effects look for levels in each pixel (random telegraph noise)
     Variable(
-        "fit/lobe_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN without any"
+        "fit/satellite_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN without any"
     ),
-    Variable("fit/lobe_weight", _MAP, "float64", "1", "probability to be off the quiet level; 0 without any"),
+    Variable("fit/satellite_weight", _MAP, "float64", "1", "probability off the quiet level; 0 without any"),
     *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")),
     *_ends("maps", (*INTERVALS, "dark_current")),
     Variable(

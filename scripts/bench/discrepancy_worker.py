@@ -85,7 +85,7 @@ def fit_maps(
     flat = [a.ravel() for a in (histograms.origin, histograms.under, histograms.over)]
     result = fit_histograms(counts, *flat)
     if effects:
-        result = _grown(result, counts, flat[0], effects, added)
+        result = _extended(result, counts, flat[0], effects, added)
     shape = frames.shape[1:]
     g, sigma = result.conversion_gain, result.read_noise_dn
     variance = np.diagonal(result.covariance, axis1=1, axis2=2)
@@ -106,16 +106,16 @@ def fit_maps(
     return {name: np.asarray(values).reshape(shape) for name, values in maps.items()}
 
 
-def _grown(
+def _extended(
     plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tuple[Any, ...], added: Any
 ) -> Any:
     """Fit again with the law that the effects make of the PCD."""
-    from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+    from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
     from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.status import FAILED
 
     parameters = [plain.quanta_exposure, plain.conversion_gain, plain.bias, plain.read_noise_dn]
-    model = marginal_model(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)
+    model = sample_law(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)
     return fit_histograms(counts, origin, law=model, start=plain)
 
 

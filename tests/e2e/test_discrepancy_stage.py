@@ -1,4 +1,4 @@
-"""``pchem discrepancy`` on real files: the verdict, the grown model, interruptions, wrong use."""
+"""``pchem discrepancy`` on real files: the verdict, the extended model, interruptions, wrong use."""
 
 import json
 import os
@@ -86,7 +86,7 @@ def test_the_model_grows_in_the_users_file_and_its_comments_stay(searched):
     assert "tag: row_noise" in text.split("model:")[1]
 
 
-def test_the_fit_runs_with_the_grown_model_and_loses_its_bias(searched):
+def test_the_fit_runs_with_the_extended_model_and_loses_its_bias(searched):
     shell, _, before = searched
     truth, after = read(shell, "truth/read_noise_dn"), read(shell, "fit/read_noise_dn")
     bias_before, bias_after = np.median(before - truth), np.median(after - truth)

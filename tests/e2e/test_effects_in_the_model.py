@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS
+from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
@@ -68,12 +68,12 @@ def fitted(store: RunStore) -> dict[str, NDArray[Any]]:
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder of the run, grown, and what was seen of it before."""
-    folder = tmp_path_factory.mktemp("grown")
+    """The folder of the run, extended, and what was seen of it before."""
+    folder = tmp_path_factory.mktemp("extended")
     path = configured(folder, [])
     run_stages(find_run(path), ["simulate", "ingest", "histogram", "fit", "maps", "ensemble"], QUIET)
     store = RunStore.open(folder / "run.zarr")
-    assert not any(store.has(f"fit/{name}") for name in FREE_LOBES)
+    assert not any(store.has(f"fit/{name}") for name in FREE_SATELLITES)
     before = {
         "pulls": mean_pulls(store),
         "facts": dict(store.attributes("ensemble")),
@@ -107,7 +107,7 @@ def test_bias_is_cut_at_least_five_times_where_it_was_significant(both) -> None:
         assert abs(now) < 5, name
 
 
-def test_ensemble_is_predicted_with_the_grown_law(both) -> None:
+def test_ensemble_is_predicted_with_the_extended_law(both) -> None:
     path, before = both
     store = RunStore.open(path.parent / "run.zarr")
     facts, old = dict(store.attributes("ensemble")), before["facts"]
@@ -148,7 +148,7 @@ def test_report_names_the_model(both) -> None:
     assert words in (path.parent / "run.zarr/report.json").read_text()
 
 
-def test_the_inspector_holds_the_law_of_the_grown_model(both) -> None:
+def test_the_inspector_holds_the_law_of_the_extended_model(both) -> None:
     store = RunStore.open(both[0].parent / "run.zarr")
     pixel = RunView(store).answer("GET", "/api/pixel?y=3&x=4", {"host": "127.0.0.1:1"}, 1)
     content = json.loads(pixel.content)
@@ -168,13 +168,13 @@ def test_the_inspector_holds_the_law_of_the_grown_model(both) -> None:
     assert facts["sample"]["masses"] == 300
 
 
-def test_tiles_do_not_change_the_grown_fit(both, tmp_path: Path) -> None:
+def test_tiles_do_not_change_the_extended_fit(both, tmp_path: Path) -> None:
     path, _ = both
     store = RunStore.open(path.parent / "run.zarr")
     other = configured(tmp_path, EFFECTS, tile=32)
     run_stages(find_run(other), ["simulate", "ingest", "histogram", "fit"], QUIET)
     again = RunStore.open(tmp_path / "run.zarr")
-    for name in (*PARAMETERS, "correlation", "fit_status", *FREE_LOBES):
+    for name in (*PARAMETERS, "correlation", "fit_status", *FREE_SATELLITES):
         np.testing.assert_array_equal(again.read(f"fit/{name}"), store.read(f"fit/{name}"), err_msg=name)
 
 
@@ -185,4 +185,4 @@ def test_back_to_the_plain_model_is_back_to_the_plain_fit(both) -> None:
     store = RunStore.open(path.parent / "run.zarr")
     for name, values in before["fit"].items():
         np.testing.assert_array_equal(store.read(f"fit/{name}"), values, err_msg=name)
-    assert not any(store.has(f"fit/{name}") for name in FREE_LOBES)
+    assert not any(store.has(f"fit/{name}") for name in FREE_SATELLITES)

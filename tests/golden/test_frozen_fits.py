@@ -142,9 +142,9 @@ def differences(old: Arrays, new: Arrays) -> list[str]:
     within("goodness_chi2", 1e-3 * np.maximum(old["goodness_dof"], 1), good)
     within("goodness_p", 1e-3, good)
     within("outlier_share", 1e-12, good)
-    if "lobe_weight" in old:
-        within("lobe_weight", 1e-4, good)
-        within("lobe_amplitude_e", 1e-3, good)
+    if "satellite_weight" in old:
+        within("satellite_weight", 1e-4, good)
+        within("satellite_amplitude_e", 1e-3, good)
     if "correlation" in old:
         within("correlation", 1e-3)
     for name in ("mean", "variance"):  # of the samples, which are no estimates

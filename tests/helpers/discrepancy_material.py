@@ -114,7 +114,7 @@ def _candidates(*scored: tuple[str, float, float, float]) -> list[dict[str, Any]
     ]
 
 
-def _pulls(grown: bool) -> list[dict[str, Any]]:
+def _pulls(extended: bool) -> list[dict[str, Any]]:
     befores = (84.0, -31.2, 22.5, 14.1, -9.8, 8.0, 6.1, -5.2, 4.9, 4.4, -4.3, 3.1)
     afters = (1.1, -0.4, 2.2, -1.3, 0.2, 0.9, -1.7, 0.1, 1.2, -0.8, 2.6, 0.5)
     names = [
@@ -132,7 +132,7 @@ def _pulls(grown: bool) -> list[dict[str, Any]]:
         "tail.low.count",
     ]
     return [
-        {"statistic": n, "sentence": STATISTICS[n].sentence, "before": b, "after": a if grown else None}
+        {"statistic": n, "sentence": STATISTICS[n].sentence, "before": b, "after": a if extended else None}
         for n, b, a in zip(names, befores, afters, strict=True)
     ]
 
@@ -182,7 +182,7 @@ def step(effect: str | None, verdict: str, before: float, after: float) -> dict[
         "separate": {
             "periodic_pickup": "a faster or slower row time moves the line of a pickup, not row noise"
         },
-        "pulls": _pulls(grown=effect is not None),
+        "pulls": _pulls(extended=effect is not None),
     }
 
 

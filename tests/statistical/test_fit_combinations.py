@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law.mass import marginal_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 Array = NDArray[np.float64]
 
 N, FIRST, N_CODES, FRAMES = 240, 40, 330, 3000
-LAW = MarginalModel().with_variance(per_electron=0.02).with_levels(curvature=0.006)
+LAW = SampleLaw().with_variance(per_electron=0.02).with_levels(curvature=0.006)
 PAIRS = list(combinations(("law", "exact", "sandwich", "profile", "guard", "warm", "series"), 2))
 FACTORS = (1.0, 2.5)
 
@@ -39,9 +39,9 @@ def truth(rng: np.random.Generator) -> Array:
     return np.stack(columns, axis=1)
 
 
-def draw(rng: np.random.Generator, law: MarginalModel, at: Array, factor: float) -> NDArray[np.uint32]:
+def draw(rng: np.random.Generator, law: SampleLaw, at: Array, factor: float) -> NDArray[np.uint32]:
     scaled = at * [factor, 1, 1, 1]
-    mass = np.maximum(marginal_mass(law, list(scaled.T), np.arange(FIRST, FIRST + N_CODES)), 0)
+    mass = np.maximum(sample_mass(law, list(scaled.T), np.arange(FIRST, FIRST + N_CODES)), 0)
     return rng.multinomial(FRAMES, mass / mass.sum(axis=1, keepdims=True)).astype(np.uint32)
 
 
@@ -49,7 +49,7 @@ def fitted(told: tuple[str, ...], seed: int = 5) -> tuple[FitResult, Array]:
     """Draw pixels, and fit them as told; return also the true (H_1 ... g, mu, sigma)."""
     rng = np.random.default_rng(seed)
     at = truth(rng)
-    law = LAW if "law" in told else MarginalModel()
+    law = LAW if "law" in told else SampleLaw()
     factors = FACTORS if "series" in told else FACTORS[:1]
     counts = [draw(rng, law, at, factor) for factor in factors]
     if "guard" in told:
@@ -105,13 +105,13 @@ def test_without_the_law_the_pulls_would_be_off() -> None:
     assert np.abs(np.median(pulls, axis=0)).max() > 3
 
 
-def minus(law: MarginalModel, samples: list[NDArray[np.uint32]], aside: Array, *at: float) -> float:
+def minus(law: SampleLaw, samples: list[NDArray[np.uint32]], aside: Array, *at: float) -> float:
     """Minus the log-likelihood of a pixel's samples given that a code is not set aside."""
     value = 0.0
     *exposures, gain, bias, sigma = at
     for counts, exposure in zip(samples, exposures, strict=True):
         columns = [np.array([v]) for v in (exposure, gain, bias, sigma)]
-        mass = np.maximum(marginal_mass(law, columns, np.arange(FIRST, FIRST + N_CODES))[0], 1e-300)
+        mass = np.maximum(sample_mass(law, columns, np.arange(FIRST, FIRST + N_CODES))[0], 1e-300)
         mass = np.where(aside, 0.0, mass) / mass[~aside].sum()
         seen = (counts > 0) & ~aside
         value -= float(counts[seen] @ np.log(mass[seen]))

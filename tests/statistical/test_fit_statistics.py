@@ -191,10 +191,10 @@ def test_bound_matches_known_values() -> None:
 
 
 def test_starting_points_are_near_where_they_should_be() -> None:
-    regression, lobe, cumulants = range(len(START_METHODS))
+    regression, satellite, cumulants = range(len(START_METHODS))
     few = drawn_in_range(42, 200, (0.15, 0.6), (0.2, 0.35))
     many = drawn_in_range(43, 200, (1.5, 8), (0.2, 0.35))
-    for pixels, methods in ((few, (regression, cumulants)), (many, (regression, lobe))):
+    for pixels, methods in ((few, (regression, cumulants)), (many, (regression, satellite))):
         starts = starting_points(pixels.counts, pixels.origin)
         for method in methods:
             off = np.abs(starts[:, method, 1] / pixels.truth[:, 1] - 1)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.model.fit.shared import Samples
-from pchem_pipeline.model.law.mass import marginal_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["NO_ORDER", "Member", "find_members", "law_of"]
 
@@ -121,7 +121,7 @@ class Member:
     @property
     def bends_codes(self) -> bool:
         """Whether it moves the edges of codes, which no comb of a pixel's own follows."""
-        law = self.effect.marginal(MarginalModel(), _ONE_PIXEL)
+        law = self.effect.sample_law(SampleLaw(), _ONE_PIXEL)
         return law.edge_shift.size > 0
 
     @property
@@ -147,7 +147,7 @@ class Member:
 
     def excludes(self, other: Member) -> bool:
         """Tell whether both cannot be in one model: one effect, or two laws of the electron number."""
-        laws = [m.effect.marginal(MarginalModel(), _ONE_PIXEL).law for m in (self, other)]
+        laws = [m.effect.sample_law(SampleLaw(), _ONE_PIXEL).law for m in (self, other)]
         return self.tag == other.tag or all(law != "poisson" for law in laws)
 
 
@@ -160,7 +160,7 @@ def law_of(
     shared: FloatArray,
     own: FloatArray,
     samples: Samples,
-) -> MarginalModel:
+) -> SampleLaw:
     """Return the law of rows of histograms with the effects present and the members at their coordinates.
 
     Args:
@@ -175,7 +175,7 @@ def law_of(
         n = len(member.coordinates)
         effects.append(member.at(shared[at : at + n]))
         at += n
-    law = marginal_model(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
+    law = sample_law(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
     if any(samples.dark) and law.added_exposure.any():
         lit = ~np.tile(np.array(samples.dark), own.shape[0] // samples.n)
         law = replace(law, added_exposure=np.where(lit[:, None], law.added_exposure, 0.0))
@@ -241,11 +241,11 @@ def _changes(effect: Effect, evidence: Evidence) -> bool:
         )
     ]
     maps = pixel_maps(columns, np.ones(usable.size, np.bool_))
-    law = marginal_model([effect], maps)
+    law = sample_law([effect], maps)
     low = int((maps.bias - 8.0 * maps.read_noise_dn).min())
     high = int((maps.bias + (maps.quanta_exposure * 3.0 + 8.0) / maps.conversion_gain).max())
     codes = np.arange(low, high + 1)
-    change = np.abs(marginal_mass(law, maps, codes) - marginal_mass(MarginalModel(), maps, codes)).max()
+    change = np.abs(sample_mass(law, maps, codes) - sample_mass(SampleLaw(), maps, codes)).max()
     return bool(change > _LEAST_CHANGE)
 
 

@@ -19,7 +19,7 @@ from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = [
     "SWAPPED",
@@ -170,7 +170,7 @@ class SetComparison:
     def problem(self, members: Sequence[Member], counts: IntArray | None = None) -> SharedProblem:
         """Return what a set is fitted to: the train part, or other histograms."""
 
-        def law(shared: FloatArray, own: FloatArray) -> MarginalModel:
+        def law(shared: FloatArray, own: FloatArray) -> SampleLaw:
             return law_of(self.present, members, shared, own, self.samples)
 
         coordinates = [c for m in members for c in m.coordinates]
@@ -340,12 +340,12 @@ def compare_sets(
     at_first = sets.gap(plain)
     first: list[FittedSet] = []
     while len(best.members) < largest and not (coarse and sets.gap(best) < _HARDLY * at_first):
-        grown = _additions(sets, best, candidates)
+        extended = _additions(sets, best, candidates)
         if best is plain:
-            first = grown
-        if not grown or not _better(sets, grown[0], best):
+            first = extended
+        if not extended or not _better(sets, extended[0], best):
             break
-        best = _swapped(sets, grown[0], plain, candidates)
+        best = _swapped(sets, extended[0], plain, candidates)
         if sets.gap(best) > _HOPELESS[len(best.members)] * at_first:
             break
     return Choice(plain, of_best_kind(sets, _pruned(sets, best, plain), candidates), first)

@@ -267,7 +267,7 @@ class FrameExplainer:
                 break
             self.model = (*before, *(h.effect for h in added.hypotheses))
             _, maps = self._mapped()
-            extended = self._extended_null(maps, f"{simulator.prefix}-grown")
+            extended = self._extended_null(maps, f"{simulator.prefix}-grown")  # of the random numbers
             added, extended = self._corrected(added, null, extended, z)
             proven = {h.tag for h in self._confirmed(added, z.final - null.mean, self._noise(null, 1))}
             chosen = tuple(h for h in added.established(_ESTABLISHED) if h.tag in proven)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.histogram.count import histogram_frames
-from pchem_pipeline.model.law.mass import marginal_mass
+from pchem_pipeline.model.law.mass import sample_mass
 
 __all__ = ["Refit", "equivalent_sensor", "expected_codes", "refit_maps"]
 
@@ -70,7 +70,7 @@ def refit_maps(
     old = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
     flat = tuple(values.ravel() for values in old)
     try:
-        law = marginal_model(effects, pixel_maps(flat, maps.usable), added)
+        law = sample_law(effects, pixel_maps(flat, maps.usable), added)
     except ConfigError:
         return Refit(maps, {}, covariance)
     histograms = histogram_frames(frames)
@@ -107,10 +107,10 @@ def expected_codes(
     every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
     flat = tuple(values.ravel()[usable] for values in every)
     try:
-        law = marginal_model(effects, pixel_maps(flat, usable[usable]))
+        law = sample_law(effects, pixel_maps(flat, usable[usable]))
     except ConfigError:
         return None
-    return np.asarray(n_samples * marginal_mass(law, flat, codes, far_tails=False).sum(axis=0))
+    return np.asarray(n_samples * sample_mass(law, flat, codes, far_tails=False).sum(axis=0))
 
 
 def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:

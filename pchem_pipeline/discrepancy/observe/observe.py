@@ -18,7 +18,7 @@ from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
-from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, marginal_statistics
+from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
 from pchem_pipeline.discrepancy.observe.vector_frames import (
     FrameView,
     frame_statistics,
@@ -200,7 +200,7 @@ def _compared(
         tail_high=tail(column.SEEN_HIGH),
         code=residuals,
         time=None,
-        z=in_order(marginal_statistics(laws, parameters[:, 0], residuals)),
+        z=in_order(sample_statistics(laws, parameters[:, 0], residuals)),
     )
     return evidence, laws
 

@@ -16,7 +16,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 
-__all__ = ["STANDS_OUT", "goodness_of", "in_order", "marginal_statistics", "outliers", "without_skew"]
+__all__ = ["STANDS_OUT", "goodness_of", "in_order", "outliers", "sample_statistics", "without_skew"]
 
 FloatArray = NDArray[np.float64]
 
@@ -60,9 +60,7 @@ def goodness_of(moments: FloatArray) -> FloatArray:
     return np.where(some, z, 0.0)
 
 
-def marginal_statistics(
-    pixels: PixelLaws, exposure: FloatArray, residuals: CodeResiduals
-) -> dict[str, float]:
+def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeResiduals) -> dict[str, float]:
     """Return the families shape, code and tail (but for the clusters, which need frames).
 
     Args:
@@ -92,7 +90,7 @@ def marginal_statistics(
 def _beyond(near: FloatArray, far: FloatArray) -> float:
     """Return the statistic of samples (seen, expected) beyond the support and far beyond it.
 
-    Few samples of heavy tails are far out, where none is expected; many of a lobe are near.
+    Few samples of heavy tails are far out, where none is expected; many of a satellite are near.
     """
     z = laws.poisson(int(near[0]), float(near[1]))
     return laws.best(z, laws.poisson(int(far[0]), float(far[1]))) if far[0] > 0 else z

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["AdcDnl"]
 
@@ -177,7 +177,7 @@ class AdcDnl(Effect):
         first = int(codes[0]) + part.start
         return [cls(dnl_lsb=min(size, 1.0), pattern="edges", first_code=first, edges=listed)]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the edges moved.
 
         Random shifts are those of a simulation and unknown in a measurement: only a bit or a list can say

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["AdcInl"]
 
@@ -105,7 +105,7 @@ class AdcInl(Effect):
             if 2.0 * math.pi * bend.amplitude < bend.period
         ]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the code edges where the bent curve crosses them."""
         first, last = code_range(maps)
         ideal = np.arange(first, last + 1) - 0.5

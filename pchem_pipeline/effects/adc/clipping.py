@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import CodeResiduals, Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["Clipping"]
 
@@ -89,7 +89,7 @@ class Clipping(Effect):
             return (cls(low=low, high=high),)
         return cls(low=low, high=high), cls(high=high), cls(low=low)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that counts at the limits what lies beyond them."""
         lows = [limit for limit in (model.clip_low, self.low) if limit is not None]
         highs = [limit for limit in (model.clip_high, self.high) if limit is not None]

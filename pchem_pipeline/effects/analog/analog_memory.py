@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["AnalogMemory"]
 
@@ -93,7 +93,7 @@ class AnalogMemory(Effect):
             return ()
         return (cls(memory=float(np.clip(above / below, -0.5, 0.5))),)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the mean charge of the frame before, and its variance."""
         exposure = np.nan_to_num(maps.quanta_exposure)
         return model.with_levels(shift_e=self.memory * exposure).with_variance(e2=self.memory**2 * exposure)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["BiasDrift"]
 
@@ -145,7 +145,7 @@ class BiasDrift(Effect):
             return [*linear, bent, walk]
         return [bent, *linear, walk]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law smeared over the path (a variance where the drift is small against the noise)."""
         if self.shape == "walk":
             # mean square of a walk around its own mean: a sixth of the variance of its end

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["BiasJumps"]
 
@@ -165,7 +165,7 @@ class BiasJumps(Effect):
         size /= alpha
         return [cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate), *random]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of copies at the levels (a variance where they are close against the noise).
 
         The pixels' places are not known here, so a path counts with the mean law of the quadrants.

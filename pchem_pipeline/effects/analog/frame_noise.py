@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["FrameNoise"]
 
@@ -90,7 +90,7 @@ class FrameNoise(Effect):
             return ()
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
         return model.with_variance(dn2=self.frame_noise_dn**2)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["GainDrift"]
 
@@ -128,7 +128,7 @@ class GainDrift(Effect):
             found.append((left + path.size * price, cls(drift=size, shape="path", path=nodes)))
         return [effect for _, effect in sorted(found, key=lambda pair: pair[0])]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the gain: that of the peaks grows as k^2."""
         profile = self.drift * self._profile(np.linspace(0.0, 1.0, 1001))
         return model.with_variance(per_electron2=float(profile.var()))

@@ -18,7 +18,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.response import first_order
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -101,7 +101,7 @@ class HeavyTailedNoise(Effect):
                 found.append((disagreement, effect.scaled(mean)))
         return [effect for _, effect in sorted(found, key=lambda item: item[0])]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with noise of two widths."""
         return model.with_noise(np.array([1.0 - self.share, self.share]), width=np.array([1.0, self.factor]))
 
@@ -118,15 +118,15 @@ class _TailBelow:
         chosen, groups = typical_pixels(evidence.maps, _TAIL_PIXELS)
         self.numbers = np.array([group.size for group in groups])
         self.laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
-        self.expected = self._number(MarginalModel())
+        self.expected = self._number(SampleLaw())
 
-    def _number(self, law: MarginalModel) -> float:
+    def _number(self, law: SampleLaw) -> float:
         below = np.array([pixel.below(law) for pixel in self.laws])
         return float((self.numbers * below).sum()) * self.n_frames
 
     def first_order(self, effect: HeavyTailedNoise) -> tuple[float, float]:
         """Return how many times an effect's share explains the samples, and the standard error."""
-        more = self._number(MarginalModel().with_noise([1.0], width=effect.factor)) * effect.share
+        more = self._number(SampleLaw().with_noise([1.0], width=effect.factor)) * effect.share
         if not more > 0:
             return 0.0, np.inf
         variance = max(self.seen, self.expected) + 1.0 + (_TAIL_DOUBT * self.expected) ** 2

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["InterpixelCapacitance"]
 
@@ -108,7 +108,7 @@ class InterpixelCapacitance(Effect):
             found.insert(0, cls(coupling=min((x + y) / 2.0, 0.2), anisotropy=(x - y) / (x + y)))
         return found
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with a smaller step, the neighbours' mean charge and its variance.
 
         The four neighbours are taken to have the pixel's own exposure.

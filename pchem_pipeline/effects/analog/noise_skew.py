@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["NoiseSkew"]
 
@@ -79,7 +79,7 @@ class NoiseSkew(Effect):
         """Return the share whose third Hermite score is that seen."""
         return strength_of(evidence, cls(share=0.3), "He3", signed=True)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the exponential cut into parts, each a Gaussian of its mean and variance.
 
         Mean and variance of the noise stay exact. Its law is to 1e-6 nats per sample up to a share of 0.6.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["Nonlinearity"]
 
@@ -75,6 +75,6 @@ class Nonlinearity(Effect):
         """Return the change whose bend of the comb (He1C2) is that seen."""
         return strength_of(evidence, cls(step_change=1e-3), "He1C2", signed=True)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the comb bent."""
         return model.with_levels(curvature=self.step_change)

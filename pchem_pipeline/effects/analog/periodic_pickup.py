@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["PeriodicPickup"]
 
@@ -126,7 +126,7 @@ class PeriodicPickup(Effect):
                 found.append((loose.excess, cls(**fields)))
         return _without_doubles(found)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law smeared by the arcsine law (a variance where the amplitude is small)."""
         return with_offsets(model, maps, self.amplitude_dn * chebyshev_nodes(_LOBES))
 

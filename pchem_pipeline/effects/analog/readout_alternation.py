@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["ReadoutAlternation"]
 
@@ -84,6 +84,6 @@ class ReadoutAlternation(Effect):
             return ()
         return (cls(alternation_dn=size / responsivity(evidence)),)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of two copies, equally likely (a variance where they are close together)."""
         return with_offsets(model, maps, self.alternation_dn * np.array([-1.0, 1.0]))

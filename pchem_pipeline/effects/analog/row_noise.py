@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["RowNoise"]
 
@@ -73,6 +73,6 @@ class RowNoise(Effect):
             return ()
         return (cls(row_noise_dn=excess**0.5 / responsivity(evidence)),)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
         return model.with_variance(dn2=self.row_noise_dn**2)

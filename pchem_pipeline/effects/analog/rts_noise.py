@@ -19,7 +19,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.long_memory import frame_key, two_states
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -233,7 +233,7 @@ class RtsNoise(Effect):
             )
         ]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that looks for such levels in every pixel, with a weight of its own.
 
         The fit decides pixel by pixel, since the effect is in few of them; steps around the stated one are
@@ -242,7 +242,7 @@ class RtsNoise(Effect):
         factors = _EQUAL if self.spread == "equal" else _EXPONENTIAL
         steps = [f * self.amplitude_e for f in factors if self.amplitude_e > 0]
         alarm = min(max(_ALARM * self.fraction, 1e-5), 1e-3)
-        return model.with_free_lobes(steps, pattern=self._pattern(), alarm=alarm)
+        return model.with_free_satellites(steps, pattern=self._pattern(), alarm=alarm)
 
     def _pattern(self) -> list[tuple[float, float]]:
         """Return (shift in steps, weight) of the levels beside the quiet one."""
@@ -252,10 +252,10 @@ class RtsNoise(Effect):
         weights = np.where(heights < 1.0, 1.0, 0.5) / self._places()
         return [(float(s * h), float(w)) for h, w in zip(heights, weights, strict=True) for s in (-1, 1)]
 
-    def _as_noise(self) -> MarginalModel:
+    def _as_noise(self) -> SampleLaw:
         """Return the law of a pixel with a trap."""
         shifts, weights = np.array(self._pattern()).T
-        return MarginalModel().with_noise(
+        return SampleLaw().with_noise(
             np.append(1.0 - self.probability, self.probability * weights),
             shift_e=np.append(0.0, self.amplitude_e * shifts),
         )
@@ -281,7 +281,7 @@ def _outlying(evidence: Evidence) -> NDArray[np.bool_]:
 
 
 def _expected_profiles(
-    kinds: Sequence[MarginalModel], laws: Sequence[PixelLaw], n_frames: int
+    kinds: Sequence[SampleLaw], laws: Sequence[PixelLaw], n_frames: int
 ) -> NDArray[np.float64]:
     """Return the same for pixels of other laws, the median over the pixels: (kind, profile).
 

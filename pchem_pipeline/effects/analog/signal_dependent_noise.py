@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["SignalDependentNoise"]
 
@@ -81,7 +81,7 @@ class SignalDependentNoise(Effect):
             found += strength_of(evidence, effect, "He2C1")
         return found
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with variance growing along the peaks."""
         more = self.noise_e**2
         return (

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["BranchingCounts"]
 
@@ -83,7 +83,7 @@ class BranchingCounts(Effect):
         # Var K = H + 2 l H + ... against H + c H
         return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > 2.5 * stderr else ()
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with generalised Poisson electron numbers."""
         return model.with_counts("borel", self.branching)
 

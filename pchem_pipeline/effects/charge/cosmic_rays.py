@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["CosmicRays"]
 
@@ -130,7 +130,7 @@ class CosmicRays(Effect):
             return ()
         return (cls(tracks_per_frame=float(tracks / n_seen), length_um=length, electrons_per_um=per_um),)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law in which a sample may, very rarely, be anything: how rarely does not matter."""
         return model.with_outliers(_SHARE_OF_SAMPLES) if self.tracks_per_frame > 0 else model
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["OpticalCrosstalk"]
 
@@ -91,7 +91,7 @@ class OpticalCrosstalk(Effect):
             return ()
         return (cls(probability=min(found / weight, 0.5)),)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with a Poisson mean that holds what neighbours as bright as the pixel send."""
         return model.with_exposures([1.0], [1.0 + self.probability])
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["OverdispersedCounts"]
 
@@ -84,7 +84,7 @@ class OverdispersedCounts(Effect):
         a, stderr = count_excess(evidence, power=0.0)
         return (cls(relative_variance=min(a, 1.0)),) if a > 2.5 * stderr else ()
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with negative binomial electron numbers."""
         return model.with_counts("negative_binomial", self.relative_variance)
 

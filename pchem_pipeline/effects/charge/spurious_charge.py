@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["SpuriousCharge"]
 
@@ -55,7 +55,7 @@ class SpuriousCharge(Effect):
         result: NDArray[Any] = values + context.random.poisson(np.full(values.shape, self.mean_e))
         return result
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with this charge on top of H, which is then the exposure without it."""
         return model.with_added_exposure([[self.mean_e]], [[1.0]])
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = [
     "WORTH_A_GUESS",
@@ -100,7 +100,7 @@ def is_narrow(spread_dn: float, maps: PixelMaps) -> bool:
     return not noise.size or spread_dn < _NARROW * float(np.median(noise))
 
 
-def with_offsets(model: MarginalModel, maps: PixelMaps, offsets_dn: FloatArray) -> MarginalModel:
+def with_offsets(model: SampleLaw, maps: PixelMaps, offsets_dn: FloatArray) -> SampleLaw:
     """Return the law of samples to which one of these offsets, DN, is added, each equally likely.
 
     Offsets that spread little against the read noise become a variance: one number costs the fit nothing,

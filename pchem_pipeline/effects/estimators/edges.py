@@ -9,13 +9,13 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["merged_edges"]
 
 
 def merged_edges(
-    model: MarginalModel, first: int, shifts: NDArray[np.float64]
+    model: SampleLaw, first: int, shifts: NDArray[np.float64]
 ) -> tuple[int, NDArray[np.float64]]:
     """Return first code and shifts, DN, of the sum of the law's own shifts and these.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -107,12 +107,12 @@ class PixelLaw:
         found: FloatArray = np.bincount(at[here], mass[here], self.codes.size).astype(np.float64)
         return found / max(float(found.sum()), _SMALLEST_MASS)
 
-    def below(self, law: MarginalModel) -> float:
+    def below(self, law: SampleLaw) -> float:
         """Return the probability of a sample below the codes under a law."""
         codes, mass = self.mass_of(law)
         return float(mass[codes < self.codes[0]].sum())
 
-    def change(self, law: MarginalModel) -> FloatArray:
+    def change(self, law: SampleLaw) -> FloatArray:
         """Return the mass of the codes under a law less that under the PCD, shape (n,)."""
         return self.on_codes(*self.mass_of(law)) - self.mass
 
@@ -144,16 +144,16 @@ class PixelLaw:
         width = 2.0 / (9.0 * degrees)
         return float((np.cbrt(1.0 + excess / degrees) - (1.0 - width)) / np.sqrt(width))
 
-    def mass_of(self, law: MarginalModel) -> tuple[FloatArray, FloatArray]:
+    def mass_of(self, law: SampleLaw) -> tuple[FloatArray, FloatArray]:
         """Return codes, DN, somewhat beyond those of the PCD, and their mass under a law."""
-        from pchem_pipeline.model.law.mass import marginal_mass
+        from pchem_pipeline.model.law.mass import sample_mass
 
-        mass: FloatArray = marginal_mass(law, self.maps, self._wide)[0]
+        mass: FloatArray = sample_mass(law, self.maps, self._wide)[0]
         return self._wide, mass
 
-    def scaled(self, factor: float) -> MarginalModel:
+    def scaled(self, factor: float) -> SampleLaw:
         """Return the law whose signal and noise are larger by a factor."""
-        return MarginalModel().with_levels(scale=factor).with_noise([1.0], width=factor)
+        return SampleLaw().with_levels(scale=factor).with_noise([1.0], width=factor)
 
 
 def refitted(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,8 +94,8 @@ def _regression(seen: FloatArray, shift: FloatArray, number: FloatArray) -> tupl
     return float((number * shift * seen).sum()) / information, information**-0.5
 
 
-def _law(effect: Effect, law: PixelLaw) -> MarginalModel:
-    return effect.marginal(MarginalModel(), law.maps)
+def _law(effect: Effect, law: PixelLaw) -> SampleLaw:
+    return effect.sample_law(SampleLaw(), law.maps)
 
 
 def _times(effect: EffectType, factor: float) -> EffectType:

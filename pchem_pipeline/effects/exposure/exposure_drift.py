@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["ExposureDrift"]
 
@@ -145,7 +145,7 @@ class ExposureDrift(Effect):
         likely = [pair for pair in net if pair[0] > max(6.5, best - 25.0)]
         return [effect for _, effect in sorted(likely, key=lambda pair: -pair[0])]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law mixed over the exposures of the run."""
         factors = 1.0 + self.drift * self.profile(np.linspace(0.0, 1.0, 401))
         return model.with_exposures(*exposure_nodes(factors))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["ExposureFlicker"]
 
@@ -124,7 +124,7 @@ class ExposureFlicker(Effect):
         found = [*_sine(cls, profile), *_random(cls, profile)]
         return found[:3]
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law mixed over the exposures of the frames."""
         if self.period_frames is not None:
             factors = 1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * (np.arange(400) + 0.5) / 400)

@@ -11,12 +11,12 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["marginal_model", "model_words", "pixel_maps"]
+__all__ = ["model_words", "pixel_maps", "sample_law"]
 
 
 def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.bool_]) -> PixelMaps:
@@ -32,9 +32,7 @@ def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.boo
     return PixelMaps(exposure, gain, bias, sigma, known)
 
 
-def marginal_model(
-    effects: Sequence[Effect], maps: PixelMaps, added: AddedExposure | None = None
-) -> MarginalModel:
+def sample_law(effects: Sequence[Effect], maps: PixelMaps, added: AddedExposure | None = None) -> SampleLaw:
     """Return the law of the pixels' samples with all effects, composed in their order.
 
     Args:
@@ -45,11 +43,11 @@ def marginal_model(
     Raises:
         ConfigError: if an effect cannot say what it does to these pixels; it is named.
     """
-    model = MarginalModel()
+    model = SampleLaw()
     for effect in effects:
         # effects may come from other packages: whatever they raise is told with their name
         try:
-            model = effect.marginal(model, maps)
+            model = effect.sample_law(model, maps)
         except Exception as error:
             raise ConfigError(
                 f"model.effects: {effect.tag} ({type(effect).__module__}) cannot be fitted with: "

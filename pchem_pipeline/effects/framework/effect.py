@@ -18,7 +18,7 @@ Halos and histories of several effects add up.
 
 The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
 :attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
-(:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.marginal`), so that the
+(:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.sample_law`), so that the
 fit of the four parameters can run with it. What it adds to the exposure of single pixels, it finds in the
 frames (:meth:`~Effect.added_exposure`).
 """
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["Effect", "Plane", "register_effect", "registered_effects"]
 
@@ -130,7 +130,7 @@ class Effect(Section):
         values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
         return type(self).model_validate(values)
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of the pixels' samples with this effect: its place in the fit.
 
         Args:

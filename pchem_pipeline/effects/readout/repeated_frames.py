@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import MarginalModel
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["RepeatedFrames"]
 
@@ -151,6 +151,6 @@ class RepeatedFrames(Effect):
         listed = tuple(int(frame) for frame in second[places])
         return type(self)(frames=listed, rows=self.rows), mean / shown
 
-    def marginal(self, model: MarginalModel, maps: PixelMaps) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the same law: a repeat is one more sample of it, though not a new one."""
         return model

@@ -76,7 +76,7 @@ def curves(
         "nuced_dependent": nuced_dependent(pixels, axes.nuced, choice),
         "nuced_independent": nuced_independent(pixels, axes.nuced, choice),
     }
-    if not axes.grown:
+    if not axes.extended:
         arrays["epcd_stderr"] = np.sqrt(totals.variance("pcd_error"))
         arrays["nuced_stderr"] = np.sqrt(totals.variance("nuced_error"))
     for prefix, noise in (("", variance), ("nuced_", nuced_variance)):

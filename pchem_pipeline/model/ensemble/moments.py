@@ -19,8 +19,8 @@ def moment_rows(
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data.
 
-    Under a grown model mean and variance are those of its masses, and what its effects add to the variance
-    that the parameters explain is a term of its own.
+    Under an extended model mean and variance are those of its masses, and what its effects add to the
+    variance that the parameters explain is a term of its own.
 
     Args:
         totals: the sums.
@@ -31,7 +31,7 @@ def moment_rows(
         Rows ``{name, quantity, unit, predicted, observed, stderr}``; terms have nothing to be observed.
     """
     plain_ones, errors = predicted_moments(pixels), moment_errors(pixels, per_pixel)
-    expected = _grown_moments(totals, plain_ones) if totals.axes.grown else plain_ones
+    expected = _extended_moments(totals, plain_ones) if totals.axes.extended else plain_ones
     share, dn = totals.mean("share"), totals.axes.dn.dn
     mean = float(share @ dn / share.sum())
     variance = float(share @ (dn - mean) ** 2 / share.sum())
@@ -70,14 +70,14 @@ def moment_rows(
             errors.nuced_variance,
         ),
     ]
-    if totals.axes.grown:
+    if totals.axes.extended:
         added = expected.variance - plain_ones.variance
         rows.insert(7, ("effects", "of which the effects of the model", "DN2", added, None, None))
     names = ("name", "quantity", "unit", "predicted", "observed", "stderr")
     return [dict(zip(names, row, strict=True)) for row in rows]
 
 
-def _grown_moments(totals: EnsembleTotals, plain_ones: EnsembleMoments) -> EnsembleMoments:
+def _extended_moments(totals: EnsembleTotals, plain_ones: EnsembleMoments) -> EnsembleMoments:
     """Return the moments with those replaced that the effects of the model change."""
     mass, dn = totals.mean("pcd"), totals.axes.dn.dn
     whole = mass.sum()

@@ -24,7 +24,7 @@ from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["fit_histograms", "satellite_threshold"]
 
@@ -52,7 +52,7 @@ def fit_histograms(
     over: Counts | None = None,
     *,
     dark: Sequence[bool] | None = None,
-    law: MarginalModel | Sequence[MarginalModel] | None = None,
+    law: SampleLaw | Sequence[SampleLaw] | None = None,
     settings: FitSettings | None = None,
     adc_limits: tuple[int, int] | None = None,
     start: FitResult | FloatArray | None = None,
@@ -113,7 +113,7 @@ def fit_histograms(
     dark = [False] * len(samples) if dark is None else list(dark)
     _check(samples, origins, dark)
     batch = _Batch(samples, origins, dark, settings, adc_limits, under, over)
-    laws = None if law is None else [law] * len(samples) if isinstance(law, MarginalModel) else list(law)
+    laws = None if law is None else [law] * len(samples) if isinstance(law, SampleLaw) else list(law)
     near = None if isinstance(start, FitResult) else start
     if laws is not None and near is not None:
         found = batch.fit_cells(laws, near, warm=True)
@@ -127,17 +127,17 @@ def fit_histograms(
     return found if several else _shaped(found)
 
 
-def satellite_threshold(law: MarginalModel) -> float:
+def satellite_threshold(law: SampleLaw) -> float:
     """Return the rise of the log-likelihood, nats, that free satellite peaks must bring to be kept.
 
     At a weight of 0, the border of what is allowed, twice the rise is 0 or, half of the time, chi-square
     with one degree of freedom. The amplitude means nothing there, so the largest of the rises at all
     amplitudes counts (Davies 1987); by Bonferroni's bound over them a pixel without satellites is given some
-    with about the probability ``free_lobe_alarm``: neighbouring amplitudes rise together, which lowers it,
-    and the best one is refined, which raises it.
+    with about the probability ``free_satellite_alarm``: neighbouring amplitudes rise together, which lowers
+    it, and the best one is refined, which raises it.
     """
-    trials = max(len(law.free_lobes), 1)
-    return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * law.free_lobe_alarm / trials)))
+    trials = max(len(law.free_satellites), 1)
+    return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * law.free_satellite_alarm / trials)))
 
 
 def _check(samples: Sequence[Counts], origins: Sequence[Counts], dark: Sequence[bool]) -> None:
@@ -200,14 +200,14 @@ class _Batch:
             gaps = np.where(np.isnan(near[:, size]), np.inf, near[:, size])
         known = np.empty((0, size)) if near is None else np.ascontiguousarray(near[:, :size], np.float64)
         starts = Starts(known, gaps, np.empty(0))
-        laws = [MarginalModel()] * self.n_samples
+        laws = [SampleLaw()] * self.n_samples
         return self._result(self._fit(self.given, laws, starts, self._limits(None)), cells=False, adjust=True)
 
     def resume(self, plain: FitResult) -> FitResult:
         """Leave out the samples that a fit with the density left out; return it."""
         pixels = np.flatnonzero(plain.outlier_share > 0)
         if self.settings.tail_guard > 0 and pixels.size:
-            laws, limits = [MarginalModel()] * self.n_samples, self._limits(None)
+            laws, limits = [SampleLaw()] * self.n_samples, self._limits(None)
             answers = self._answers(self.n)
             answers.parameters[:] = plain.columns
             gone = plain.outlier_share * self.given.counts.sum(axis=1, dtype=np.float64)
@@ -232,7 +232,7 @@ class _Batch:
         enough = (fewest >= _FEWEST_CODES) & ((plain.fit_status & int(FAILED)) == 0)
         self.given.mask[enough] = mask[enough]
 
-    def refine(self, plain: FitResult, laws: Sequence[MarginalModel] | None) -> FitResult:
+    def refine(self, plain: FitResult, laws: Sequence[SampleLaw] | None) -> FitResult:
         """Fit again with the cells what the law or the settings ask for, from a fit with the density."""
         fitted = (plain.fit_status & int(FAILED)) == 0
         if laws is not None or (self.given.mask == SET_ASIDE).any():
@@ -262,7 +262,7 @@ class _Batch:
 
     def fit_cells(
         self,
-        laws: Sequence[MarginalModel],
+        laws: Sequence[SampleLaw],
         near: FloatArray,
         *,
         gaps: FloatArray | None = None,
@@ -288,7 +288,7 @@ class _Batch:
         starts = Starts(
             np.ascontiguousarray(near[some], np.float64),
             np.ascontiguousarray(gap, np.float64),
-            np.array(own[0].free_lobes, np.float64),
+            np.array(own[0].free_satellites, np.float64),
         )
         limits = self._limits(own, warm=warm, scan=scan)
         adjust = all(each.neutral for each in own)
@@ -299,9 +299,7 @@ class _Batch:
             self.given.mask[some] = given.mask
         return self._result(answers, cells=True, adjust=adjust, pixels=some)
 
-    def _fit(
-        self, given: Histograms, laws: Sequence[MarginalModel], starts: Starts, limits: Limits
-    ) -> Answers:
+    def _fit(self, given: Histograms, laws: Sequence[SampleLaw], starts: Starts, limits: Limits) -> Answers:
         n = given.counts.shape[0]
         answers = self._answers(n)
         packed = pack(laws, n)
@@ -346,9 +344,7 @@ class _Batch:
 
     # -- what they are told
 
-    def _limits(
-        self, laws: Sequence[MarginalModel] | None, *, warm: bool = False, scan: bool = False
-    ) -> Limits:
+    def _limits(self, laws: Sequence[SampleLaw] | None, *, warm: bool = False, scan: bool = False) -> Limits:
         settings = self.settings
         em = settings.algorithm == "em" and laws is None
         return Limits(
@@ -369,12 +365,12 @@ class _Batch:
             sandwich=settings.errors == "sandwich",
         )
 
-    def _neutral(self) -> list[MarginalModel]:
+    def _neutral(self) -> list[SampleLaw]:
         """Return the law of the PCD between the limits of the ADC."""
         low, high = self.adc_limits or (None, None)
-        return [MarginalModel(clip_low=low, clip_high=high)] * self.n_samples
+        return [SampleLaw(clip_low=low, clip_high=high)] * self.n_samples
 
-    def _at_limits(self, laws: Sequence[MarginalModel]) -> NDArray[np.bool_]:
+    def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
         """Tell in which pixels codes pile up at a limit of the law."""
         found = np.zeros(self.n, np.bool_)
         for j, each in enumerate(laws):
@@ -442,8 +438,8 @@ class _Batch:
             goodness_dof=dof,
             goodness_p=probability,
             outlier_share=left / np.maximum(frames + left, 1.0),
-            lobe_amplitude_e=np.where(weight > 0, out[:, search_numba.AMPLITUDE], np.nan),
-            lobe_weight=weight,
+            satellite_amplitude_e=np.where(weight > 0, out[:, search_numba.AMPLITUDE], np.nan),
+            satellite_weight=weight,
         )
 
     def _freedom(
@@ -485,7 +481,7 @@ class _Batch:
             found |= seen & ((low <= self.adc_limits[0]) | (high >= self.adc_limits[1]))
         return found
 
-    def intervals(self, found: FitResult, laws: Sequence[MarginalModel] | None) -> FloatArray:
+    def intervals(self, found: FitResult, laws: Sequence[SampleLaw] | None) -> FloatArray:
         """Return the ends of profile-likelihood intervals, (n, J + 4, 2); NaN where there are none.
 
         At an end the profile likelihood has fallen by ``z^2 / 2`` nats, all other parameters being at their
@@ -499,9 +495,9 @@ class _Batch:
             some = np.flatnonzero(fitted & (self.by_cells == cells))
             if some.size == 0:
                 continue
-            chosen = (laws or self._neutral()) if cells else [MarginalModel()] * self.n_samples
+            chosen = (laws or self._neutral()) if cells else [SampleLaw()] * self.n_samples
             part = np.full((some.size, *ends.shape[1:]), np.nan)
-            satellites = np.stack([found.lobe_amplitude_e[some], found.lobe_weight[some]], axis=1)
+            satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
             profile_numba.profile_tile(
                 self.given._replace(
                     counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
@@ -530,8 +526,8 @@ def _count_near(given: Histograms) -> None:
     given.mask[near] = np.where(given.mask[near] == LEFT_OUT, np.uint8(COUNTED), given.mask[near])
 
 
-def _reshapes(law: MarginalModel) -> bool:
+def _reshapes(law: SampleLaw) -> bool:
     """Tell whether a law changes more than the width of peaks: the plain fit may then be an electron off."""
-    one_peak = law.lobe_weights.shape[1] == 1
+    one_peak = law.satellite_weights.shape[1] == 1
     one_law = law.law == "poisson" and law.exposure_weights.size == 1
     return not (one_peak and one_law and law.curvature == 0.0 and law.variance_per_electron2 == 0.0)

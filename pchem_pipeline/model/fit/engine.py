@@ -14,7 +14,7 @@ from pchem_pipeline.model.fit import cells_search_numba, climb_numba, search_num
 from pchem_pipeline.model.fit.climb_numba import Goal, Limits
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import evaluation_arguments
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["cells_search", "climb", "density_search", "regression_basis"]
 
@@ -45,7 +45,7 @@ def _search_arguments() -> tuple[Any, ...]:
     tools = numba.types.NamedTuple(
         types_of((_LIMITS, evaluate, climb_on, np.zeros((1, 1)), scratch)), search_numba.Tools
     )
-    return pixel, tools, pack([MarginalModel()], 1), 0, _VECTOR, _VECTOR, 0.0, _VECTOR, _VECTOR
+    return pixel, tools, pack([SampleLaw()], 1), 0, _VECTOR, _VECTOR, 0.0, _VECTOR, _VECTOR
 
 
 @functools.cache

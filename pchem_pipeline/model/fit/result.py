@@ -53,9 +53,9 @@ class FitResult:
             parameters (Chernoff and Lehmann 1954).
         goodness_p: probability of a larger chi-square, shape (n,); NaN without degrees of freedom.
         outlier_share: share of the samples that the tail guard left out of the likelihood, shape (n,).
-        lobe_amplitude_e: amplitude of the free satellite peaks found in the pixel, e-, shape (n,); NaN
+        satellite_amplitude_e: amplitude of the free satellite peaks found in the pixel, e-, shape (n,); NaN
             without any.
-        lobe_weight: weight of these peaks, shape (n,); 0 without any.
+        satellite_weight: weight of these peaks, shape (n,); 0 without any.
         intervals: ends of profile-likelihood intervals of H_1 ... H_J, g, mu, sigma and sigma g, shape
             (n, J + 4, 2); None unless asked for.
     """
@@ -75,8 +75,8 @@ class FitResult:
     goodness_dof: FloatArray
     goodness_p: FloatArray
     outlier_share: FloatArray
-    lobe_amplitude_e: FloatArray
-    lobe_weight: FloatArray
+    satellite_amplitude_e: FloatArray
+    satellite_weight: FloatArray
     intervals: FloatArray | None = None
 
     @property

@@ -187,7 +187,7 @@ def loglik_without_gain(pixel: Pixel) -> float:
 def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     """Return the height exp(-2 pi^2 s_e^2) of the side lobe in units of its noise, 1/sqrt(N) at most.
 
-    Where the lobe sinks into the noise, maxima at other gains come as near as the right one.
+    Where the satellite sinks into the noise, maxima at other gains come as near as the right one.
     """
     n = pixel.facts.shape[0]
     most = 0.0

@@ -1,7 +1,7 @@
 """Maximum likelihood of the pixels' four parameters together with parameters that all pixels share.
 
 Scoring steps (Fisher 1935) with a damping (Levenberg 1944) on the exact masses of the codes
-(:func:`~pchem_pipeline.model.law.mass.marginal_mass`); derivatives in what the pixels share are differences
+(:func:`~pchem_pipeline.model.law.mass.sample_mass`); derivatives in what the pixels share are differences
 of masses, so any law will do. The information matrix has an arrow shape, a 4 x 4 block per pixel and one
 border for what they share, so a step costs no more than the pixels' own.
 
@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.mass import marginal_mass, marginal_slopes
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["Samples", "SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared"]
 
 FloatArray = NDArray[np.float64]
 #: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
-Law = Callable[[FloatArray, FloatArray], MarginalModel]
+Law = Callable[[FloatArray, FloatArray], SampleLaw]
 
 _LEAST_MASS = 1e-60
 _STEP = 1e-5  # of the differences, in units of the parameters' natural scale
@@ -165,7 +165,7 @@ class SharedProblem:
         """Return the mass of every code, those left out included, shape (n, B)."""
         own = _to_parameters(self.samples.rows(theta))
         codes = self.origin[:, None] + np.arange(self.counts.shape[1])
-        return marginal_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
+        return sample_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
 
     def log_masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the logarithm of the mass given that the code is kept, shape (n, B); 0 where it is not."""
@@ -422,7 +422,7 @@ def _differences(
     n, width = base.shape
     slopes = np.zeros((n, 4 + problem.n_shared, width))
     own = _to_parameters(problem.samples.rows(theta))
-    mass, found = marginal_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
+    mass, found = sample_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
     found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
     kept = problem.kept[:, None, :]
     inside = np.where(problem.kept, mass, 0.0).sum(axis=1)

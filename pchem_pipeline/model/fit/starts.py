@@ -21,7 +21,7 @@ def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) ->
     From the empirical characteristic function ``phi(f) = mean exp(2 pi i f x)`` of a PCD, with
     ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f / g)`` and phase ``2 pi f mu + H sin 2 pi f / g``:
     *regression* fits the former by weighted least squares for a grid of gains (good for H < 15), *side_lobe*
-    takes the highest lobe beyond the central one (needs H > 0.7 and sigma g < 0.48 e-). *cumulants* sets
+    takes the highest satellite beyond the central one (needs H > 0.7 and sigma g < 0.48 e-). *cumulants* sets
     ``1/g = k4/k3`` and ``H = k3 g^3`` (good for H < 1).
 
     Args:

@@ -52,11 +52,11 @@ from pchem_pipeline.model.law.pixel_numba import (
 )
 from pchem_pipeline.model.law.simd_numba import LANES, counting, fused, load_lanes, store_lanes
 
-FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a lobe
-N_FREQUENCIES = 48  # up to 4.8/sd, the lobe of H = 22
-N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the lobe of H = 200
+FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a satellite
+N_FREQUENCIES = 48  # up to 4.8/sd, the satellite of H = 22
+N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the satellite of H = 200
 LOBE_STEP = 0.05
-LOBE_FIRST = 0.25  # lowest lobe frequency tried, 1/sd: the step a is at most 4 sd
+LOBE_FIRST = 0.25  # lowest satellite frequency tried, 1/sd: the step a is at most 4 sd
 N_LOBES = 90
 _SIDE_BY_SIDE = 3  # vectors of frequencies at a time
 _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
@@ -87,8 +87,8 @@ _STEP_NOISES = (0.2, 0.36)  # e-
 def regression_basis() -> NDArray[np.float64]:
     """Return ``1 - cos(2 pi f a)`` for every frequency f (rows) and every trial step a (columns)."""
     frequency = FREQUENCY_STEP * np.arange(1, N_FREQUENCIES + 1)
-    lobe = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
-    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / lobe[None, :]))
+    satellite = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
+    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / satellite[None, :]))
 
 
 @kernel
@@ -150,7 +150,7 @@ def _regress(
     floor: float,
     sums: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Return (lobe frequency in 1/sd, H) of the best weighted regression over all trial steps.
+    """Return (satellite frequency in 1/sd, H) of the best weighted regression over all trial steps.
 
     The sums of all trial steps grow side by side, frequency by frequency: that needs no other order of the
     additions to run in vector registers.
@@ -202,11 +202,11 @@ def _regress(
         last = gain
     if place < 0:
         return 0.0, 0.0
-    lobe = LOBE_FIRST + LOBE_STEP * place
+    satellite = LOBE_FIRST + LOBE_STEP * place
     bend = before - 2.0 * best + after
     if before > 0.0 and after > 0.0 and bend < 0.0:  # vertex of the parabola through the three best
-        lobe += LOBE_STEP * 0.5 * (before - after) / bend
-    return lobe, best_exposure
+        satellite += LOBE_STEP * 0.5 * (before - after) / bend
+    return satellite, best_exposure
 
 
 @kernel
@@ -216,10 +216,10 @@ def assemble(
     exposure: float,
     theta: NDArray[np.float64],
 ) -> tuple[bool, bool]:
-    """Turn a step and a rough H into a start: noise from the lobe's height, bias from its phase.
+    """Turn a step and a rough H into a start: noise from the satellite's height, bias from its phase.
 
     Returns:
-        Whether there is a start, and whether the lobe stands clear of the noise.
+        Whether there is a start, and whether the satellite stands clear of the noise.
     """
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
@@ -238,7 +238,7 @@ def assemble(
         bias = anchor + a * math.floor((mean - exposure * a - anchor) / a + 0.5)
         if bias > mean - 0.01 * a:
             bias -= a * math.ceil((bias - mean + 0.01 * a) / a)
-        # a lobe that leans on the centre, H < 1, has a phase of its own: trust it only to a few tenths
+        # a satellite that leans on the centre, H < 1, has a phase of its own: trust it only to a few tenths
         if exposure < 0.5 and abs(mean - bias - exposure * a) > 0.2 * a:
             bias = mean - exposure * a
         exposure = (mean - bias) / a
@@ -267,10 +267,10 @@ def start_regression(
     sd = math.sqrt(variance)
     n_used = np.int64(min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP)))
     ecf_power(histogram, FREQUENCY_STEP / sd, n_used, work)
-    lobe, exposure = _regress(basis, work[0, :n_used], 9.0 / n, work[4:7])
-    if lobe <= 0.0:
+    satellite, exposure = _regress(basis, work[0, :n_used], 9.0 / n, work[4:7])
+    if satellite <= 0.0:
         return False, False
-    answer: tuple[bool, bool] = assemble(histogram, sd / lobe, exposure, theta)
+    answer: tuple[bool, bool] = assemble(histogram, sd / satellite, exposure, theta)
     return answer
 
 

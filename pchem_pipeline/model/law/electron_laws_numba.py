@@ -122,5 +122,5 @@ def normal_tail(z: float, table: NDArray[np.float64]) -> tuple[float, float]:
     series = d * (1.0 - d * (z0 / 2.0 - d * (h2 / 6.0 - d * (h3 / 24.0 - d * (h4 / 120.0 - d * h5 / 720.0)))))
     tail = table[node, 0] - table[node, 1] * series
     y = -d * (z0 + 0.5 * d)
-    grown = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y / 120.0))))
-    return (tail if z <= 0.0 else -tail), table[node, 1] * grown
+    extended = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y / 120.0))))
+    return (tail if z <= 0.0 else -tail), table[node, 1] * extended

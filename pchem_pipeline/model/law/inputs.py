@@ -11,9 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
-from pchem_pipeline.model.law.sample_law import CountLaw, MarginalModel
+from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
-__all__ = ["HasLobes", "HasParameters", "Parameters", "columns_of", "kernel_counts", "lobes_of", "pack"]
+__all__ = [
+    "HasParameters",
+    "HasSatellites",
+    "Parameters",
+    "columns_of",
+    "kernel_counts",
+    "pack",
+    "satellites_of",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -47,15 +55,15 @@ class HasParameters(Protocol):
 
 
 @runtime_checkable
-class HasLobes(Protocol):
-    """Free lobes of the pixels."""
+class HasSatellites(Protocol):
+    """Free satellites of the pixels."""
 
     @property
-    def lobe_amplitude_e(self) -> FloatArray:
+    def satellite_amplitude_e(self) -> FloatArray:
         """Amplitude, e-; NaN without any."""
 
     @property
-    def lobe_weight(self) -> FloatArray:
+    def satellite_weight(self) -> FloatArray:
         """Weight; 0 without any."""
 
 
@@ -69,7 +77,7 @@ def _normal_table() -> FloatArray:
     return table
 
 
-def pack(models: Sequence[MarginalModel], n: int) -> Law:
+def pack(models: Sequence[SampleLaw], n: int) -> Law:
     """Return the laws of the samples of n pixels as the loops take them.
 
     Args:
@@ -88,7 +96,7 @@ def pack(models: Sequence[MarginalModel], n: int) -> Law:
         _stacked([part.exposures for part in parts]),
         _stacked([part.added for part in parts]),
         _stacked([part.edge_shift for part in parts]),
-        np.array(models[0].free_lobe_pattern, np.float64).reshape(-1, 2),
+        np.array(models[0].free_satellite_pattern, np.float64).reshape(-1, 2),
         _normal_table(),
     )
 
@@ -104,7 +112,7 @@ class _Part(NamedTuple):
     edge_shift: FloatArray
 
 
-def _pack_one(model: MarginalModel, n: int) -> _Part:
+def _pack_one(model: SampleLaw, n: int) -> _Part:
     def per_pixel(*names: str) -> FloatArray:
         values = [np.asarray(getattr(model, name), np.float64) for name in names]
         for name, rows in zip(names, values, strict=True):
@@ -112,7 +120,7 @@ def _pack_one(model: MarginalModel, n: int) -> _Part:
                 raise ValueError(f"{name} has {rows.shape[0]} rows for {n} pixels")
         return np.stack(np.broadcast_arrays(*values), axis=1)
 
-    peaks = per_pixel(*(f"lobe_{name}" for name in _PEAK_FIELDS))
+    peaks = per_pixel(*(f"satellite_{name}" for name in _PEAK_FIELDS))
     added = per_pixel("added_weights", "added_exposure")
     for weights in (model.exposure_weights[None], added[:, 0], peaks[:, 0]):
         if not np.allclose(weights.sum(axis=1), 1.0, rtol=0, atol=1e-6):
@@ -154,13 +162,15 @@ def columns_of(parameters: Parameters) -> FloatArray:
     return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 
-def lobes_of(parameters: Parameters, lobes: tuple[ArrayLike, ArrayLike] | None, n: int) -> FloatArray:
-    """Return amplitude and weight of the pixels' free lobes, shape (n, 2), 0 without any."""
-    if lobes is None and isinstance(parameters, HasLobes):
-        lobes = parameters.lobe_amplitude_e, parameters.lobe_weight
+def satellites_of(
+    parameters: Parameters, satellites: tuple[ArrayLike, ArrayLike] | None, n: int
+) -> FloatArray:
+    """Return amplitude and weight of the pixels' free satellites, shape (n, 2), 0 without any."""
+    if satellites is None and isinstance(parameters, HasSatellites):
+        satellites = parameters.satellite_amplitude_e, parameters.satellite_weight
     found = np.zeros((n, 2))
-    if lobes is not None:
-        found[:] = np.stack([np.asarray(values, np.float64).ravel() for values in lobes], axis=1)
+    if satellites is not None:
+        found[:] = np.stack([np.asarray(values, np.float64).ravel() for values in satellites], axis=1)
     return np.nan_to_num(found)
 
 

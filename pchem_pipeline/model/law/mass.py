@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
-from pchem_pipeline.model.law.inputs import Parameters, columns_of, kernel_counts, lobes_of, pack
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.inputs import Parameters, columns_of, kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["log_likelihood", "marginal_mass", "marginal_slopes"]
+__all__ = ["log_likelihood", "sample_mass", "sample_slopes"]
 
 FloatArray = NDArray[np.float64]
 
@@ -19,9 +19,9 @@ def log_likelihood(
     counts: NDArray[np.integer],
     origin: NDArray[np.integer],
     parameters: Parameters,
-    model: MarginalModel,
+    model: SampleLaw,
     *,
-    lobes: tuple[ArrayLike, ArrayLike] | None = None,
+    satellites: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> FloatArray:
     """Return ``sum_i c_i log P(x_i)`` of every pixel, nats, shape (n,); NaN without parameters.
 
@@ -32,8 +32,8 @@ def log_likelihood(
         origin: DN of bin 0, shape (n,).
         parameters: (H, g, mu, sigma) of the pixels, each (n,).
         model: the law.
-        lobes: ``lobe_amplitude_e`` and ``lobe_weight`` of the pixels; by default those of ``parameters``
-            where it has any, else none.
+        satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
+            ``parameters`` where it has any, else none.
     """
     counts = kernel_counts(counts)
     out = np.full(counts.shape[0], np.nan)
@@ -41,19 +41,19 @@ def log_likelihood(
         counts,
         np.ascontiguousarray(origin, np.int64),
         columns_of(parameters),
-        lobes_of(parameters, lobes, out.size),
+        satellites_of(parameters, satellites, out.size),
         pack([model], out.size),
         out,
     )
     return out
 
 
-def marginal_mass(
-    model: MarginalModel,
+def sample_mass(
+    model: SampleLaw,
     maps: Parameters,
     codes: ArrayLike,
     *,
-    lobes: tuple[ArrayLike, ArrayLike] | None = None,
+    satellites: tuple[ArrayLike, ArrayLike] | None = None,
     far_tails: bool = True,
 ) -> FloatArray:
     """Return the probability of each code in each pixel, exact to the ends of the tails.
@@ -62,7 +62,7 @@ def marginal_mass(
         model: the law.
         maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
-        lobes: as in :func:`log_likelihood`.
+        satellites: as in :func:`log_likelihood`.
         far_tails: also what is below 1e-50, which takes several times as long.
 
     Returns:
@@ -81,12 +81,14 @@ def marginal_mass(
         first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
         stage = EXACT if far_tails else NEAR
         none = np.empty((0, 4, out.shape[1]))
-        mass_numba.mass_tile(first, columns, lobes_of(maps, lobes, n), pack([model], n), stage, out, none)
+        mass_numba.mass_tile(
+            first, columns, satellites_of(maps, satellites, n), pack([model], n), stage, out, none
+        )
     return out
 
 
-def marginal_slopes(
-    model: MarginalModel, maps: Parameters, first: NDArray[np.integer], n_codes: int
+def sample_slopes(
+    model: SampleLaw, maps: Parameters, first: NDArray[np.integer], n_codes: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return the probability of successive codes down to 1e-50, and its slopes.
 
@@ -104,5 +106,5 @@ def marginal_slopes(
     mass, slopes = np.full((n, n_codes), np.nan), np.full((n, 4, n_codes), np.nan)
     start = np.ascontiguousarray(first, np.int64)
     law = pack([model], n)
-    mass_numba.mass_tile(start, columns, lobes_of(maps, None, n), law, NEAR, mass, slopes)
+    mass_numba.mass_tile(start, columns, satellites_of(maps, None, n), law, NEAR, mass, slopes)
     return mass, slopes

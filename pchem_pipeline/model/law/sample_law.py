@@ -2,8 +2,8 @@
 
 The PCD is ``x = round(mu + (K + R) / g)`` with Poisson K and Gaussian R (Hendrickson et al. 2023, eq.
 PCD_RV_definition). Effects change the law of K, the levels that it maps to, the noise around them, and the
-codes. A :class:`MarginalModel` says all that for a batch of n pixels; each effect of a run's model adds its
-part with :meth:`~pchem_pipeline.effects.framework.effect.Effect.marginal`, and the fit of (H, g, mu, sigma)
+codes. A :class:`SampleLaw` says all that for a batch of n pixels; each effect of a run's model adds its
+part with :meth:`~pchem_pipeline.effects.framework.effect.Effect.sample_law`, and the fit of (H, g, mu, sigma)
 uses the whole.
 """
 
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CountLaw", "MarginalModel"]
+__all__ = ["CountLaw", "SampleLaw"]
 
 FloatArray = NDArray[np.float64]
 CountLaw = Literal["poisson", "negative_binomial", "borel"]
@@ -31,7 +31,7 @@ def _zero() -> FloatArray:
 
 
 @dataclass(frozen=True)
-class MarginalModel:
+class SampleLaw:
     """The mass of code x given (H, g, mu, sigma) of a pixel.
 
     ``P(x) = sum_bj w_b u_j sum_k P(k; H f_b + d_j) sum_l v_l [Phi((e_{x+1} - m) / s) - Phi((e_x - m) / s)]``
@@ -56,19 +56,19 @@ class MarginalModel:
         variance_per_electron, variance_per_electron2: e-^2 per electron and per electron squared.
         extra_variance_e2, extra_variance_dn2: variance that no parameter of the pixel holds, e-^2 and DN^2,
             shape (n,) or (1,).
-        lobe_weights, lobe_shift_e, lobe_shift_dn, lobe_shift_sigma, lobe_width: components of the noise,
-            shape (n or 1, l) each; weights sum to 1 along l.
+        satellite_weights, satellite_shift_e, satellite_shift_dn, satellite_shift_sigma, satellite_width:
+            components of the noise, shape (n or 1, l) each; weights sum to 1 along l.
         edge_first, edge_shift: shift of the lower edge of the codes from ``edge_first`` on, DN; 0 elsewhere.
             The shifts of neighbouring edges must differ by less than 1 DN.
         clip_low, clip_high: smallest and largest code that comes out, or None.
         outlier_share, outlier_codes: share of the samples that can be anything, evenly over so many codes:
             they then count for nothing in the fit (particle hits).
-        free_lobes: amplitudes A, e-, of which one may be found in a pixel, with a weight q of its own; the
-            fit tries each, refines the best, and keeps it where the likelihood rises by enough. Empty: none.
-        free_lobe_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps 1 - q;
-            the weights sum to 1 and q multiplies them. The default is a trap read by correlated double
+        free_satellites: amplitudes A, e-, of which one may be found in a pixel, with a weight q of its own;
+            the fit tries each, refines the best, and keeps it where the likelihood rises enough. Empty: none.
+        free_satellite_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps
+            1 - q; the weights sum to 1 and q multiplies them. The default is a trap read by correlated double
             sampling: -A, 0, +A with q/2, 1 - q, q/2.
-        free_lobe_alarm: about the probability that a pixel without such levels is given some.
+        free_satellite_alarm: about the probability that a pixel without such levels is given some.
     """
 
     law: CountLaw = "poisson"
@@ -84,39 +84,39 @@ class MarginalModel:
     variance_per_electron2: float = 0.0
     extra_variance_e2: FloatArray = field(default_factory=_zero)
     extra_variance_dn2: FloatArray = field(default_factory=_zero)
-    lobe_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
-    lobe_shift_e: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-    lobe_shift_dn: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-    lobe_shift_sigma: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-    lobe_width: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    satellite_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    satellite_shift_e: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    satellite_shift_dn: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    satellite_shift_sigma: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    satellite_width: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     edge_first: int = 0
     edge_shift: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_low: int | None = None
     clip_high: int | None = None
     outlier_share: float = 0.0
     outlier_codes: int = 65536
-    free_lobes: tuple[float, ...] = ()
-    free_lobe_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
-    free_lobe_alarm: float = 1e-4
+    free_satellites: tuple[float, ...] = ()
+    free_satellite_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
+    free_satellite_alarm: float = 1e-4
 
     @property
     def neutral(self) -> bool:
         """Whether this is the PCD itself, cells integrated exactly."""
-        mine, plain = _values(self), _values(MarginalModel())
+        mine, plain = _values(self), _values(SampleLaw())
         return all(np.array_equal(mine[name], plain[name]) for name in plain)
 
-    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> MarginalModel:
+    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
         return replace(
             self,
             **{name: values[pixels] for name in _PER_PIXEL if (values := getattr(self, name)).shape[0] != 1},
         )
 
-    def with_counts(self, law: CountLaw, dispersion: float) -> MarginalModel:
+    def with_counts(self, law: CountLaw, dispersion: float) -> SampleLaw:
         """Return a copy with another law of the electron number."""
         return replace(self, law=law, dispersion=dispersion)
 
-    def with_exposures(self, weights: ArrayLike, factors: ArrayLike) -> MarginalModel:
+    def with_exposures(self, weights: ArrayLike, factors: ArrayLike) -> SampleLaw:
         """Return a copy whose exposure is also mixed over ``factors`` (all products)."""
         w, f = np.asarray(weights, np.float64), np.asarray(factors, np.float64)
         return replace(
@@ -125,7 +125,7 @@ class MarginalModel:
             exposure_factors=np.outer(self.exposure_factors, f).ravel(),
         )
 
-    def with_added_exposure(self, exposure_e: ArrayLike, weights: ArrayLike) -> MarginalModel:
+    def with_added_exposure(self, exposure_e: ArrayLike, weights: ArrayLike) -> SampleLaw:
         """Return a copy whose pixels also get one of several exposures, (n, j) e- each (all sums)."""
         d, u = (np.atleast_2d(np.asarray(values, np.float64)) for values in (exposure_e, weights))
         sums = self.added_exposure[:, :, None] + d[:, None, :]
@@ -144,7 +144,7 @@ class MarginalModel:
         shift_dn: ArrayLike = 0.0,
         shift_sigma: ArrayLike = 0.0,
         width: ArrayLike = 1.0,
-    ) -> MarginalModel:
+    ) -> SampleLaw:
         """Return a copy whose noise is also mixed over components, (l,) or (n, l) each (all products)."""
         w = np.atleast_2d(np.asarray(weights, np.float64))
 
@@ -157,11 +157,11 @@ class MarginalModel:
 
         return replace(
             self,
-            lobe_weights=outer(self.lobe_weights, w, product=True),
-            lobe_shift_e=outer(self.lobe_shift_e, like(shift_e), product=False),
-            lobe_shift_dn=outer(self.lobe_shift_dn, like(shift_dn), product=False),
-            lobe_shift_sigma=outer(self.lobe_shift_sigma, like(shift_sigma), product=False),
-            lobe_width=outer(self.lobe_width, like(width), product=True),
+            satellite_weights=outer(self.satellite_weights, w, product=True),
+            satellite_shift_e=outer(self.satellite_shift_e, like(shift_e), product=False),
+            satellite_shift_dn=outer(self.satellite_shift_dn, like(shift_dn), product=False),
+            satellite_shift_sigma=outer(self.satellite_shift_sigma, like(shift_sigma), product=False),
+            satellite_width=outer(self.satellite_width, like(width), product=True),
         )
 
     def with_variance(
@@ -171,7 +171,7 @@ class MarginalModel:
         e2: ArrayLike = 0.0,
         per_electron: float = 0.0,
         per_electron2: float = 0.0,
-    ) -> MarginalModel:
+    ) -> SampleLaw:
         """Return a copy with more variance.
 
         Args:
@@ -190,7 +190,7 @@ class MarginalModel:
 
     def with_levels(
         self, *, scale: ArrayLike = 1.0, shift_e: ArrayLike = 0.0, curvature: float = 0.0
-    ) -> MarginalModel:
+    ) -> SampleLaw:
         """Return a copy with a comb stretched by ``scale``, moved by ``shift_e`` e- and bent.
 
         Args:
@@ -205,7 +205,7 @@ class MarginalModel:
             level_shift_e=self.level_shift_e + np.atleast_1d(np.asarray(shift_e, np.float64)),
         )
 
-    def with_edges(self, first: int, shift: ArrayLike) -> MarginalModel:
+    def with_edges(self, first: int, shift: ArrayLike) -> SampleLaw:
         """Return a copy whose lower code edges are shifted, on top of what there is.
 
         Args:
@@ -222,7 +222,7 @@ class MarginalModel:
         both[self.edge_first - low : self.edge_first - low + self.edge_shift.size] += self.edge_shift
         return replace(self, edge_first=low, edge_shift=both)
 
-    def with_clip(self, low: int | None = None, high: int | None = None) -> MarginalModel:
+    def with_clip(self, low: int | None = None, high: int | None = None) -> SampleLaw:
         """Return a copy with codes cut to ``low`` .. ``high``, and to the limits that there are."""
         lows = [c for c in (low, self.clip_low) if c is not None]
         highs = [c for c in (high, self.clip_high) if c is not None]
@@ -232,23 +232,23 @@ class MarginalModel:
             clip_high=min(highs) if highs else None,
         )
 
-    def with_outliers(self, share: float, codes: int = 65536) -> MarginalModel:
+    def with_outliers(self, share: float, codes: int = 65536) -> SampleLaw:
         """Return a copy in which a share of the samples may lie anywhere among so many codes."""
         return replace(self, outlier_share=share, outlier_codes=codes)
 
-    def with_free_lobes(
+    def with_free_satellites(
         self,
         amplitudes_e: Sequence[float],
         *,
         pattern: Sequence[tuple[float, float]] | None = None,
         alarm: float = 1e-4,
-    ) -> MarginalModel:
-        """Return a copy that looks in every pixel for lobes of one of these amplitudes (``free_lobes``)."""
+    ) -> SampleLaw:
+        """Return a copy that looks in every pixel for satellites of one of these amplitudes."""
         return replace(
             self,
-            free_lobes=tuple(float(a) for a in amplitudes_e),
-            free_lobe_pattern=self.free_lobe_pattern if pattern is None else tuple(pattern),
-            free_lobe_alarm=alarm,
+            free_satellites=tuple(float(a) for a in amplitudes_e),
+            free_satellite_pattern=self.free_satellite_pattern if pattern is None else tuple(pattern),
+            free_satellite_alarm=alarm,
         )
 
 
@@ -260,13 +260,13 @@ _PER_PIXEL = (
     "level_shift_e",
     "extra_variance_e2",
     "extra_variance_dn2",
-    "lobe_weights",
-    "lobe_shift_e",
-    "lobe_shift_dn",
-    "lobe_shift_sigma",
-    "lobe_width",
+    "satellite_weights",
+    "satellite_shift_e",
+    "satellite_shift_dn",
+    "satellite_shift_sigma",
+    "satellite_width",
 )
 
 
-def _values(model: MarginalModel) -> dict[str, Any]:
+def _values(model: SampleLaw) -> dict[str, Any]:
     return {f.name: getattr(model, f.name) for f in fields(model)}

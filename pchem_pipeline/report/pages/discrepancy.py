@@ -176,10 +176,10 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
-    grown = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    value = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if grown else gap_text(gap.before)
+    extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
+    value = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
     more = [f"10⁻⁶ nats per sample; floor {gap_text(gap.floor)}"]
-    if grown and math.isfinite(gap.closed_fraction):
+    if extended and math.isfinite(gap.closed_fraction):
         more.append(f"{percent(max(gap.closed_fraction, 0.0), 1.0)} of the gap closed{_interval(gap)}")
     return [KeyFact("gap", value, tuple(more))]
 
@@ -243,10 +243,10 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     """Return what speaks for and against the verdict, the gravest first."""
     found = data.found
     flags: list[Flag] = []
-    grown = [step for step in found.steps if step.effect]
-    if grown:
-        flags += _closing(found, grown[-1])
-        flags += _materiality(grown)
+    extended = [step for step in found.steps if step.effect]
+    if extended:
+        flags += _closing(found, extended[-1])
+        flags += _materiality(extended)
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
             flags.append(Flag("note", f"To tell {rival} apart: {measurement}."))
@@ -291,8 +291,8 @@ def _closed(step: Step, rival: Rival | None) -> float:
     return 1.0 - max(rival.gap_after, 0.0) / step.gap_before
 
 
-def _materiality(grown: list[Step]) -> list[Flag]:
-    moved = _largest_move(grown)
+def _materiality(extended: list[Step]) -> list[Flag]:
+    moved = _largest_move(extended)
     if moved is None:
         return []
     name, largest = parameter_name(moved[0]), moved[1]

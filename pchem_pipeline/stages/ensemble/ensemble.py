@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS
+from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers, electron_numbers
@@ -111,7 +111,7 @@ class _Fitted:
         pixels, mask = PixelParameters.from_maps(maps)
         return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
 
-    def axes(self, settings: EnsembleSettings, *, grown: bool) -> EnsembleAxes | None:
+    def axes(self, settings: EnsembleSettings, *, extended: bool) -> EnsembleAxes | None:
         """Choose the axes of the ensemble; None where no pixel has a value."""
         if len(self.pixels) == 0:
             return None
@@ -122,7 +122,7 @@ class _Fitted:
         largest = min(float(self.pixels.quanta_exposure.max()), 60_000.0)
         mass = electron_pmf(self.pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
         n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
-        return EnsembleAxes(dn, nuced, n_k, grown)
+        return EnsembleAxes(dn, nuced, n_k, extended)
 
 
 def _pixels_of(
@@ -161,7 +161,7 @@ def run(context: StageContext) -> None:
     everything = frames == (0, sensor.n_frames)
     source = open_source(context) if frames is not None and (truth or not everything) else None
     fitted = _Fitted.read(store, [tile for tile in tiles if tile.key in ready])
-    axes = fitted.axes(settings, grown=bool(effects))
+    axes = fitted.axes(settings, extended=bool(effects))
     if sensor.kind == "histograms":
         context.note(
             "the input is histograms: the ensemble is of all samples, every channel counting the same"
@@ -256,9 +256,9 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     counts = store.read("histogram/counts", (*rows, slice(None)))
     outside = store.read("histogram/under", rows) + store.read("histogram/over", rows)
     maps = tuple(store.read(f"fit/{name}", rows) for name in PARAMETERS)
-    lobes = None
+    satellites = None
     if job.effects:
-        lobes = tuple(store.read(f"fit/{name}", rows) for name in FREE_LOBES)
+        satellites = tuple(store.read(f"fit/{name}", rows) for name in FREE_SATELLITES)
     added = fitted_added_exposure(store, rows)
     covariance = None
     if store.has("fit/correlation"):
@@ -279,7 +279,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             PixelHistograms(counts[part].reshape(n, -1), outside[part].ravel()),
             job.axes,
             job.effects,
-            None if lobes is None else (lobes[0][part].ravel(), lobes[1][part].ravel()),
+            None if satellites is None else (satellites[0][part].ravel(), satellites[1][part].ravel()),
             None if covariance is None else covariance[part].reshape(n, 4, 4),
             None if added is None else added.of(part).flat(),
         )

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_counts
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, tally
-from pchem_pipeline.model.ensemble.grown_ensemble import grown_sums
+from pchem_pipeline.model.ensemble.extended_ensemble import extended_sums
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 from pchem_pipeline.stages.fit.fitted_model import deciding_maps
@@ -55,7 +55,7 @@ def ensemble_tile(
     everything: PixelHistograms,
     axes: EnsembleAxes,
     effects: Sequence[Effect] = (),
-    lobes: tuple[FloatArray, FloatArray] | None = None,
+    satellites: tuple[FloatArray, FloatArray] | None = None,
     covariance: FloatArray | None = None,
     added: AddedExposure | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
@@ -67,8 +67,8 @@ def ensemble_tile(
         chosen: histograms of the chosen frames.
         everything: histograms of all frames, on the same bins.
         axes: axes of the ensemble.
-        effects: of the run's model, the axes being ``grown`` where there are any.
-        lobes: amplitude (e-) and weight of the pixels' free lobes, shape (n,); None: none.
+        effects: of the run's model, the axes being ``extended`` where there are any.
+        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
         covariance: of the maps, shape (n, 4, 4); None: not known.
         added: exposure that the effects add to the pixels, (j, n); None: nothing.
 
@@ -98,32 +98,32 @@ def ensemble_tile(
         if n > 0:
             _add_group(part, decider, origin[group], *sets, axes, integers, floats)
             if effects:
-                own = None if lobes is None else (lobes[0][mask][group], lobes[1][mask][group])
+                own = None if satellites is None else (satellites[0][mask][group], satellites[1][mask][group])
                 more = None if added is None else added.of(group)
-                _add_grown(part, own, int(n), axes, (effects, more), floats)
+                _add_extended(part, own, int(n), axes, (effects, more), floats)
     return integers, floats
 
 
-def _add_grown(
+def _add_extended(
     pixels: PixelParameters,
-    lobes: tuple[FloatArray, FloatArray] | None,
+    satellites: tuple[FloatArray, FloatArray] | None,
     n: int,
     axes: EnsembleAxes,
     law: tuple[Sequence[Effect], AddedExposure | None],
     floats: FloatArray,
 ) -> None:
-    """Add what the grown law predicts of pixels that have the same number of samples."""
+    """Add what the extended law predicts of pixels that have the same number of samples."""
     effects, added = law
     maps = pixel_maps(pixels.columns(), np.ones(len(pixels), bool))
-    grown = grown_sums(pixels, lobes, marginal_model(effects, maps, added), axes.dn, axes.nuced)
-    sums = grown.sums
+    extended = extended_sums(pixels, satellites, sample_law(effects, maps, added), axes.dn, axes.nuced)
+    sums = extended.sums
     parts: dict[str, Any] = {
         "pcd": sums.raw,
         "pcd_variance": (sums.raw - sums.raw_square) / n,
         "nuced": sums.nuced,
         "nuced_variance": (sums.nuced - sums.nuced_square) / n,
-        "nuced_predicted_sum": grown.nuced_sum,
-        "nuced_predicted_sum_square": grown.nuced_sum_square,
+        "nuced_predicted_sum": extended.nuced_sum,
+        "nuced_predicted_sum_square": extended.nuced_sum_square,
     }
     for name, part in parts.items():
         floats[axes.floats[name]] += part
@@ -167,7 +167,7 @@ def _add_group(
         "error": cells.error.sum(),
         "error_variance": np.sum(cells.error * (1.0 - cells.error)),
     }
-    if not axes.grown:
+    if not axes.extended:
         sums = ensemble_sums(pixels, axes.dn, axes.nuced)
         parts |= {
             "pcd": sums.raw,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, interval_names, variables_of
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.run.stage import StageContext
 
@@ -11,7 +11,7 @@ __all__ = ["create_fit_maps"]
 
 def create_fit_maps(context: StageContext) -> None:
     """Make the maps that the fit will have; the words of its status are explained with them."""
-    left_out = {"fit_status", *(() if context.model.effects else FREE_LOBES)}
+    left_out = {"fit_status", *(() if context.model.effects else FREE_SATELLITES)}
     if context.config.fit.intervals == "normal":
         left_out |= {path for name in INTERVALS for path in interval_names(name)}
     context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])

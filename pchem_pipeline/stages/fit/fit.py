@@ -45,7 +45,7 @@ def fit_tile(
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the group ``fit`` of a tile, by name.
 
-    With effects the plain fit is where the one under the grown law starts.
+    With effects the plain fit is where the one under the extended law starts.
 
     Args:
         histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of the tile.

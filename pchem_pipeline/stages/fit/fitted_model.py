@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
-from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
 from pchem_pipeline.run.model_versions import Region, model_of, read_added_exposure
 
 if TYPE_CHECKING:
@@ -57,5 +57,5 @@ def deciding_maps(
     """
     if not effects:
         return tuple(maps)
-    model = marginal_model(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), added)
+    model = sample_law(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), added)
     return tuple(values.reshape(maps[0].shape) for values in nearest_pcd(list(maps), model))

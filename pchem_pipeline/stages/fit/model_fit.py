@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.errors.fisher import correlations
 from pchem_pipeline.model.fit.excluding_codes import Interval
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["fit_arrays", "fit_model"]
 
@@ -53,14 +53,14 @@ def fit_model(
 
 def _laws(
     plain: FitResult, effects: Sequence[Effect], added: AddedExposure | None
-) -> MarginalModel | list[MarginalModel]:
+) -> SampleLaw | list[SampleLaw]:
     """Return the law that the effects compose after the plain fit, or a list of one for each sample."""
     usable = (plain.fit_status & int(_UNUSABLE)) == 0
     shared = [getattr(plain, name) for name in PARAMETERS[1:]]
     if plain.quanta_exposure.ndim == 1:
-        return marginal_model(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added)
+        return sample_law(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added)
     return [
-        marginal_model(effects, pixel_maps([np.ascontiguousarray(exposure), *shared], usable), added)
+        sample_law(effects, pixel_maps([np.ascontiguousarray(exposure), *shared], usable), added)
         for exposure in plain.quanta_exposure.T
     ]
 
@@ -89,7 +89,7 @@ def fit_arrays(result: FitResult, shown: int = 0, *, effects: bool = False) -> d
             for place, name in zip([*places, n_samples + 3], INTERVALS, strict=True)
             for side, path in enumerate(interval_names(name))
         }
-    known = {*arrays, *(() if effects else FREE_LOBES)}
+    known = {*arrays, *(() if effects else FREE_SATELLITES)}
     arrays |= {
         v.name: getattr(result, v.name)
         for v in variables_of("fit")

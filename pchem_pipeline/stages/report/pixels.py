@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.fit.status import MEANINGS, describe
-from pchem_pipeline.model.law.mass import marginal_mass
+from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
 from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.report.stored import FittedModel, PixelHistograms
@@ -145,12 +145,10 @@ def bin_masses(
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))
     if known.size:
         kept = [column[known] for column in columns]
-        law = marginal_model(
-            model.effects, pixel_maps(kept, np.ones(known.size, bool)), model.at(known).added
-        )
+        law = sample_law(model.effects, pixel_maps(kept, np.ones(known.size, bool)), model.at(known).added)
         codes = histograms.origin[known][:, None] + np.arange(counts[0].size)
         amplitude, weight = histograms.satellites[:, known]
-        found[known] = marginal_mass(law, kept, codes, lobes=(amplitude, weight))
+        found[known] = sample_mass(law, kept, codes, satellites=(amplitude, weight))
     return list(found)
 
 

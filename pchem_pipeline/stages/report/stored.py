@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import model_of, read_added_exposure
@@ -171,7 +171,7 @@ def read_histograms(
         block = store.read("histogram/counts", region)
         for i in here:
             counts[i] = block[y[i] - y0, x[i] - x0].copy()
-    free = [f"fit/{name}" for name in FREE_LOBES]
+    free = [f"fit/{name}" for name in FREE_SATELLITES]
     satellites = [
         store.read(path).reshape(-1)[index] if store.has(path) else np.zeros(index.size) for path in free
     ]

@@ -50,5 +50,5 @@ class ChessboardOffset(Effect):
         square = float(np.mean(covariance[evidence.maps.usable]))
         return (cls(offset_dn=np.sqrt(square)),) if square > 0 else ()
 
-    def marginal(self, model, maps):
+    def sample_law(self, model, maps):
         return model.with_noise([0.5, 0.5], shift_dn=[-self.offset_dn, self.offset_dn])

@@ -25,8 +25,8 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.plane import Plane
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.law.mass import marginal_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -408,22 +408,22 @@ def test_the_marginal_is_the_law_of_the_samples(effect):
     seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
     assert seen.sum() == inside.size
 
-    def misfit(model: MarginalModel) -> float:
-        expected = marginal_mass(model, MAPS, CODES)[0] * inside.size
+    def misfit(model: SampleLaw) -> float:
+        expected = sample_mass(model, MAPS, CODES)[0] * inside.size
         some = expected > 10
         chi = ((seen - expected)[some] ** 2 / expected[some]).sum()
         return float((chi - some.sum()) / np.sqrt(2 * some.sum()))
 
-    model = effect.marginal(MarginalModel(), MAPS)
+    model = effect.sample_law(SampleLaw(), MAPS)
     assert abs(misfit(model)) < 5
     if not model.neutral:
-        assert misfit(MarginalModel()) > 20
+        assert misfit(SampleLaw()) > 20
 
 
 def test_telegraph_noise_leaves_the_levels_to_the_pixels():
-    model = RtsNoise(fraction=0.01, amplitude_e=1.5, samples=2).marginal(MarginalModel(), MAPS)
-    assert 1.5 in model.free_lobes
-    assert dict(model.free_lobe_pattern) == pytest.approx({-0.5: 1 / 3, 0.5: 1 / 3, -1: 1 / 6, 1: 1 / 6})
-    spread = RtsNoise(fraction=0.01, amplitude_e=1.5, spread="exponential").marginal(MarginalModel(), MAPS)
-    assert min(spread.free_lobes) < min(model.free_lobes)
-    assert RtsNoise(fraction=0.01, amplitude_e=0.0).marginal(MarginalModel(), MAPS).free_lobes == ()
+    model = RtsNoise(fraction=0.01, amplitude_e=1.5, samples=2).sample_law(SampleLaw(), MAPS)
+    assert 1.5 in model.free_satellites
+    assert dict(model.free_satellite_pattern) == pytest.approx({-0.5: 1 / 3, 0.5: 1 / 3, -1: 1 / 6, 1: 1 / 6})
+    spread = RtsNoise(fraction=0.01, amplitude_e=1.5, spread="exponential").sample_law(SampleLaw(), MAPS)
+    assert min(spread.free_satellites) < min(model.free_satellites)
+    assert RtsNoise(fraction=0.01, amplitude_e=0.0).sample_law(SampleLaw(), MAPS).free_satellites == ()

@@ -26,7 +26,7 @@ from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 CLASSES = (
     ExposureDrift,
@@ -281,7 +281,7 @@ def test_exposures_of_a_run_are_a_mixture_with_its_moments():
     ],
 )
 def test_the_law_is_mixed_over_the_exposures_of_the_run(effect, variance):
-    model = effect.marginal(MarginalModel(), None)
+    model = effect.sample_law(SampleLaw(), None)
     w, f = model.exposure_weights, model.exposure_factors
     assert w.sum() == pytest.approx(1.0)
     assert w @ f == pytest.approx(1.0)
@@ -289,18 +289,18 @@ def test_the_law_is_mixed_over_the_exposures_of_the_run(effect, variance):
 
 
 def test_the_law_of_the_electron_number_and_what_leaves_it_alone():
-    plain = MarginalModel()
-    law = OverdispersedCounts(relative_variance=0.1).marginal(plain, None)
+    plain = SampleLaw()
+    law = OverdispersedCounts(relative_variance=0.1).sample_law(plain, None)
     assert (law.law, law.dispersion) == ("negative_binomial", 0.1)
-    law = BranchingCounts(branching=0.2).marginal(plain, None)
+    law = BranchingCounts(branching=0.2).sample_law(plain, None)
     assert (law.law, law.dispersion) == ("borel", 0.2)
-    law = OpticalCrosstalk(probability=0.2).marginal(plain, None)
+    law = OpticalCrosstalk(probability=0.2).sample_law(plain, None)
     assert law.exposure_factors.tolist() == [1.2]
-    assert 0 < CosmicRays(tracks_per_frame=0.1).marginal(plain, None).outlier_share < 1e-5
+    assert 0 < CosmicRays(tracks_per_frame=0.1).sample_law(plain, None).outlier_share < 1e-5
     for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion):
-        assert cls.typical()[0].marginal(plain, None) is plain
+        assert cls.typical()[0].sample_law(plain, None) is plain
     # H is then the exposure without it
-    law = SpuriousCharge(mean_e=0.3).marginal(plain, None)
+    law = SpuriousCharge(mean_e=0.3).sample_law(plain, None)
     assert (law.added_exposure.tolist(), law.added_weights.tolist()) == ([[0.3]], [[1.0]])
 
 

@@ -12,11 +12,11 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_of
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.framework.compose import marginal_model, model_words, pixel_maps
+from pchem_pipeline.effects.framework.compose import model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect, Plane
-from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.fit.fit import fit_tile
 from pchem_pipeline.stages.fit.fitted_model import deciding_maps
 
@@ -30,7 +30,7 @@ class Broken(Effect):
     def apply(self, values: Any, context: Any) -> Any:
         return values
 
-    def marginal(self, model: MarginalModel, maps: Any) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: Any) -> SampleLaw:
         raise IndexError("list index out of range")
 
 
@@ -39,7 +39,7 @@ class Wide(Broken):
 
     tag: Literal["wide"] = "wide"  # type: ignore[assignment]
 
-    def marginal(self, model: MarginalModel, maps: Any) -> MarginalModel:
+    def sample_law(self, model: SampleLaw, maps: Any) -> SampleLaw:
         return model.with_variance(e2=0.01 * np.nan_to_num(maps.quanta_exposure))
 
 
@@ -52,10 +52,10 @@ def test_effects_add_up_in_their_order() -> None:
     maps = maps_of(1.0, np.nan, 3.0)
     assert maps.usable.tolist() == [True, False, True]
     assert np.isnan(maps.bias).tolist() == [False, True, False]
-    model = marginal_model([Wide(), RowNoise(row_noise_dn=0.5), RowNoise(row_noise_dn=1.0)], maps)
+    model = sample_law([Wide(), RowNoise(row_noise_dn=0.5), RowNoise(row_noise_dn=1.0)], maps)
     np.testing.assert_allclose(model.extra_variance_e2, [0.01, 0.0, 0.03])
     np.testing.assert_allclose(model.extra_variance_dn2, [1.25])
-    assert marginal_model([], maps).neutral
+    assert sample_law([], maps).neutral
     assert model_words([RowNoise(row_noise_dn=0.5), Wide()]) == "PCD + row_noise + wide"
     assert model_words([]) == "PCD"
 
@@ -64,7 +64,7 @@ def test_an_effect_that_raises_is_named() -> None:
     with pytest.raises(
         ConfigError, match=r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
     ):
-        marginal_model([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
+        sample_law([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
 
 
 def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
@@ -80,19 +80,19 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
     for name, values in plain.items():
         np.testing.assert_array_equal(again[name], values)
     trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
-    grown = fit_tile(histogram, FitSettings(), None, [RowNoise(row_noise_dn=1.0), trap])
+    extended = fit_tile(histogram, FitSettings(), None, [RowNoise(row_noise_dn=1.0), trap])
     ends = {path for name in INTERVALS for path in interval_names(name)}  # only where they are asked for
     stored = [variable for variable in variables_of("fit") if variable.name not in ends]
-    assert set(grown) == {variable.name for variable in stored}
+    assert set(extended) == {variable.name for variable in stored}
     for variable in stored:
-        assert grown[variable.name].dtype == np.dtype(variable.dtype), variable.name
-        assert grown[variable.name].shape[:2] == (2, 2), variable.name
+        assert extended[variable.name].dtype == np.dtype(variable.dtype), variable.name
+        assert extended[variable.name].shape[:2] == (2, 2), variable.name
     # the pixel's own noise is what the rows leave of it
     expected = plain["read_noise_dn"] ** 2 - 1.0
-    np.testing.assert_allclose(grown["read_noise_dn"] ** 2, expected, rtol=2e-3)
-    np.testing.assert_allclose(grown["bias"], plain["bias"], atol=0.01)
-    assert not grown["lobe_weight"].any()
-    assert np.isnan(grown["lobe_amplitude_e"]).all()
+    np.testing.assert_allclose(extended["read_noise_dn"] ** 2, expected, rtol=2e-3)
+    np.testing.assert_allclose(extended["bias"], plain["bias"], atol=0.01)
+    assert not extended["satellite_weight"].any()
+    assert np.isnan(extended["satellite_amplitude_e"]).all()
 
 
 def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> None:
@@ -102,7 +102,7 @@ def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> Non
         np.array([100.0, np.nan]),
         np.array([2.5, np.nan]),
     ]
-    model = MarginalModel().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
+    model = SampleLaw().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
     model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02).with_noise(
         [0.5, 0.5], shift_dn=[-1.0, 2.0]
     )
@@ -112,7 +112,7 @@ def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> Non
     assert exposure[0] == 2.0
     assert 1 / gain[0] == pytest.approx((levels[2] - levels[0]) / 0.2)
     assert bias[0] + 2.0 / gain[0] == pytest.approx(levels[1])
-    # lobes at -1 and 2 DN have the variance 2.25; the electrons' in e-^2 counts a hundredfold in DN^2
+    # satellites at -1 and 2 DN have the variance 2.25; the electrons' in e-^2 counts a hundredfold in DN^2
     assert sigma[0] ** 2 == pytest.approx(2.5**2 + 1.0 + 2.25 + 100 * (0.01 + 0.01 + 0.004))
     assert np.isnan([gain[1], bias[1], sigma[1]]).all()
     maps = [np.array([[2.0]]), np.array([[0.1]]), np.array([[100.0]]), np.array([[2.5]])]

@@ -19,8 +19,8 @@ from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
-from pchem_pipeline.model.law.mass import marginal_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.truth import TruthMaps
 
 H, STEP, MU, NOISE_E = 1.4, 12.0, 100.3, 0.25
@@ -37,12 +37,12 @@ def maps_of(bias) -> PixelMaps:
 
 def law_of(effect) -> np.ndarray:
     maps = maps_of(MU)
-    return marginal_mass(effect.marginal(MarginalModel(), maps), maps, CODES)[0]
+    return sample_mass(effect.sample_law(SampleLaw(), maps), maps, CODES)[0]
 
 
 def smeared(added: np.ndarray) -> np.ndarray:
     """Return the mean of the plain law over these offsets, DN."""
-    return marginal_mass(MarginalModel(), maps_of(MU + added.ravel()), CODES).mean(axis=0)
+    return sample_mass(SampleLaw(), maps_of(MU + added.ravel()), CODES).mean(axis=0)
 
 
 @pytest.mark.parametrize("scale", [0.2, 3.0])
@@ -107,19 +107,19 @@ def test_the_law_of_the_adc_is_that_of_simulated_samples(effect):
 
 
 def test_random_widths_and_repeats_leave_the_law_as_it_is():
-    model = MarginalModel()
+    model = SampleLaw()
     for effect in (AdcDnl(dnl_lsb=0.3), RepeatedFrames(probability=0.1)):
-        assert effect.marginal(model, maps_of(MU)) is model
+        assert effect.sample_law(model, maps_of(MU)) is model
 
 
 def test_edges_of_several_effects_add_up():
     maps = maps_of(MU)
     first = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=100, edges=(1.0, 2.0))
     second = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=99, edges=(1.0, 1.0))
-    both = second.marginal(first.marginal(MarginalModel(), maps), maps)
+    both = second.sample_law(first.sample_law(SampleLaw(), maps), maps)
     assert both.edge_first == 99
     np.testing.assert_allclose(both.edge_shift, [0.1, 0.2, 0.2])
-    limits = Clipping(low=90, high=200).marginal(
-        Clipping(low=95, high=300).marginal(MarginalModel(), maps), maps
+    limits = Clipping(low=90, high=200).sample_law(
+        Clipping(low=95, high=300).sample_law(SampleLaw(), maps), maps
     )
     assert (limits.clip_low, limits.clip_high) == (95, 200)

@@ -11,8 +11,8 @@ from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
 from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
-from pchem_pipeline.model.law.mass import marginal_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 N_FRAMES = 1200
 FRAMES = taken(drawn_truth((6, 6)), n_frames=N_FRAMES)
@@ -44,14 +44,14 @@ def test_scores_are_those_of_the_evidence(pixel):
         assert spread == pytest.approx(deviation.flat[pixel], rel=1e-4)
 
 
-def test_the_mass_is_that_of_the_grown_law_and_all_of_it():
+def test_the_mass_is_that_of_the_extended_law_and_all_of_it():
     law = PixelLaw(EVIDENCE.maps, 3, N_FRAMES)
     assert law.mass.sum() == pytest.approx(1.0, abs=1e-9)
-    expected = marginal_mass(MarginalModel(), law.maps, law.codes)[0]
+    expected = sample_mass(SampleLaw(), law.maps, law.codes)[0]
     np.testing.assert_allclose(law.mass, expected / expected.sum(), atol=1e-14)
-    assert abs(law.change(MarginalModel())).max() < 1e-14
-    below = marginal_mass(MarginalModel(), law.maps, np.arange(law.codes[0] - 300, law.codes[0]))[0].sum()
-    assert law.below(MarginalModel()) == pytest.approx(below, rel=1e-6)
+    assert abs(law.change(SampleLaw())).max() < 1e-14
+    below = sample_mass(SampleLaw(), law.maps, np.arange(law.codes[0] - 300, law.codes[0]))[0].sum()
+    assert law.below(SampleLaw()) == pytest.approx(below, rel=1e-6)
     assert below * N_FRAMES < 1e-2
 
 
@@ -60,14 +60,14 @@ def test_narrow_peaks_and_faint_pixels_do_no_harm():
     for pixel in range(3):
         law = PixelLaw(maps, pixel, 1000)
         np.testing.assert_array_equal(np.diff(law.codes), 1)
-        change = law.change(Nonlinearity(step_change=0.01).marginal(MarginalModel(), law.maps))
+        change = law.change(Nonlinearity(step_change=0.01).sample_law(SampleLaw(), law.maps))
         assert all(np.isfinite(law.score_shift(name, change)) for name in SCORES)
         assert np.isfinite(law.goodness(change, 1000))
 
 
 def test_a_refit_of_the_pcd_is_the_pcd():
     law = PixelLaw(maps_of(1.5, 0.1, 100.0, 3.0), 0, N_FRAMES)
-    [again] = refitted([law], [law.mass_of(MarginalModel())], N_FRAMES)
+    [again] = refitted([law], [law.mass_of(SampleLaw())], N_FRAMES)
     assert again.maps.conversion_gain[0] == pytest.approx(0.1, rel=1e-3)
     # a comb of twice the gain is another PCD, and is found
     [double] = refitted([law], [law.mass_of(law.scaled(2.0))], N_FRAMES)
@@ -99,7 +99,7 @@ def test_typical_pixels_stand_for_all_usable_ones():
 
 def test_goodness_grows_with_the_change():
     law = PixelLaw(maps_of(1.5, 0.1, 100.0, 3.0), 0, N_FRAMES)
-    rows = [law.change(Nonlinearity(step_change=c).marginal(MarginalModel(), law.maps)) for c in (0.05, 0.1)]
+    rows = [law.change(Nonlinearity(step_change=c).sample_law(SampleLaw(), law.maps)) for c in (0.05, 0.1)]
     small, large = (law.goodness(row, 100_000) for row in rows)
     assert abs(law.goodness(0.0 * rows[0], 100_000)) < 0.5
     assert 2 < small < large

@@ -12,7 +12,7 @@ from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure, added_exposures
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.run.model_versions import (
@@ -55,7 +55,7 @@ def test_effects_add_up_and_the_others_add_nothing() -> None:
     alone = added_exposures([RowNoise(row_noise_dn=1.0), GHOST], frames, np.arange(1000), MAPS)
     assert alone is not None
     columns = [MAPS.quanta_exposure, MAPS.conversion_gain, MAPS.bias, MAPS.read_noise_dn]
-    law = marginal_model([RowNoise(row_noise_dn=1.0)], pixel_maps(columns, MAPS.usable), alone)
+    law = sample_law([RowNoise(row_noise_dn=1.0)], pixel_maps(columns, MAPS.usable), alone)
     assert law.added_exposure.shape == (48, 3)
     np.testing.assert_array_equal(law.added_exposure[10], alone.exposure_e[:, 1, 2])
     assert added_exposures([RowNoise(row_noise_dn=1.0)], frames, np.arange(1000), MAPS) is None

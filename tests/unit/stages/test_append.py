@@ -64,19 +64,19 @@ def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, m
     monkeypatch.setattr("pchem_pipeline.stages.ingest._CHUNK", (32, 16, 16))
     sections = {"input": {"mode": mode}, "histogram": {"summaries": summaries}}
     write(tmp_path, frames[: cuts[0]], [])
-    grown = target(tmp_path, "grown.zarr", **sections)
-    run_stages(grown, ["ingest", "histogram"], QUIET)
+    extended = target(tmp_path, "extended.zarr", **sections)
+    run_stages(extended, ["ingest", "histogram"], QUIET)
     for number, part in enumerate(np.split(frames, cuts)[1:], 1):
         np.save(tmp_path / f"f{number}.npy", part)
-        assert [state.state for state in append_frames(grown, QUIET)] == ["complete", "complete"]
-    assert append_frames(grown, QUIET) == []
+        assert [state.state for state in append_frames(extended, QUIET)] == ["complete", "complete"]
+    assert append_frames(extended, QUIET) == []
     whole = target(tmp_path, "whole.zarr", **sections)
     run_stages(whole, ["ingest", "histogram"], QUIET)
-    expected, found = (arrays_of(tmp_path / name, GROUPS) for name in ("whole.zarr", "grown.zarr"))
+    expected, found = (arrays_of(tmp_path / name, GROUPS) for name in ("whole.zarr", "extended.zarr"))
     assert found.keys() == expected.keys()
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
-    one, other = (RunStore.open(tmp_path / name) for name in ("whole.zarr", "grown.zarr"))
+    one, other = (RunStore.open(tmp_path / name) for name in ("whole.zarr", "extended.zarr"))
     assert one.attributes("frames") == other.attributes("frames")
     for stage in ("ingest", "histogram"):
         assert one.records.read(stage).fingerprint == other.records.read(stage).fingerprint

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.base.variables import FREE_LOBES, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.stages.fit.fit import fit_tile
@@ -41,7 +41,7 @@ def tile(branching=0.0):
 def test_the_shown_sample_stands_where_a_run_of_one_has_its_own():
     arrays = fit_samples_tile(tile(), SampleFit([False, False, False, True], 1, FitSettings()))
     ends = {path for name in (*PARAMETERS, "read_noise_e") for path in interval_names(name)}
-    named = {v.path for v in variables_of("fit") if v.name not in ends | set(FREE_LOBES)}
+    named = {v.path for v in variables_of("fit") if v.name not in ends | set(FREE_SATELLITES)}
     assert {path for path in arrays if path.startswith("fit/")} == named
     for end in ("", "_stderr"):
         np.testing.assert_array_equal(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from helpers.drawn_pixels import draw
 
-from pchem_pipeline.base.variables import FREE_LOBES, INTERVALS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, interval_names, variables_of
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.stages.fit.fit import fit_tile
@@ -20,7 +20,7 @@ def test_tile_has_every_array_in_its_place() -> None:
         "over": np.zeros((2, 3), np.uint32),
     }
     ends = {path for name in INTERVALS for path in interval_names(name)}
-    absent = ends | set(FREE_LOBES)
+    absent = ends | set(FREE_SATELLITES)
     arrays = fit_tile(histogram, FitSettings(), None)
     assert set(arrays) == {variable.name for variable in variables_of("fit")} - absent
     expected = fit_histograms(

@@ -34,7 +34,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     WEIGHT,
     make_scratch,
 )
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 EXACT = FitSettings(likelihood="exact")
 
@@ -49,7 +49,7 @@ class Series:
         given = tile_numba.Histograms(
             counts, places, origin, np.array(series.dark), np.zeros(counts.shape, np.uint8)
         )
-        law = pack([MarginalModel()] * len(series.counts), 1)
+        law = pack([SampleLaw()] * len(series.counts), 1)
         self.pixel = tile_numba.load_pixel(given, 0, tile_numba.make_room(given, law))
         cells_numba.resolve(law, 0, 0.0, self.pixel)
         self.scratch = make_scratch(len(series.counts), int(np.diff(places).max()), True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.effects.framework.compose import marginal_model, pixel_maps
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.model.fit.shared import Samples, SharedProblem, Tangent, fit_shared
 
@@ -24,7 +24,7 @@ LAYOUTS = [
 
 def law(shared: Any, own: Any) -> Any:
     effect = effect_class("signal_dependent_noise")(noise_e=float(np.sqrt(abs(shared[0]))))
-    return marginal_model([effect], pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
+    return sample_law([effect], pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
 
 
 def problem(samples: Samples, n_pixels: int, n: int, seed: int) -> tuple[SharedProblem, Any, Any]:

@@ -1,4 +1,4 @@
-"""The ensemble predicted with a grown law: the mean of the pixels' exact masses."""
+"""The ensemble predicted with an extended law: the mean of the pixels' exact masses."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.ensemble import grown_ensemble_numba
+from pchem_pipeline.model.ensemble import extended_ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, EnsembleSums, NucedAxis
-from pchem_pipeline.model.law.mass import marginal_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
-__all__ = ["GrownSums", "grown_sums"]
+__all__ = ["ExtendedSums", "extended_sums"]
 
 _CHUNK = 4_000_000  # masses held at a time
 
 
 @dataclass(frozen=True)
-class GrownSums:
-    """Sums over pixels under a grown law.
+class ExtendedSums:
+    """Sums over pixels under an extended law.
 
     Attributes:
         sums: masses and their squares on both axes, as without effects.
@@ -33,20 +33,20 @@ class GrownSums:
     nuced_sum_square: float
 
 
-def grown_sums(
+def extended_sums(
     pixels: PixelParameters,
-    lobes: tuple[FloatArray, FloatArray] | None,
-    model: MarginalModel,
+    satellites: tuple[FloatArray, FloatArray] | None,
+    model: SampleLaw,
     dn: DnAxis,
     nuced: NucedAxis,
-) -> GrownSums:
+) -> ExtendedSums:
     """Sum the pixels' masses at the integer DN, and the same masses sorted into NUCed bins.
 
     The mean over the pixels replaces that of their PCDs (Hendrickson et al. 2023, eq. full_ensemble_dist).
 
     Args:
         pixels: the n pixels.
-        lobes: amplitude (e-) and weight of the free lobes of each, shape (n,); None: none.
+        satellites: amplitude (e-) and weight of the free satellites of each, shape (n,); None: none.
         model: the law.
         dn: axis of the raw prediction; it should hold all of the data.
         nuced: axis of the NUCed prediction.
@@ -62,10 +62,10 @@ def grown_sums(
     step = max(1, _CHUNK // dn.size)
     for first in range(0, n, step):
         part = np.arange(first, min(first + step, n))
-        own = None if lobes is None else (lobes[0][part], lobes[1][part])
-        mass = marginal_mass(model.of(part), [c[part] for c in columns], dn.dn, lobes=own)
+        own = None if satellites is None else (satellites[0][part], satellites[1][part])
+        mass = sample_mass(model.of(part), [c[part] for c in columns], dn.dn, satellites=own)
         _add(mass, raw, raw_square)
-        grown_ensemble_numba.sort_masses(
+        extended_ensemble_numba.sort_masses(
             mass,
             float(dn.start),
             columns[1][part],
@@ -76,7 +76,7 @@ def grown_sums(
             bins_square,
             moments,
         )
-    return GrownSums(EnsembleSums(n, raw, raw_square, bins, bins_square), *map(float, moments))
+    return ExtendedSums(EnsembleSums(n, raw, raw_square, bins, bins_square), *map(float, moments))
 
 
 def _add(mass: NDArray[np.float64], raw: FloatArray, raw_square: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""The mass of a grown law written out term by term, and laws that use every part of it."""
+"""The mass of an extended law written out term by term, and laws that use every part of it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import mpmath
 import numpy as np
 
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 EVERYTHING = (
-    MarginalModel()
+    SampleLaw()
     .with_exposures([0.3, 0.7], [1.2, (1 - 0.36) / 0.7])
     .with_added_exposure([[0.0, 0.4, 1.1]], [[0.5, 0.3, 0.2]])
     .with_noise(
@@ -26,23 +26,23 @@ EVERYTHING = (
 )
 
 LAWS = {
-    "neutral": MarginalModel(),
-    "negative_binomial": MarginalModel().with_counts("negative_binomial", 0.05),
-    "hardly_dispersed": MarginalModel().with_counts("negative_binomial", 2e-4),
-    "borel": MarginalModel().with_counts("borel", 0.1),
-    "mixture": MarginalModel().with_exposures([0.5, 0.5], [0.8, 1.2]),
-    "added": MarginalModel().with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]]),
-    "skew": MarginalModel().with_noise([0.7, 0.3], shift_sigma=[-0.3, 0.7], width=0.9),
-    "variance": MarginalModel().with_variance(dn2=0.5, e2=0.01, per_electron=0.02, per_electron2=0.003),
-    "levels": MarginalModel().with_levels(scale=0.98, shift_e=0.2, curvature=0.02),
-    "clip": MarginalModel().with_clip(97, 130),
-    "edges": MarginalModel().with_edges(90, 0.2 * np.sin(np.arange(30.0))),
+    "neutral": SampleLaw(),
+    "negative_binomial": SampleLaw().with_counts("negative_binomial", 0.05),
+    "hardly_dispersed": SampleLaw().with_counts("negative_binomial", 2e-4),
+    "borel": SampleLaw().with_counts("borel", 0.1),
+    "mixture": SampleLaw().with_exposures([0.5, 0.5], [0.8, 1.2]),
+    "added": SampleLaw().with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]]),
+    "skew": SampleLaw().with_noise([0.7, 0.3], shift_sigma=[-0.3, 0.7], width=0.9),
+    "variance": SampleLaw().with_variance(dn2=0.5, e2=0.01, per_electron=0.02, per_electron2=0.003),
+    "levels": SampleLaw().with_levels(scale=0.98, shift_e=0.2, curvature=0.02),
+    "clip": SampleLaw().with_clip(97, 130),
+    "edges": SampleLaw().with_edges(90, 0.2 * np.sin(np.arange(30.0))),
     "everything": EVERYTHING,
     "everything_branching_clipped": EVERYTHING.with_counts("borel", 0.07).with_clip(93, 150),
 }
 
 
-def electron_mass(model: MarginalModel, k: int, exposure: float) -> float:
+def electron_mass(model: SampleLaw, k: int, exposure: float) -> float:
     """P(k), from the textbook formulas."""
     a = model.dispersion
     if model.law == "negative_binomial" and a:
@@ -59,7 +59,7 @@ def electron_mass(model: MarginalModel, k: int, exposure: float) -> float:
     return math.exp(k * math.log(exposure) - exposure - math.lgamma(k + 1))
 
 
-def lower_edge(model: MarginalModel, code: int) -> float:
+def lower_edge(model: SampleLaw, code: int) -> float:
     """Where a code begins, DN."""
     if model.clip_low is not None and code <= model.clip_low:
         return -math.inf
@@ -69,12 +69,12 @@ def lower_edge(model: MarginalModel, code: int) -> float:
     return code - 0.5 + (model.edge_shift[i] if 0 <= i < model.edge_shift.size else 0.0)
 
 
-def reference_mass(model: MarginalModel, parameters: tuple[float, ...], codes: range) -> list[float]:
-    """The docstring of MarginalModel, sum by sum, for one pixel."""
+def reference_mass(model: SampleLaw, parameters: tuple[float, ...], codes: range) -> list[float]:
+    """The docstring of SampleLaw, sum by sum, for one pixel."""
     exposure, gain, bias, sigma = parameters
     analog = math.sqrt(sigma**2 - 1 / 12)
-    lobes = [
-        getattr(model, f"lobe_{name}")[0]
+    satellites = [
+        getattr(model, f"satellite_{name}")[0]
         for name in ("weights", "shift_e", "shift_dn", "shift_sigma", "width")
     ]
     parts = []
@@ -85,7 +85,7 @@ def reference_mass(model: MarginalModel, parameters: tuple[float, ...], codes: r
             for u, d in zip(model.added_weights[0], model.added_exposure[0], strict=True)
         )
         level = model.level_scale[0] * k * (1 + model.curvature * (k - 1) / 2) + model.level_shift_e[0]
-        for w, shift_e, shift_dn, shift_sigma, width in zip(*lobes, strict=True):
+        for w, shift_e, shift_dn, shift_sigma, width in zip(*satellites, strict=True):
             mean = bias + (level + shift_e) / gain + shift_dn + shift_sigma * analog
             extra = model.extra_variance_e2[0] + model.variance_per_electron * k
             extra += model.variance_per_electron2 * k**2

@@ -1,4 +1,4 @@
-"""Masses under a grown law, their derivatives, and what the law refuses."""
+"""Masses under an extended law, their derivatives, and what the law refuses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 from helpers.em_trace import evaluated
-from helpers.grown_reference import EVERYTHING, LAWS, reference_mass
+from helpers.extended_reference import EVERYTHING, LAWS, reference_mass
 from scipy.stats import norm
 
 from pchem_pipeline.model.fit.api import satellite_threshold
@@ -23,9 +23,9 @@ from pchem_pipeline.model.law.electron_laws_numba import (
 )
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
-from pchem_pipeline.model.law.mass import log_likelihood, marginal_mass
+from pchem_pipeline.model.law.mass import log_likelihood, sample_mass
 from pchem_pipeline.model.law.pcd import pcd_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 PIXELS = [(2.0, 1 / 12, 100.0, 3.0), (0.4, 0.1, 99.3, 2.0), (9.0, 1 / 5.5, 97.7, 1.1)]
 CODES = range(70, 220)
@@ -34,7 +34,7 @@ CODES = range(70, 220)
 @pytest.mark.parametrize("name", LAWS)
 def test_mass_is_the_docstring_term_by_term(name: str) -> None:
     model = LAWS[name]
-    got = marginal_mass(model, list(np.transpose(PIXELS)), list(CODES))
+    got = sample_mass(model, list(np.transpose(PIXELS)), list(CODES))
     for pixel, row in zip(PIXELS, got, strict=True):
         expected = np.array(reference_mass(model, pixel, CODES))
         np.testing.assert_allclose(row, expected, rtol=0, atol=3e-15)
@@ -45,9 +45,9 @@ def test_mass_is_the_docstring_term_by_term(name: str) -> None:
 
 
 def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> None:
-    laws = [LAWS["levels"], MarginalModel().with_variance(e2=0.04, dn2=0.2), LAWS["skew"]]
+    laws = [LAWS["levels"], SampleLaw().with_variance(e2=0.04, dn2=0.2), LAWS["skew"]]
     laws[1] = laws[1].with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]])
-    both = MarginalModel().with_levels(scale=[0.98, 1, 1], shift_e=[0.2, 0, 0], curvature=0.0)
+    both = SampleLaw().with_levels(scale=[0.98, 1, 1], shift_e=[0.2, 0, 0], curvature=0.0)
     both = both.with_variance(e2=[0, 0.04, 0], dn2=[0, 0.2, 0])
     both = both.with_added_exposure([[0, 0], [0, 0.8], [0, 0]], [[1, 0], [0.6, 0.4], [1, 0]])
     both = both.with_noise(
@@ -56,12 +56,12 @@ def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> Non
         width=[[1, 1], [1, 1], [0.9, 0.9]],
     )
     columns = list(np.transpose(PIXELS))
-    got = marginal_mass(both, columns, list(CODES))
+    got = sample_mass(both, columns, list(CODES))
     for i, law in enumerate(laws):
         alone = law.with_levels(curvature=-law.curvature)
-        expected = marginal_mass(alone, [c[i : i + 1] for c in columns], list(CODES))[0]
+        expected = sample_mass(alone, [c[i : i + 1] for c in columns], list(CODES))[0]
         np.testing.assert_allclose(got[i], expected, rtol=1e-12, atol=1e-300)
-    part = marginal_mass(both.of(np.array([2, 0])), [c[[2, 0]] for c in columns], list(CODES))
+    part = sample_mass(both.of(np.array([2, 0])), [c[[2, 0]] for c in columns], list(CODES))
     np.testing.assert_array_equal(part, got[[2, 0]])
 
 
@@ -71,17 +71,15 @@ def test_neutral_law_is_the_pcd_and_codes_may_differ_by_pixel() -> None:
     codes = np.array([60, 70, 80])[:, None] + np.arange(90)
     analog = gain * np.sqrt(sigma**2 - 1 / 12)
     expected = pcd_mass(codes, exposure[:, None], gain[:, None], bias[:, None], analog[:, None])
-    np.testing.assert_allclose(
-        marginal_mass(MarginalModel(), columns, codes), expected, rtol=1e-7, atol=1e-280
-    )
-    assert MarginalModel().neutral
+    np.testing.assert_allclose(sample_mass(SampleLaw(), columns, codes), expected, rtol=1e-7, atol=1e-280)
+    assert SampleLaw().neutral
     assert not any(model.neutral for name, model in LAWS.items() if name != "neutral")
 
 
 def test_clipped_codes_hold_all_that_lies_beyond() -> None:
     columns = [np.array([2.0]), np.array([1 / 12]), np.array([100.0]), np.array([3.0])]
-    plain = marginal_mass(MarginalModel(), columns, np.arange(50, 600))[0]
-    clipped = marginal_mass(MarginalModel().with_clip(97, 130), columns, np.arange(90, 140))[0]
+    plain = sample_mass(SampleLaw(), columns, np.arange(50, 600))[0]
+    clipped = sample_mass(SampleLaw().with_clip(97, 130), columns, np.arange(90, 140))[0]
     assert clipped.sum() == pytest.approx(1.0, abs=1e-14)
     assert clipped[7] == pytest.approx(plain[: 97 - 50 + 1].sum(), rel=1e-12)
     assert clipped[130 - 90] == pytest.approx(plain[130 - 50 :].sum(), rel=1e-12)
@@ -89,18 +87,18 @@ def test_clipped_codes_hold_all_that_lies_beyond() -> None:
     assert not clipped[41:].any()
     # a window beside the codes that come out, or with their edge at its end, is no special case
     for low in (60, 80, 90, 97, 98, 121, 131):
-        window = marginal_mass(MarginalModel().with_clip(97, 130), columns, np.arange(low, low + 10))[0]
+        window = sample_mass(SampleLaw().with_clip(97, 130), columns, np.arange(low, low + 10))[0]
         inside = np.arange(low, low + 10) - 90
         expected = [clipped[i] if 0 <= i < 50 else 0.0 for i in inside]
         np.testing.assert_allclose(window, expected, rtol=1e-12)
-    tighter = MarginalModel().with_clip(97, 130).with_clip(95, 120)
+    tighter = SampleLaw().with_clip(97, 130).with_clip(95, 120)
     assert (tighter.clip_low, tighter.clip_high) == (97, 120)
 
 
 def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
     columns = [np.array([2.0]), np.array([1 / 12]), np.array([100.0]), np.array([3.0])]
-    plain = marginal_mass(MarginalModel(), columns, np.arange(70, 200))
-    with_some = marginal_mass(MarginalModel().with_outliers(1e-3, 1000), columns, np.arange(70, 200))
+    plain = sample_mass(SampleLaw(), columns, np.arange(70, 200))
+    with_some = sample_mass(SampleLaw().with_outliers(1e-3, 1000), columns, np.arange(70, 200))
     np.testing.assert_allclose(with_some, 0.999 * plain + 1e-6, rtol=1e-13)
 
 
@@ -111,7 +109,7 @@ def test_score_and_information_are_the_derivatives(law: str, satellite: float, a
     model = EVERYTHING.with_counts(law, 0.06).with_clip(92, 158).with_outliers(1e-3, 4096)
     counts = np.zeros(90, np.uint32)
     counts[2:69] = np.arange(67) % 7 * 9 + 1
-    packed = pack([model.with_free_lobes((1.3,))], 1)
+    packed = pack([model.with_free_satellites((1.3,))], 1)
     n_peaks = packed.peaks.shape[3] * (1 + packed.pattern.shape[0])
     n_exposures = max(packed.exposures.shape[2], packed.added.shape[3])
     pixel = pixel_numba.make_pixel(np.array([False]), 90, n_peaks, n_exposures, packed.table)
@@ -183,7 +181,7 @@ def test_log_likelihood_is_that_of_the_masses() -> None:
     counts[0, 149] = 1  # far out: every tail counts
     got = log_likelihood(counts, np.full(3, 70), columns, EVERYTHING)
     with np.errstate(divide="ignore"):
-        log_mass = np.log(marginal_mass(EVERYTHING, columns, list(CODES)))
+        log_mass = np.log(sample_mass(EVERYTHING, columns, list(CODES)))
     expected = [float(row[c > 0] @ log[c > 0]) for row, log, c in zip(counts, log_mass, counts, strict=True)]
     np.testing.assert_allclose(got, expected, rtol=1e-12)
     columns[1] = np.array([np.nan, 0.1, 0.2])
@@ -194,9 +192,9 @@ def test_log_likelihood_is_that_of_the_masses() -> None:
     ]
 
 
-def test_threshold_of_free_lobes_grows_with_the_number_of_trials() -> None:
-    one = MarginalModel().with_free_lobes([1.0])
-    eight = MarginalModel().with_free_lobes(range(1, 9))
+def test_threshold_of_free_satellites_grows_with_the_number_of_trials() -> None:
+    one = SampleLaw().with_free_satellites([1.0])
+    eight = SampleLaw().with_free_satellites(range(1, 9))
     # half of the chi-square mass: a normal deviate exceeds sqrt(2 rise) with the probability of a trial
     assert norm.sf(np.sqrt(2 * satellite_threshold(one))) == pytest.approx(1e-4, rel=1e-6)
     assert norm.sf(np.sqrt(2 * satellite_threshold(eight))) == pytest.approx(1e-4 / 8, rel=1e-6)
@@ -205,16 +203,16 @@ def test_threshold_of_free_lobes_grows_with_the_number_of_trials() -> None:
 def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:
     columns = list(np.transpose(PIXELS))
     with pytest.raises(ValueError, match="extra_variance_e2 has 2 rows for 3 pixels"):
-        marginal_mass(MarginalModel().with_variance(e2=[0.1, 0.2]), columns, [1, 2])
+        sample_mass(SampleLaw().with_variance(e2=[0.1, 0.2]), columns, [1, 2])
     with pytest.raises(ValueError, match="do not sum to 1"):
-        marginal_mass(MarginalModel().with_noise([0.5, 0.4]), columns, [1, 2])
+        sample_mass(SampleLaw().with_noise([0.5, 0.4]), columns, [1, 2])
     with pytest.raises(ValueError, match="do not sum to 1"):
-        marginal_mass(MarginalModel().with_added_exposure([[0, 1]], [[0.5, 0.4]]), columns, [1, 2])
+        sample_mass(SampleLaw().with_added_exposure([[0, 1]], [[0.5, 0.4]]), columns, [1, 2])
     with pytest.raises(ValueError, match="increase by 1"):
-        marginal_mass(MarginalModel(), columns, [1, 3])
+        sample_mass(SampleLaw(), columns, [1, 3])
 
 
 def test_edges_of_several_effects_add_up() -> None:
-    model = MarginalModel().with_edges(10, [0.1, 0.2]).with_edges(8, [0.3, 0.3, 0.3])
+    model = SampleLaw().with_edges(10, [0.1, 0.2]).with_edges(8, [0.3, 0.3, 0.3])
     assert model.edge_first == 8
     np.testing.assert_allclose(model.edge_shift, [0.3, 0.3, 0.4, 0.2])

@@ -1,4 +1,4 @@
-"""The PCD that comes nearest to a grown law: what electron numbers are decided with."""
+"""The PCD that comes nearest to an extended law: what electron numbers are decided with."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.inputs import Parameters, columns_of
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import FloatArray
 
 __all__ = ["nearest_pcd"]
 
 
-def nearest_pcd(parameters: Parameters, model: MarginalModel) -> tuple[FloatArray, ...]:
-    """Return (H, g, mu, sigma) of the PCD whose peaks lie and widen as those of the grown law do near k = H.
+def nearest_pcd(parameters: Parameters, model: SampleLaw) -> tuple[FloatArray, ...]:
+    """Return (H, g, mu, sigma) of the PCD whose peaks lie and widen as the extended law's do near k = H.
 
     The thresholds between electron numbers (Hendrickson et al. 2023, eq. demarg_K_eqn) need the levels and
     the whole width of the peaks, that of the named effects included, which the fitted read noise leaves out.
-    Free lobes are levels beside the peaks, not part of their width.
+    Free satellites are levels beside the peaks, not part of their width.
 
     Args:
         parameters: fitted (H, g, mu, sigma) of the n pixels of the law, NaN where there are none.
@@ -29,12 +29,14 @@ def nearest_pcd(parameters: Parameters, model: MarginalModel) -> tuple[FloatArra
     exposure, gain, bias, sigma = columns_of(parameters).T
     exposure = exposure + (model.added_weights * model.added_exposure).sum(axis=1)
     step, analog = 1.0 / gain, np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.0))
-    weights = model.lobe_weights
+    weights = model.satellite_weights
     shift = (
-        step[:, None] * model.lobe_shift_e + model.lobe_shift_dn + model.lobe_shift_sigma * analog[:, None]
+        step[:, None] * model.satellite_shift_e
+        + model.satellite_shift_dn
+        + model.satellite_shift_sigma * analog[:, None]
     )
     centre = (weights * shift).sum(axis=1)
-    own = (weights * ((model.lobe_width * analog[:, None]) ** 2 + shift**2)).sum(axis=1) - centre**2
+    own = (weights * ((model.satellite_width * analog[:, None]) ** 2 + shift**2)).sum(axis=1) - centre**2
     charge = model.extra_variance_e2 + model.variance_per_electron * exposure
     charge = charge + model.variance_per_electron2 * exposure**2
     variance = own + step**2 * charge + model.extra_variance_dn2 + QUANTISATION_VARIANCE

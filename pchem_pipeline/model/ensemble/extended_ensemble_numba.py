@@ -1,4 +1,4 @@
-"""Compiled loop of :mod:`pchem_pipeline.model.ensemble.grown_ensemble`."""
+"""Compiled loop of :mod:`pchem_pipeline.model.ensemble.extended_ensemble`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fit under a grown law: at the maximum, with the right errors, and what it does with odd pixels."""
+"""The fit under an extended law: at the maximum, with the right errors, and what it does with odd pixels."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.grown_reference import LAWS
+from helpers.extended_reference import LAWS
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from pchem_pipeline.model.electrons.grown_electrons import nearest_pcd
+from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.law.mass import log_likelihood, marginal_mass
+from pchem_pipeline.model.law.mass import log_likelihood, sample_mass
 from pchem_pipeline.model.law.pcd import pcd_mass
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 FIRST, N_CODES, FRAMES = 40, 330, 4000
@@ -29,8 +29,8 @@ TRUTH = [
 ]
 
 
-def drawn(model: MarginalModel, truth: list[NDArray[np.float64]], seed: int = 3) -> NDArray[np.uint32]:
-    mass = np.maximum(marginal_mass(model, truth, np.arange(FIRST, FIRST + N_CODES)), 0.0)
+def drawn(model: SampleLaw, truth: list[NDArray[np.float64]], seed: int = 3) -> NDArray[np.uint32]:
+    mass = np.maximum(sample_mass(model, truth, np.arange(FIRST, FIRST + N_CODES)), 0.0)
     counts = np.random.default_rng(seed).multinomial(FRAMES, mass / mass.sum(axis=1, keepdims=True))
     return counts.astype(np.uint32)
 
@@ -48,7 +48,7 @@ def stderr(fit: FitResult) -> NDArray[np.float64]:
 
 
 def maximum(
-    counts: NDArray[np.uint32], model: MarginalModel, start: NDArray[np.float64], scale: NDArray[np.float64]
+    counts: NDArray[np.uint32], model: SampleLaw, start: NDArray[np.float64], scale: NDArray[np.float64]
 ):
     """Where the gradient of the log-likelihood vanishes, in standard errors from ``start``, by scipy."""
 
@@ -78,41 +78,41 @@ def maximum(
 def test_fit_is_where_the_gradient_vanishes(name: str) -> None:
     model = LAWS[name]
     if name == "clip":
-        model = MarginalModel().with_clip(97, 180)
+        model = SampleLaw().with_clip(97, 180)
     counts = drawn(model, TRUTH)
     plain = fit_histograms(counts, origins(5))
-    grown = fit_histograms(counts, origins(5), law=model, start=plain)
+    extended = fit_histograms(counts, origins(5), law=model, start=plain)
     for pixel in (1, 3):
-        offset = maximum(counts[pixel], model, columns(grown)[pixel], stderr(grown)[pixel])
+        offset = maximum(counts[pixel], model, columns(extended)[pixel], stderr(extended)[pixel])
         assert abs(offset).max() < 1e-5, offset
     np.testing.assert_allclose(
-        grown.log_likelihood, log_likelihood(counts, origins(5), grown, model), rtol=1e-13
+        extended.log_likelihood, log_likelihood(counts, origins(5), extended, model), rtol=1e-13
     )
 
 
 def test_neutral_fit_agrees_with_an_independent_likelihood_and_with_the_plain_one() -> None:
-    counts = drawn(MarginalModel(), TRUTH)
+    counts = drawn(SampleLaw(), TRUTH)
     plain = fit_histograms(counts, origins(5))
-    grown = fit_histograms(counts, origins(5), law=MarginalModel(), start=plain)
+    extended = fit_histograms(counts, origins(5), law=SampleLaw(), start=plain)
     # density and exact mass differ by terms of order 1/24 of the second derivative, which sigma takes up
-    assert (abs(columns(grown) - columns(plain)) < 0.01 * stderr(plain)).all()
-    np.testing.assert_allclose(stderr(grown), stderr(plain), rtol=1e-4)
-    exposure, gain, bias, sigma = columns(grown).T[..., None]
+    assert (abs(columns(extended) - columns(plain)) < 0.01 * stderr(plain)).all()
+    np.testing.assert_allclose(stderr(extended), stderr(plain), rtol=1e-4)
+    exposure, gain, bias, sigma = columns(extended).T[..., None]
     analog = gain * np.sqrt(sigma**2 - 1 / 12)
     mass = pcd_mass(np.arange(FIRST, FIRST + N_CODES), exposure, gain, bias, analog)
     expected = np.where(counts > 0, counts * np.log(np.maximum(mass, 1e-300)), 0.0).sum(axis=1)
-    np.testing.assert_allclose(grown.log_likelihood, expected, rtol=1e-12)
-    assert (grown.fit_status == 0).all()
-    assert np.isnan(grown.lobe_amplitude_e).all()
-    assert not grown.lobe_weight.any()
+    np.testing.assert_allclose(extended.log_likelihood, expected, rtol=1e-12)
+    assert (extended.fit_status == 0).all()
+    assert np.isnan(extended.satellite_amplitude_e).all()
+    assert not extended.satellite_weight.any()
 
 
 def test_covariance_is_the_inverse_of_the_curvature() -> None:
     model = LAWS["everything"]
     counts = drawn(model, TRUTH)
     plain = fit_histograms(counts, origins(5))
-    grown = fit_histograms(counts, origins(5), law=model, start=plain)
-    best, scale = columns(grown), stderr(grown)
+    extended = fit_histograms(counts, origins(5), law=model, start=plain)
+    best, scale = columns(extended), stderr(extended)
 
     def value(offset: NDArray[np.float64]) -> NDArray[np.float64]:
         return log_likelihood(counts, origins(5), list((best + offset * scale).T), model)
@@ -125,11 +125,11 @@ def test_covariance_is_the_inverse_of_the_curvature() -> None:
             curvature[:, i, j] = (value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / (4 * h * h)
     expected = np.linalg.inv(-curvature) * scale[:, :, None] * scale[:, None, :]
     bound = 2e-3 * scale[:, :, None] * scale[:, None, :]
-    assert (abs(grown.covariance - expected) < bound).all()
+    assert (abs(extended.covariance - expected) < bound).all()
 
 
 def test_pixels_do_not_influence_each_other() -> None:
-    model = LAWS["variance"].with_free_lobes([1.0, 2.0])
+    model = LAWS["variance"].with_free_satellites([1.0, 2.0])
     truth = [np.repeat(column, 2) for column in TRUTH]
     counts = drawn(model, truth)
     plain = fit_histograms(counts, origins(10))
@@ -147,17 +147,17 @@ def test_pixels_do_not_influence_each_other() -> None:
 
 
 def test_a_pixel_without_plain_values_stays_without() -> None:
-    counts = drawn(MarginalModel(), TRUTH)
+    counts = drawn(SampleLaw(), TRUTH)
     counts[1] = 0
     counts[2] = 0
     counts[2, 60] = FRAMES
     plain = fit_histograms(counts, origins(5))
-    grown = fit_histograms(counts, origins(5), law=LAWS["variance"], start=plain)
-    assert grown.fit_status[1] == FitStatus.NO_DATA
-    assert grown.fit_status[2] == FitStatus.TOO_FEW_BINS
-    assert np.isnan(columns(grown)[1:3]).all()
-    assert np.isnan(grown.covariance[1:3]).all()
-    assert np.isfinite(columns(grown)[[0, 3, 4]]).all()
+    extended = fit_histograms(counts, origins(5), law=LAWS["variance"], start=plain)
+    assert extended.fit_status[1] == FitStatus.NO_DATA
+    assert extended.fit_status[2] == FitStatus.TOO_FEW_BINS
+    assert np.isnan(columns(extended)[1:3]).all()
+    assert np.isnan(extended.covariance[1:3]).all()
+    assert np.isfinite(columns(extended)[[0, 3, 4]]).all()
     # a start that is not there says it
     start = columns(plain)
     start[3] = np.nan
@@ -166,16 +166,18 @@ def test_a_pixel_without_plain_values_stays_without() -> None:
 
 
 def test_bits_about_the_data_are_kept_and_those_about_the_plain_fit_are_not() -> None:
-    model = MarginalModel().with_variance(per_electron=0.03)
+    model = SampleLaw().with_variance(per_electron=0.03)
     counts = drawn(model, TRUTH)
     plain = fit_histograms(counts, origins(5), over=np.array([0, 0, 0, 2, 0]), adc_limits=(0, 4000))
     marked = plain.fit_status | np.uint16(FitStatus.POOR_FIT | FitStatus.COARSE_STEPS)
-    grown = fit_histograms(counts, origins(5), law=model, start=dataclasses.replace(plain, fit_status=marked))
-    assert grown.fit_status.tolist() == [0, 0, 0, FitStatus.OUTSIDE_WINDOW, 0]
+    extended = fit_histograms(
+        counts, origins(5), law=model, start=dataclasses.replace(plain, fit_status=marked)
+    )
+    assert extended.fit_status.tolist() == [0, 0, 0, FitStatus.OUTSIDE_WINDOW, 0]
 
 
 def test_neighbour_is_taken_where_it_is_likelier() -> None:
-    counts = drawn(MarginalModel(), TRUTH)
+    counts = drawn(SampleLaw(), TRUTH)
     right = fit_histograms(counts, origins(5))
     wrong = dataclasses.replace(
         right,
@@ -183,11 +185,11 @@ def test_neighbour_is_taken_where_it_is_likelier() -> None:
         bias=right.bias - 1 / right.conversion_gain,
         likelihood_gap=np.zeros(5),
     )
-    found = fit_histograms(counts, origins(5), law=MarginalModel(), start=wrong)
+    found = fit_histograms(counts, origins(5), law=SampleLaw(), start=wrong)
     np.testing.assert_allclose(found.bias, right.bias, atol=0.01)
     assert (found.likelihood_gap > 0).all()
     # a warm start is believed
-    stays = fit_histograms(counts, origins(5), law=MarginalModel(), start=columns(wrong))
+    stays = fit_histograms(counts, origins(5), law=SampleLaw(), start=columns(wrong))
     assert (abs(stays.bias - right.bias)[1:] > 5).all()
 
 
@@ -195,53 +197,53 @@ def test_exposure_that_is_added_leaves_h_as_it_is_without() -> None:
     # half of the frames get 0.9 e- in the first three pixels, a third 1.4 e- in the fourth, none in the last
     added = [[0.0, 0.9]] * 3 + [[0.0, 1.4], [0.0, 0.0]]
     weights = [[0.5, 0.5]] * 3 + [[2 / 3, 1 / 3], [1.0, 0.0]]
-    model = MarginalModel().with_added_exposure(added, weights)
+    model = SampleLaw().with_added_exposure(added, weights)
     truth = [np.tile(column, 20) for column in TRUTH]
     every = np.tile(np.arange(5), 20)
     counts = drawn(model.of(every), truth, seed=11)
     plain = fit_histograms(counts, origins(100))
-    grown = fit_histograms(counts, origins(100), law=model.of(every), start=plain)
-    pull = (columns(grown) - np.stack(truth, axis=1)) / stderr(grown)
+    extended = fit_histograms(counts, origins(100), law=model.of(every), start=plain)
+    pull = (columns(extended) - np.stack(truth, axis=1)) / stderr(extended)
     for i in range(5):
         # the mean of twenty pulls, four standard errors
         assert abs(pull[i::5].mean(axis=0)).max() < 4 / np.sqrt(20)
-    assert ((plain.quanta_exposure - truth[0]) / stderr(grown)[:, 0])[every < 4].mean() > 10
-    same = fit_histograms(counts, origins(100), law=MarginalModel(), start=plain)
-    np.testing.assert_array_equal(columns(grown)[every == 4], columns(same)[every == 4])
+    assert ((plain.quanta_exposure - truth[0]) / stderr(extended)[:, 0])[every < 4].mean() > 10
+    same = fit_histograms(counts, origins(100), law=SampleLaw(), start=plain)
+    np.testing.assert_array_equal(columns(extended)[every == 4], columns(same)[every == 4])
     # electron numbers are decided with the mean exposure
-    mean = nearest_pcd(columns(grown).T.tolist(), model.of(every))[0]
-    np.testing.assert_allclose(mean, columns(grown)[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
+    mean = nearest_pcd(columns(extended).T.tolist(), model.of(every))[0]
+    np.testing.assert_allclose(mean, columns(extended)[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
 
 
-def test_free_lobes_are_found_where_they_are_and_nowhere_else() -> None:
-    law = MarginalModel().with_free_lobes([0.5, 1.0, 1.5, 2.0, 3.0])
+def test_free_satellites_are_found_where_they_are_and_nowhere_else() -> None:
+    law = SampleLaw().with_free_satellites([0.5, 1.0, 1.5, 2.0, 3.0])
     truth = [np.tile(column, 8) for column in TRUTH]
     weight, amplitude = np.zeros(40), np.zeros(40)
     weight[5:15], amplitude[5:15] = 0.15, 1.5
     weight[15:20], amplitude[15:20] = 0.1, 3.0
     shares = np.stack([0.5 * weight, 1 - weight, 0.5 * weight], axis=1)
     shifts = np.stack([-amplitude, 0 * amplitude, amplitude], axis=1)
-    counts = drawn(MarginalModel().with_noise(shares, shift_e=shifts), truth)
+    counts = drawn(SampleLaw().with_noise(shares, shift_e=shifts), truth)
     plain = fit_histograms(counts, origins(40))
-    grown = fit_histograms(counts, origins(40), law=law, start=plain)
-    found = grown.lobe_weight > 0
+    extended = fit_histograms(counts, origins(40), law=law, start=plain)
+    found = extended.satellite_weight > 0
     assert found[5:20].all()
     assert not found[20:].any()
     assert not found[:5].any()
-    right = found & (abs(grown.lobe_amplitude_e - amplitude) < 0.1)
+    right = found & (abs(extended.satellite_amplitude_e - amplitude) < 0.1)
     assert right.sum() >= 14
-    error = abs(grown.lobe_weight - weight)[right] / np.sqrt(weight * (1 - weight) / FRAMES)[right]
+    error = abs(extended.satellite_weight - weight)[right] / np.sqrt(weight * (1 - weight) / FRAMES)[right]
     assert (error < 8).all()
     # the parameters come right: the plain fit was led astray by electrons, this one is within its errors
-    pulls = (columns(grown) - np.stack(truth, axis=1)) / stderr(grown)
+    pulls = (columns(extended) - np.stack(truth, axis=1)) / stderr(extended)
     astray = (columns(plain) - np.stack(truth, axis=1)) / stderr(plain)
     assert (abs(pulls[right]) < 5).all()
     assert (abs(astray[5:20]).max(axis=1) > 10).sum() > 8
-    # their log-likelihood holds the lobes
+    # their log-likelihood holds the satellites
     np.testing.assert_allclose(
-        grown.log_likelihood, log_likelihood(counts, origins(40), grown, law), rtol=1e-12
+        extended.log_likelihood, log_likelihood(counts, origins(40), extended, law), rtol=1e-12
     )
-    mass = marginal_mass(law, grown, np.arange(FIRST, FIRST + N_CODES))
+    mass = sample_mass(law, extended, np.arange(FIRST, FIRST + N_CODES))
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-6)
 
 
@@ -253,20 +255,20 @@ def test_telegraph_levels_are_found_where_the_plain_fit_is_astray() -> None:
     amplitude, weight = rng.uniform(0.9, 1.35, n), rng.uniform(0.3, 0.48, n)
     shares = np.stack([0.5 * weight, 1 - weight, 0.5 * weight], axis=1)
     shifts = np.stack([-amplitude, 0 * amplitude, amplitude], axis=1)
-    counts = drawn(MarginalModel().with_noise(shares, shift_e=shifts), truth)
+    counts = drawn(SampleLaw().with_noise(shares, shift_e=shifts), truth)
     plain = fit_histograms(counts, origins(n))
-    law = MarginalModel().with_free_lobes([0.5, 0.7, 1.0, 1.4, 2.0], alarm=1e-3)
-    grown = fit_histograms(counts, origins(n), law=law, start=plain)
+    law = SampleLaw().with_free_satellites([0.5, 0.7, 1.0, 1.4, 2.0], alarm=1e-3)
+    extended = fit_histograms(counts, origins(n), law=law, start=plain)
     astray = abs(columns(plain) - np.stack(truth, axis=1))[:, 0] > 0.5
     assert astray.mean() > 0.5
-    found = grown.lobe_weight > 0
+    found = extended.satellite_weight > 0
     assert found.mean() > 0.9
-    off = abs(columns(grown) - np.stack(truth, axis=1))[:, 0] > 0.5
+    off = abs(columns(extended) - np.stack(truth, axis=1))[:, 0] > 0.5
     assert off.mean() < 0.1
     # between the amplitudes of the grid, too, the fit is likelier than the truth
-    of_truth = log_likelihood(counts, origins(n), truth, law, lobes=(amplitude, weight))
-    assert (grown.log_likelihood > of_truth)[found & ~off].all()
-    pulls = (columns(grown) - np.stack(truth, axis=1))[found & ~off] / stderr(grown)[found & ~off]
+    of_truth = log_likelihood(counts, origins(n), truth, law, satellites=(amplitude, weight))
+    assert (extended.log_likelihood > of_truth)[found & ~off].all()
+    pulls = (columns(extended) - np.stack(truth, axis=1))[found & ~off] / stderr(extended)[found & ~off]
     # the amplitude's own uncertainty is not in the errors, so single pulls are wider; their mean is not
     assert (abs(pulls.mean(axis=0)) < 5 * pulls.std(axis=0) / np.sqrt(len(pulls))).all()
     assert (abs(np.median(pulls, axis=0)) < 1.0).all()
@@ -277,22 +279,22 @@ def test_pixels_without_levels_are_rarely_given_some() -> None:
     rng = np.random.default_rng(22)
     noise = 12.0 * rng.uniform(0.25, 0.45, n)
     truth = [rng.uniform(0.5, 3.5, n), np.full(n, 1 / 12), np.full(n, 100.0), noise]
-    counts = drawn(MarginalModel(), truth)
+    counts = drawn(SampleLaw(), truth)
     plain = fit_histograms(counts, origins(n))
-    law = MarginalModel().with_free_lobes([0.5, 0.7, 1.0, 1.4, 2.0], alarm=alarm)
-    grown = fit_histograms(counts, origins(n), law=law, start=plain)
-    false = int((grown.lobe_weight > 0).sum())
+    law = SampleLaw().with_free_satellites([0.5, 0.7, 1.0, 1.4, 2.0], alarm=alarm)
+    extended = fit_histograms(counts, origins(n), law=law, start=plain)
+    false = int((extended.satellite_weight > 0).sum())
     # Poisson: more than 5 of 0.4 expected have a probability below 1e-5
     assert false <= 5
 
 
 def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
-    counts = drawn(MarginalModel(), TRUTH)
+    counts = drawn(SampleLaw(), TRUTH)
     clean = fit_histograms(counts, origins(5))
     hit = counts.copy()
     hit[:, N_CODES - 1] += 1
     start = fit_histograms(hit, origins(5))
-    law, off = MarginalModel(), FitSettings(tail_guard=0.0)
+    law, off = SampleLaw(), FitSettings(tail_guard=0.0)
     careless = fit_histograms(hit, origins(5), law=law, start=start, settings=off)
     careful = fit_histograms(hit, origins(5), law=law.with_outliers(1e-4), start=start, settings=off)
     guarded = fit_histograms(hit, origins(5), law=law, start=start)
@@ -305,9 +307,9 @@ def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
 
 def test_coarse_codes_no_longer_bias_the_read_noise() -> None:
     truth = [np.full(60, 1.5), np.full(60, 1 / 3.2), np.linspace(99.5, 100.5, 60), np.full(60, 0.62)]
-    counts = drawn(MarginalModel(), truth)
+    counts = drawn(SampleLaw(), truth)
     plain = fit_histograms(counts, origins(60))
-    grown = fit_histograms(counts, origins(60), law=MarginalModel(), start=plain)
-    assert (grown.fit_status & int(FitStatus.COARSE_STEPS) == 0).all()
-    pulls = (columns(grown) - np.stack(truth, axis=1)) / stderr(grown)
+    extended = fit_histograms(counts, origins(60), law=SampleLaw(), start=plain)
+    assert (extended.fit_status & int(FitStatus.COARSE_STEPS) == 0).all()
+    pulls = (columns(extended) - np.stack(truth, axis=1)) / stderr(extended)
     assert (abs(pulls.mean(axis=0)) < 5 / np.sqrt(60)).all()

@@ -1,4 +1,4 @@
-"""Samples made by a chain of their own: the grown fit is right within its errors, the plain one is not."""
+"""Samples made by a chain of their own: the extended fit is right within its errors, the plain one is not."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.law.mass import log_likelihood
-from pchem_pipeline.model.law.sample_law import MarginalModel
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 PIXELS, FRAMES = 120, 4000
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
-PLAIN = MarginalModel()
+PLAIN = SampleLaw()
 
 Rng = np.random.Generator
 Samples = Callable[[Rng, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], NDArray[np.float64]]
@@ -86,7 +86,7 @@ def uneven(rng, exposure, gain, bias, noise):
     return 49.0 + np.searchsorted(edges, straight(rng, exposure, gain, bias, noise))
 
 
-CASES: dict[str, tuple[Samples, MarginalModel, tuple[str, ...]]] = {
+CASES: dict[str, tuple[Samples, SampleLaw, tuple[str, ...]]] = {
     "negative binomial": (dispersed, PLAIN.with_counts("negative_binomial", 0.08), ("conversion_gain",)),
     "borel": (branching, PLAIN.with_counts("borel", 0.08), ("conversion_gain",)),
     "two exposures": (flickering, PLAIN.with_exposures([0.5, 0.5], [0.7, 1.3]), ("conversion_gain",)),
@@ -125,20 +125,20 @@ def pulls(fit: FitResult, truth: tuple[NDArray[np.float64], ...], least: float =
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_grown_fit_is_unbiased_where_the_plain_one_is_not(name: str) -> None:
+def test_extended_fit_is_unbiased_where_the_plain_one_is_not(name: str) -> None:
     samples, model, wrong = CASES[name]
     rng = np.random.default_rng(7)
     truth = sensor(rng)
     counts, origin = histograms(samples(rng, *(column[:, None] for column in truth)))
     plain = fit_histograms(counts, origin)
-    grown = fit_histograms(counts, origin, law=model, start=plain)
-    before, after = pulls(plain, truth, 0.8), pulls(grown, truth)
+    extended = fit_histograms(counts, origin, law=model, start=plain)
+    before, after = pulls(plain, truth, 0.8), pulls(extended, truth)
     assert (abs(after) < 5).all(), after
     for parameter in wrong:
         assert abs(before[NAMES.index(parameter)]) > 7, before
     # the goodness of fit is uniform: a tenth of the pixels below 0.1
-    share = np.mean(grown.goodness_p[np.isfinite(grown.goodness_p)] < 0.1)
+    share = np.mean(extended.goodness_p[np.isfinite(extended.goodness_p)] < 0.1)
     assert abs(share - 0.1) < 5 * np.sqrt(0.09 / PIXELS)
     # the right law wins on the frames that it was fitted to, all pixels together
     neutral = log_likelihood(counts, origin, fit_histograms(counts, origin, law=PLAIN, start=plain), PLAIN)
-    assert np.nansum(grown.log_likelihood - neutral) > (20 if name != "variance" else -5)
+    assert np.nansum(extended.log_likelihood - neutral) > (20 if name != "variance" else -5)
