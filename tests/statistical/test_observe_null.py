@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from helpers.small_stacks import small_stack
 
-from pchem_pipeline.discrepancy.observe import laws, observe
+from pchem_pipeline.discrepancy.observe import laws
+from pchem_pipeline.discrepancy.observe import observe as observe_module
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.observe import observe as observe_module
+from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.vector_frames import FrameView
 
 N_STACKS, SHAPE, N_FRAMES, BLOCK = 60, (24, 24), 600, 50
