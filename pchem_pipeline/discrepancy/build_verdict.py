@@ -40,8 +40,8 @@ FloatArray = NDArray[np.float64]
 LARGEST_REST = 0.2
 _MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
-_MOST_RESIDUALS_TOLD = 3
-_MICRO = 1e-3  # nats: smaller gaps are told in millionths
+_MOST_RESIDUALS = 3
+_MICRO = 1e-3  # nats: smaller gaps are said in millionths
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Addition:
 
     Attributes:
         effect: with its fitted parameters.
-        alone: whether it was told from all others.
+        alone: whether all others are excluded.
         fits: whether it explains what it moves itself; where not, the candidates are the nearest known.
         candidates: those compared, the likeliest first.
         strength_stderr: standard error of its strength.
@@ -315,8 +315,8 @@ def _rest(found: Findings) -> str:
 
 def _left(added: Added) -> str:
     """Return in words which codes are not accounted for, and what stands in for it."""
-    told = "; ".join(place.sentence for place in added.residuals[:_MOST_RESIDUALS_TOLD])
-    words = f"; what is left: {told}" if told else ""
+    first = "; ".join(place.sentence for place in added.residuals[:_MOST_RESIDUALS])
+    words = f"; what is left: {first}" if first else ""
     if added.stand_ins:
         names = ", ".join(added.stand_ins)
         words += f"; {names} would describe a part of it, but not on all codes alike, and is not named"

@@ -76,7 +76,7 @@ class NullModel:
             names: of the statistics.
             vectors: the replicates.
             before: null of the model to which effects were added: statistics that they leave where they were
-                scatter as they did, which few new replicates need not tell again.
+                scatter as they did, which few new replicates need not show again.
         """
         mean, std, covariance = moments(vectors)
         tests = _effective_tests(vectors)

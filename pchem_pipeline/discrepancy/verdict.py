@@ -426,7 +426,7 @@ class Discrepancy:
         statistics: names, and deviations before and after, for pictures.
         code_extended: samples expected at each code of ``evidence.code`` from the final model; None where
             nothing was added or the model gives no law.
-        added: exposure that the effects add to single pixels beside the H of ``maps``; None: nothing.
+        added: exposure that the effects add to single pixels on top of the H of ``maps``; None: nothing.
     """
 
     verdict: Verdict

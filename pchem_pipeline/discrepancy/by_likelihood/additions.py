@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.by_likelihood.comb import electrons_of, find_residuals, set_aside_residual
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_over
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
-from pchem_pipeline.discrepancy.by_likelihood.residuals import find_residuals, set_aside_residual
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
-from pchem_pipeline.discrepancy.by_likelihood.views import electrons_of
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
@@ -69,7 +68,7 @@ class AddedSets:
             still: whether the data disagree with the final model.
         """
         pulls = [null.pulls(z) for null in nulls]
-        told = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
+        moved = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
         gap, fitted = before, self.plain
         additions: list[Addition] = []
         members: tuple[Member, ...] = ()
@@ -78,7 +77,7 @@ class AddedSets:
             extended = self._refit(members)
             after = self.gaps.gap(self.sets.problem(members), extended.fit)
             addition = self._addition(named, members, (gap, after), (fitted, extended))
-            additions.append(replace(addition, pulls=told))
+            additions.append(replace(addition, pulls=moved))
             gap, fitted = after, extended
         fits = self.found.rest <= LARGEST_REST or gap.at_floor
         added = Added(

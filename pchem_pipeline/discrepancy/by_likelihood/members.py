@@ -75,7 +75,7 @@ class Member:
 
     @classmethod
     def of(cls, effect: Effect) -> Member:
-        """Find the fields to fit: the strength, and real numbers with limits beside it."""
+        """Find the fields to fit: the strength, and other real numbers with limits."""
         names = [effect.strength] if effect.strength else []
         for name, value in effect.model_dump().items():
             if isinstance(value, float) and name not in names and len(names) <= _MOST_EXTRA and names:

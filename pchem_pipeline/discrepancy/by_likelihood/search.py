@@ -9,6 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST
+from pchem_pipeline.discrepancy.by_likelihood.comb import (
+    Interval,
+    doubtful_peaks,
+    electrons_of,
+    inside,
+    valleys,
+)
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import (
@@ -19,13 +26,6 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import (
     compare_sets,
     find_rivals,
     of_best_kind,
-)
-from pchem_pipeline.discrepancy.by_likelihood.views import (
-    Interval,
-    doubtful_peaks,
-    electrons_of,
-    inside,
-    valleys,
 )
 
 __all__ = ["Explanation", "Named", "combs_coincide", "explain"]

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    Choice,
+    Contender,
     Hypothesis,
     Noise,
     SetFit,
     fit_set,
     tolerance,
 )
-from pchem_pipeline.discrepancy.by_simulation.naming import Choice, Contender
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, contradicted, misfits
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings

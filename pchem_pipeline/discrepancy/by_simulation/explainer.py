@@ -26,15 +26,16 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     serial,
 )
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    Choice,
     Hypothesis,
     Noise,
     SetFit,
+    choose,
     correction,
     fit_set,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import Refit, equivalent_sensor, expected_codes, refit_maps
-from pchem_pipeline.discrepancy.by_simulation.naming import Choice, choose
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, suspicious

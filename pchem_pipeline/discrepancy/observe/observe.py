@@ -22,12 +22,13 @@ from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sam
 from pchem_pipeline.discrepancy.observe.vector_frames import (
     FrameView,
     frame_statistics,
+    neighbour_sums,
     pixel_lags,
     quadrant_series,
     quadrant_sums,
+    space_statistics,
     time_statistics,
 )
-from pchem_pipeline.discrepancy.observe.vector_space import neighbour_sums, space_statistics
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult

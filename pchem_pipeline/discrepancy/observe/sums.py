@@ -68,7 +68,7 @@ class FrameSums:
         lags: mean products after removal of the frames' common modes: kk and rr at lags 1, 2, 3, then r with
             the k before, k with the r before, (8, y, x).
         n_pairs: number of products behind lags 1, 2, 3.
-        beside, below: mean products kk, rr and rk + kr with the next column or row, (3, y, x).
+        next_column, next_row: mean products kk, rr and rk + kr with the next column or row, (3, y, x).
         repeated: positions of frames equal to the one before.
         repeated_rows: number of rows (of other frames) equal to those before.
         consecutive: number of frames that directly follow another.
@@ -81,8 +81,8 @@ class FrameSums:
     blocks: FloatArray
     lags: FloatArray
     n_pairs: tuple[int, int, int]
-    beside: FloatArray
-    below: FloatArray
+    next_column: FloatArray
+    next_row: FloatArray
     repeated: IntArray
     repeated_rows: int
     consecutive: int
@@ -136,14 +136,15 @@ def sum_frames(
     charge, readout = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
     rows, columns, gain = np.zeros((4, n, ny)), np.zeros((n, 2, nx), np.float32), np.zeros(n)
     blocks = np.zeros((edges.size - 1, 2, ny, nx))
-    lags, beside, below = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
+    lags, next_column, next_row = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
     modes = np.stack([pixels.exposure, pixels.usable]).astype(np.float32)
     weights = np.stack([pixels.factor, pixels.shift]).astype(np.float32)
     norms = np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64)
     for b, (first, last) in enumerate(pairwise(edges)):
         kernel.sum_block(
             frames[first:last], support, laws.tables, modes, weights, norms, charge, readout,
-            rows[:, first:last], columns[first:last], gain[first:last], blocks[b], lags, beside, below,
+            rows[:, first:last], columns[first:last], gain[first:last], blocks[b], lags,
+            next_column, next_row,
         )  # fmt: skip
     lengths = np.diff(edges)
     pairs = [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3)]
@@ -154,8 +155,8 @@ def sum_frames(
     gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
     return FrameSums(
         rows, columns.transpose(1, 0, 2), gain, blocks, lags,
-        (pairs[0], pairs[1], pairs[2]), beside / n, below / n, np.flatnonzero(repeated), int(repeated_rows),
-        int(consecutive.sum()), _hits(frames, laws, pixels.usable),
+        (pairs[0], pairs[1], pairs[2]), next_column / n, next_row / n, np.flatnonzero(repeated),
+        int(repeated_rows), int(consecutive.sum()), _hits(frames, laws, pixels.usable),
     )  # fmt: skip
 
 

@@ -171,8 +171,8 @@ def sum_block(
     gain: FloatArray,
     block: FloatArray,
     lags: FloatArray,
-    beside: FloatArray,
-    below: FloatArray,
+    next_column: FloatArray,
+    next_row: FloatArray,
 ) -> None:
     """Add one block of consecutive frames to the sums.
 
@@ -190,8 +190,8 @@ def sum_block(
         gain: weighted sums of r k and r, (frame,); to add to.
         block: sums of k and r of each pixel, (2, y, x); to add to.
         lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x); to add to.
-        beside: products kk, rr, rk + kr with the next column, (3, y, x); to add to.
-        below: the same with the next row.
+        next_column: products kk, rr, rk + kr with the next column, (3, y, x); to add to.
+        next_row: the same with the next row.
     """
     n, ny, _ = frames.shape
     chunk = charge.shape[0] - LAGS
@@ -216,9 +216,9 @@ def sum_block(
                 _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, lags)
             _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, lags)
             _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, lags)
-            _add_neighbours(charge, readout, y, 0, 1, size, beside)
+            _add_neighbours(charge, readout, y, 0, 1, size, next_column)
             if y < ny - 1:
-                _add_neighbours(charge, readout, y, 1, 0, size, below)
+                _add_neighbours(charge, readout, y, 1, 0, size, next_row)
         done += size
         _keep_last(charge, size)
         _keep_last(readout, size)

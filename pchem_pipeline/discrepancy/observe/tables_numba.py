@@ -15,9 +15,10 @@ from pchem_pipeline.discrepancy.observe.law_numba import (
     N_NUISANCE,
     NOTHING,
     fill_law,
+    pixel_scores,
+    whiten,
     within,
 )
-from pchem_pipeline.discrepancy.observe.scores_numba import pixel_scores, whiten
 
 __all__ = ["N_MOMENTS", "summarise_pixels"]
 

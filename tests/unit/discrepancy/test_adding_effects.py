@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit
-from pchem_pipeline.discrepancy.by_simulation.naming import seen_among
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, seen_among
 from pchem_pipeline.discrepancy.null import Measured
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.registry import effect_class

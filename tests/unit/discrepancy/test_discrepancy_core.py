@@ -7,9 +7,15 @@ import pytest
 from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    Hypothesis,
+    Noise,
+    SetFit,
+    choose,
+    fit_set,
+    score_set,
+)
 from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
-from pchem_pipeline.discrepancy.by_simulation.naming import choose, score_set
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import NullModel, contradicted, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS

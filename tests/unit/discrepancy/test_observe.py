@@ -10,7 +10,7 @@ from helpers.small_stacks import small_stack
 from scipy import special, stats
 
 from pchem_pipeline.base.errors import InputError, PchEmError
-from pchem_pipeline.discrepancy.observe import law_numba, scores_numba, sums_numba, tables_numba
+from pchem_pipeline.discrepancy.observe import law_numba, sums_numba, tables_numba
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import (
     observe,
@@ -66,7 +66,7 @@ def test_scores_are_orthogonal_to_the_parameters_and_know_their_variance() -> No
     mass = law[:, 0].copy()
     raw = law.copy()
     gram = np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
-    assert scores_numba.whiten(law, 1 / mass, gram)
+    assert law_numba.whiten(law, 1 / mass, gram)
     products = law.T @ (law / mass[:, None])
     n = law_numba.N_NUISANCE
     np.testing.assert_allclose(products[:n, :n], np.eye(n), atol=1e-9)
@@ -75,11 +75,11 @@ def test_scores_are_orthogonal_to_the_parameters_and_know_their_variance() -> No
     # samples in exact proportion to the mass score nothing but the bias of a fit; doubling He3 shows
     out = np.empty((3, law_numba.N_TESTS))
     seen = 1e4 * mass
-    scores_numba.pixel_scores(law, 1 / mass, seen, gram, H, out)
+    law_numba.pixel_scores(law, 1 / mass, seen, gram, H, out)
     still = out[0].copy()
     assert np.abs(still).max() < 0.2
     tilt = 1 + 0.05 * law[:, n + 2] / mass
-    scores_numba.pixel_scores(law, 1 / mass, seen * tilt, gram, H, out)
+    law_numba.pixel_scores(law, 1 / mass, seen * tilt, gram, H, out)
     variance = products[n + 2, n + 2]
     assert out[0, 2] - still[2] == pytest.approx(0.05 * np.sqrt(1e4 * variance), rel=1e-3)
 
@@ -92,7 +92,7 @@ def test_bias_of_the_scores_is_that_of_fitted_samples() -> None:
     keep = mass > 1e-12
     law, mass = law[keep], mass[keep]
     codes = np.arange(150)[keep]
-    assert scores_numba.whiten(law, 1 / mass, gram)
+    assert law_numba.whiten(law, 1 / mass, gram)
     n = law_numba.N_NUISANCE
     theta = np.array([H, STEP, BIAS, WIDTH])
 
@@ -111,7 +111,7 @@ def test_bias_of_the_scores_is_that_of_fitted_samples() -> None:
             expected -= 0.5 * covariance[i, j] * (law[:, n:] / mass[:, None]).T @ curvature
     out = np.empty((3, law_numba.N_TESTS))
     samples = 1e4
-    scores_numba.pixel_scores(law, 1 / mass, samples * mass, gram, H, out)
+    law_numba.pixel_scores(law, 1 / mass, samples * mass, gram, H, out)
     variance = np.sum(law[:, n:] ** 2 / mass[:, None], axis=0)
     bias = -out[0] * np.sqrt(samples * variance)
     np.testing.assert_allclose(bias, expected, rtol=0.02, atol=0.02 * np.abs(expected).max())
@@ -327,7 +327,7 @@ def test_samples_far_above_are_listed() -> None:
     assert evidence.z["tail.high.count"] > 3
 
 
-def test_histograms_alone_give_the_same_marginal_statistics() -> None:
+def test_histograms_alone_give_the_same_histogram_statistics() -> None:
     frames = small_stack((10, 10), 300, 1)
     histograms = histogram_frames(frames)
     full = observe(frames, np.arange(300), n_run=300, block_frames=20)

@@ -1,34 +1,125 @@
-"""Where on the comb histograms and model disagree, and in words: windows of DN between and at the peaks."""
+"""Codes by their place on the comb of peaks: which to compare, and where data and model disagree.
+
+Where no known effect brings the model to the data, something unknown is in them, and likely in one place: a
+peak that was cut by a trigger, samples between the peaks. A fit to all codes bends every parameter towards
+it. So the comparison is repeated on fewer codes (a side band, as where a background is fitted next to a
+bump), and what is named must be found in all of these views. What is left is located at the peaks or between.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, saturated
 from pchem_pipeline.discrepancy.verdict import Place
 
-__all__ = ["find_residuals", "place_words", "set_aside_residual"]
+__all__ = [
+    "Interval",
+    "doubtful_peaks",
+    "electrons_of",
+    "find_residuals",
+    "inside",
+    "place_words",
+    "set_aside_residual",
+    "valleys",
+]
 
 FloatArray = NDArray[np.float64]
 
-_WIDEST = 1.0  # e-
-_MOST = 6
+_RESOLVED = 0.3  # e-: read noise above which there are no valleys
+_HALF_PEAK = 0.25  # e-: half width of what counts as a peak
+_MOST_SHARE = 0.3  # of the samples that may be set aside
+_LEAST_SHARE = 1e-3
+_WIDEST_RESIDUAL = 1.0  # e-
+_MOST_RESIDUALS = 6
 _SIGNIFICANT = 0.005
-_PEAK = 0.25  # e-: half width of what is called a peak
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Codes by their place on a pixel's comb, e-; None: no limit."""
+
+    low: float | None
+    high: float | None
+
+    def holds(self, electrons: FloatArray) -> NDArray[np.bool_]:
+        """Tell which places lie in it."""
+        found = np.ones(electrons.shape, np.bool_)
+        if self.low is not None:
+            found &= electrons >= self.low
+        if self.high is not None:
+            found &= electrons < self.high
+        return found
+
+
+def electrons_of(origin: NDArray[np.int64], width: int, parameters: FloatArray) -> FloatArray:
+    """Return ``(x - mu) g`` of every code, e-, shape (n, B), of pixels with (H, g, mu, sigma)."""
+    codes = origin[:, None] + np.arange(width)
+    return np.asarray((codes - parameters[:, 2:3]) * parameters[:, 1:2])
+
+
+def inside(intervals: tuple[Interval, ...], electrons: FloatArray) -> NDArray[np.bool_]:
+    """Tell which codes lie in one of the intervals, shape (n, B)."""
+    found = np.zeros(electrons.shape, np.bool_)
+    for interval in intervals:
+        found |= interval.holds(electrons)
+    return found
+
+
+def doubtful_peaks(sets: SetComparison, electrons: FloatArray) -> list[Interval]:
+    """Return peaks of few samples, those first without which the plain law fits best.
+
+    Args:
+        sets: with all codes.
+        electrons: place of every code, e-, shape (n, B).
+    """
+    total = float(sets.train.sum())
+    cumulative = [float(sets.train[electrons < k + 0.5].sum()) / total for k in range(_last(electrons) + 1)]
+    ranked: list[tuple[float, Interval]] = []
+    for k, below in enumerate(cumulative):
+        before = cumulative[k - 1] if k else 0.0
+        candidates = {Interval(None if k == 0 else k - 0.5, k + 0.5): below - before}
+        if k:
+            candidates[Interval(k - 0.5, None)] = 1.0 - before
+        for interval, share in candidates.items():
+            if _LEAST_SHARE < share < _MOST_SHARE:
+                ranked.append((_gap(sets, sets.kept & ~interval.holds(electrons)), interval))
+    return [interval for _, interval in sorted(ranked, key=lambda pair: pair[0])]
+
+
+def valleys(sets: SetComparison, electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
+    """Return the codes between the peaks; none where peaks are not resolved or little would be left."""
+    if sigma_e > _RESOLVED:
+        return ()
+    found = tuple(Interval(k + _HALF_PEAK, k + 1.0 - _HALF_PEAK) for k in range(-1, _last(electrons) + 1))
+    share = float(sets.train[inside(found, electrons)].sum()) / float(sets.train.sum())
+    return found if share < _MOST_SHARE else ()
+
+
+def _gap(sets: SetComparison, kept: NDArray[np.bool_]) -> float:
+    """Return the gap of the plain law among some codes, nats per sample of all."""
+    view = replace(sets.on(kept, sets.start), test=sets.train)
+    return float(saturated(view.train, kept).sum() - view.fit(()).score) / float(sets.train.sum())
+
+
+def _last(electrons: FloatArray) -> int:
+    """Return the electron number of the last code of most pixels."""
+    return max(int(np.median(electrons[:, -1])), 1)
 
 
 def place_words(low: float, high: float) -> str:
     """Return the words for an interval on the comb, e-."""
     centre = 0.5 * (low + high)
     k = round(centre)
-    if centre < -_PEAK:
+    if centre < -_HALF_PEAK:
         return "below the 0-electron peak"
     if high - low > 1.0:
         return f"from the {max(round(low), 0)}- to the {round(high)}-electron peak"
-    if abs(centre - k) < _PEAK:
+    if abs(centre - k) < _HALF_PEAK:
         return f"at the {k}-electron peak"
     below = int(np.floor(centre))
     return f"between the {below}- and the {below + 1}-electron peak"
@@ -56,7 +147,7 @@ def find_residuals(
         for values in (observed, expected)
     )
     sums = [np.concatenate([[0.0], np.cumsum(values)]) for values in (seen, wanted)]
-    widest = max(int(_WIDEST / gain), 1)
+    widest = max(int(_WIDEST_RESIDUAL / gain), 1)
     windows: list[tuple[float, int, int]] = []
     for width in range(1, min(widest, seen.size) + 1):
         o, e = (total[width:] - total[:-width] for total in sums)
@@ -69,7 +160,7 @@ def find_residuals(
     for z, start, width in windows:
         place = slice(start, start + width)
         p = float(min(1.0, 2.0 * special.ndtr(-abs(z)) * widest * seen.size))
-        if p > _SIGNIFICANT or len(found) == _MOST:
+        if p > _SIGNIFICANT or len(found) == _MOST_RESIDUALS:
             break
         if taken[place].any():
             continue
@@ -131,8 +222,3 @@ def _contribution(seen: FloatArray, expected: FloatArray) -> FloatArray:
 def _signed_root(seen: FloatArray, expected: FloatArray) -> FloatArray:
     """Return the signed root of the Poisson deviance, about N(0, 1) by chance."""
     return np.asarray(np.sign(seen - expected) * np.sqrt(2.0 * special.kl_div(seen, expected)))
-
-
-def closing(residuals: Sequence[Place], most: int = 3) -> str:
-    """Return the residuals in one clause."""
-    return "; ".join(r.sentence for r in residuals[:most])
