@@ -327,7 +327,7 @@ def test_samples_far_above_are_listed() -> None:
     assert evidence.z["tail.high.count"] > 3
 
 
-def test_histograms_alone_give_the_same_histogram_statistics() -> None:
+def test_histograms_alone_give_the_same_sample_statistics() -> None:
     frames = small_stack((10, 10), 300, 1)
     histograms = histogram_frames(frames)
     full = observe(frames, np.arange(300), n_run=300, block_frames=20)
