@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.cli import app
+from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands import figures
 from pchem_pipeline.commands.compare import compare
 from pchem_pipeline.commands.figures import Wanted, figures_of_run
