@@ -86,7 +86,8 @@ def test_the_effect_is_simulated_and_fitted(done):
     store = RunStore.open(done / "odd_even.zarr")
     fitted, true = store.read("fit/read_noise_dn"), store.read("truth/read_noise_dn")
     # without the effect in the law the fit would find (sigma^2 + 4)^(1/2) DN
-    assert abs(np.median(fitted / true) - 1) < 0.05
+    assert np.isfinite(fitted).mean() > 0.98
+    assert abs(np.nanmedian(fitted / true) - 1) < 0.05
     assert np.median(np.hypot(true, 2.0) / true) > 1.1
 
 
