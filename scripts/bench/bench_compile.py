@@ -26,14 +26,16 @@ from running import machine
 
 # the command of any checkout, whatever module its pyproject.toml names
 PCHEM = [sys.executable, "-c", "import sys, importlib; importlib.import_module(sys.argv.pop(1)).main()"]
-RUN = "run: {store: run.zarr}\ninput: {files: [frames/*.tif], integration_time: 4.87, bit_depth: 14}\n"
+RUN = """run: {{store: {name}.zarr}}
+input: {{files: [{name}/*.tif], integration_time: {exposure}, bit_depth: 14}}
+"""
 CAMERA = """run: {{store: {name}-truth.zarr}}
 simulate:
   shape: [{side}, {side}]
   n_frames: {frames}
   seed: {seed}
   output: {name}
-  integration_time: 4.87
+  integration_time: {exposure}
   parameters: {{quanta_exposure: {{kind: constant, value: {exposure}}}}}
 """
 
@@ -73,7 +75,7 @@ def prepare(checkout: Path, folder: Path, options: argparse.Namespace) -> None:
         )
         (folder / f"{name}.yaml").write_text(text)
         pchem(checkout, cache, folder, ["simulate", f"{name}.yaml", "--quiet"])
-        given = RUN.replace("frames/", f"{name}/").replace("run.zarr", f"{name}.zarr")
+        given = RUN.format(name=name, exposure=exposure)
         (folder / f"{name}-run.yaml").write_text(given)
         if set(options.commands) != {"run"}:
             pchem(checkout, cache, folder, ["run", f"{name}-run.yaml", "--quiet"])
