@@ -271,7 +271,7 @@ def search_cells(
 
     From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
     exclude them, or where its law was too different to do so. Pixels that the limits of the codes led
-    astray, and those of few DN per electron, are also started anew. Where the law has free satellites, each
+    astray, those of few DN per electron, and those whose climb does not arrive are also started anew. Where the law has free satellites, each
     amplitude is tried.
 
     Args:
@@ -318,7 +318,7 @@ def search_cells(
         used += count
     # several samples, some of them cut, may have led the density astray
     astray = n > 1 and score > SUSPICIOUS
-    if limits.scan and (astray or not best[place] > _FEW_STEP):
+    if not best[place] > 0.0 or (limits.scan and (astray or not best[place] > _FEW_STEP)):
         loglik, runner_up, count = _climb_few(pixel, tools, best, (loglik, runner_up))
         used += count
     if not best[place] > 0.0:
