@@ -271,8 +271,8 @@ def search_cells(
 
     From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
     exclude them, or where its law was too different to do so. Pixels that the limits of the codes led
-    astray, those of few DN per electron, and those whose climb does not arrive are also started anew. Where the law has free satellites, each
-    amplitude is tried.
+    astray, those of few DN per electron, and those whose climb does not arrive are also started anew. Where
+    the law has free satellites, each amplitude is tried.
 
     Args:
         pixel: its samples and its law.

@@ -8,7 +8,7 @@ import tifffile
 from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.cli import app
+from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
