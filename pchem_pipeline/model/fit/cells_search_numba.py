@@ -318,7 +318,8 @@ def search_cells(
         used += count
     # several samples, some of them cut, may have led the density astray
     astray = n > 1 and score > SUSPICIOUS
-    if not best[place] > 0.0 or (limits.scan and (astray or not best[place] > _FEW_STEP)):
+    lost = known and not best[place] > 0.0
+    if lost or (limits.scan and (astray or not best[place] > _FEW_STEP)):
         loglik, runner_up, count = _climb_few(pixel, tools, best, (loglik, runner_up))
         used += count
     if not best[place] > 0.0:
