@@ -18,6 +18,7 @@ __all__ = [
     "InputError",
     "LockedError",
     "MissingDependencyError",
+    "NotBelievedError",
     "PchEmError",
     "StoreError",
     "quoted",
@@ -60,6 +61,12 @@ class MissingDependencyError(ConfigError):
 
 class IncompleteRunError(PchEmError):
     """The run ended with failed tiles, or with more failed pixels than allowed."""
+
+    exit_code = ExitCode.INCOMPLETE
+
+
+class NotBelievedError(PchEmError):
+    """With ``--strict``: the report says that the results cannot be believed as they are."""
 
     exit_code = ExitCode.INCOMPLETE
 

@@ -15,7 +15,7 @@ import typer
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ExitCode, PchEmError
 from pchem_pipeline.cli.methods import methods
-from pchem_pipeline.cli.options import Progress, Quiet, Target, Workers, region_of, takes_command
+from pchem_pipeline.cli.options import Progress, Quiet, Strict, Target, Workers, region_of, takes_command
 from pchem_pipeline.cli.plan import plan
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
@@ -114,15 +114,17 @@ def run(
     until: Annotated[
         str, typer.Option(help="last stage to be done", metavar=f"[{'|'.join(pipeline())}]")
     ] = pipeline()[-1],
+    strict: Strict = False,
     *,
     command: Command,
 ) -> None:
-    """Do every stage, from camera files to the report.
+    """Do every stage, from camera files to the report, and say what its first screen says.
 
-    What is up to date is not done again.
+    What is up to date is not done again. The path of the report is on stdout, all else on stderr.
     """
+    from pchem_pipeline.commands.first_screen import run_to_first_screen
     from pchem_pipeline.commands.new_run import find_or_start
-    from pchem_pipeline.run.session import cropped, run_stages, up_to
+    from pchem_pipeline.run.session import cropped, up_to
 
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}
@@ -131,9 +133,7 @@ def run(
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, pipeline_of(target.config))
-    run_stages(target, stages, command)
-    if not wanted.dry_run:
-        typer.echo(target.store / "report.html" if "report" in stages else target.store)
+    run_to_first_screen(target, stages, command, typer.echo, strict=strict)
 
 
 @app.command()
@@ -176,6 +176,7 @@ def joint(
         list[Path] | None, typer.Option(help="runs: one whose frames hold no electrons (repeatable)")
     ] = None,
     store: Annotated[Path | None, typer.Option(help="runs: store of the fit [default: joint.zarr]")] = None,
+    strict: Strict = False,
     *,
     command: Command,
 ) -> None:
@@ -186,9 +187,7 @@ def joint(
     from pchem_pipeline.commands.joint import find_joint, run_joint
 
     target, is_new = find_joint(targets, bias or [], store, write=not command.options.dry_run)
-    run_joint(target, command, is_new=is_new)
-    if not command.options.dry_run:
-        typer.echo(target.store / "report.html")
+    run_joint(target, command, typer.echo, is_new=is_new, strict=strict)
 
 
 app.command()(methods)

@@ -16,12 +16,15 @@ from pchem_pipeline.base.errors import ConfigError
 if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
 
-__all__ = ["Progress", "Quiet", "Target", "Workers", "region_of", "takes_command"]
+__all__ = ["Progress", "Quiet", "Strict", "Target", "Workers", "region_of", "takes_command"]
 
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
 Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
 Progress = Annotated[
     Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
+]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="exit code 3 where the report says not to believe its results")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
 

@@ -28,6 +28,7 @@ _FROM_FIT = ("fit_status", "likelihood_gap", "goodness_p")
 _COLUMNS = (
     "n_valid",
     "n_missing",
+    "n_left_out",
     "median",
     "median_stderr",
     "robust_sd",

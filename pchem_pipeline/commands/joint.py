@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.config.load import dump_config, make_config
-from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import write_atomic
@@ -61,7 +62,14 @@ def find_joint(
     return Target(config, path.parent, place, path), is_new
 
 
-def run_joint(target: Target, command: Command, *, is_new: bool = False) -> None:
+def run_joint(
+    target: Target,
+    command: Command,
+    say: Callable[[str], None],
+    *,
+    is_new: bool = False,
+    strict: bool = False,
+) -> None:
     """Do every stage of a run of several samples, and what their own runs need for it.
 
     A new YAML whose samples do not belong together is taken away again, so that its name is free.
@@ -72,7 +80,7 @@ def run_joint(target: Target, command: Command, *, is_new: bool = False) -> None
         PchEmError: a stage cannot be done; the message says why.
     """
     try:
-        run_stages(target, pipeline_of(target.config), command)
+        run_to_first_screen(target, pipeline_of(target.config), command, say, strict=strict)
     except ConfigError:
         if is_new and target.config_path is not None and not target.store.exists():
             target.config_path.unlink(missing_ok=True)

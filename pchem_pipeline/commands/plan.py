@@ -119,7 +119,9 @@ def _median_pixel(run: Path) -> dict[str, float]:
     names = ("read_noise_e", "quanta_exposure", "conversion_gain")
     found = {name: summary[name]["median"] for name in names}
     if None in found.values():
-        raise StoreError(f"{store.path}: no pixel has a value; give --read-noise and --exposure")
+        raise StoreError(
+            f"{store.path}: every pixel is flagged or has no value; give --read-noise and --exposure"
+        )
     return {name: float(value) for name, value in found.items()}
 
 

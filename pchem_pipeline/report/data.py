@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.verdict import Verdict
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
+from pchem_pipeline.report.settings import Criteria
 
 __all__ = [
     "CHANNELS",
@@ -158,6 +159,8 @@ class ReportData:
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
         status_words: bit of ``fit_status`` to its short sentence, gravest first.
         failed_mask: bits of ``fit_status`` for which the parameters are NaN.
+        flagged_mask: bits for which the value of a pixel is open, whatever its standard error says.
+        criteria: what the sensor must meet to be called all right.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
         ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
@@ -195,6 +198,8 @@ class ReportData:
     fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})
     failed_mask: int = int(FAILED)
+    flagged_mask: int = int(FLAGGED)
+    criteria: Criteria = field(default_factory=Criteria)
     pixels: Sequence[PixelFit] = ()
     ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     ensemble_facts: Mapping[str, Any] = field(default_factory=dict)
@@ -237,6 +242,32 @@ class ReportData:
         if status is None or gain is None:
             return np.zeros(self.shape, dtype=bool)
         return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
+
+    @property
+    def flagged(self) -> NDArray[np.bool_]:
+        """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
+        status = self.fit.get("fit_status")
+        if status is None:
+            return np.zeros(self.shape, dtype=bool)
+        return np.asarray((status & self.failed_mask == 0) & (status & self.flagged_mask != 0))
+
+    @property
+    def flagged_share(self) -> float:
+        """Share of flagged pixels among those with a value."""
+        status = self.fit.get("fit_status")
+        valued = 0 if status is None else int(np.count_nonzero(status & self.failed_mask == 0))
+        return int(np.count_nonzero(self.flagged)) / max(valued, 1)
+
+    @property
+    def mostly_flagged(self) -> bool:
+        """Tell whether most pixels with a value are flagged: medians of the rest describe no sensor."""
+        return self.flagged_share > 0.5
+
+    @property
+    def often_flagged(self) -> bool:
+        """Tell whether more pixels are flagged than the criteria allow: the others are a selection."""
+        limit = self.criteria.flagged_pixels
+        return self.flagged_share > (0.1 if limit is None else limit)
 
     def has_values(self, name: str) -> bool:
         """Tell whether a map exists and at least one pixel has a value in it."""

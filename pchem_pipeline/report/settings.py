@@ -8,9 +8,44 @@ from pydantic import Field, field_validator
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["ReportSettings"]
+__all__ = ["Criteria", "ReportSettings"]
 
 PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+
+
+class Criteria(Section):
+    """Limits within which the report calls a sensor all right; null: no limit.
+
+    Flagged pixels (``fit_status``: values open by whole electrons) do not count, but for ``flagged_pixels``.
+    """
+
+    read_noise_e: float | None = Field(
+        default=0.5, gt=0, description="median read noise, e-; above 0.5 electrons cannot be counted"
+    )
+    failed_pixels: float | None = Field(
+        default=0.01, ge=0, le=1, description="share of pixels without a value"
+    )
+    flagged_pixels: float | None = Field(
+        default=0.1, ge=0, le=1, description="share of pixels whose value is open by whole electrons"
+    )
+    hot_pixels: float | None = Field(
+        default=0.01,
+        ge=0,
+        le=1,
+        description="share of hot pixels: H above its median by more than maps.outlier_sigmas",
+    )
+    outlying_pixels: float | None = Field(
+        default=0.01,
+        ge=0,
+        le=1,
+        description="share of outliers in the conversion gain, the bias or the read noise, whichever is more",
+    )
+    gain_nonuniformity: float | None = Field(
+        default=0.15,
+        gt=0,
+        description="spread of the conversion gain between pixels over its median: robust deviation, "
+        "without what the errors of the pixels add",
+    )
 
 
 class ReportSettings(Section):
@@ -33,6 +68,9 @@ class ReportSettings(Section):
         default="beta",
         description="colours of the maps: 'beta' follows the rank of a pixel (Beta(2,2) transform), "
         "'linear' its value between the 1st and the 99th percentile",
+    )
+    criteria: Criteria = Field(
+        default_factory=Criteria, description="limits within which the sensor is called all right; null: none"
     )
     histogram_bins: int = Field(
         default=128, ge=8, le=1024, description="largest number of bins in histograms of maps"

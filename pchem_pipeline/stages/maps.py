@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
 from pchem_pipeline.model.errors.fisher import covariance_from
-from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
 from pchem_pipeline.model.maps.sample_maps import LINE_MAPS, line_maps
 from pchem_pipeline.run.stage import StageContext, open_store
@@ -134,13 +134,19 @@ def _write_line(store: RunStore, tile: Tile, line: _Line) -> None:
 def _summarise(context: StageContext, names: list[str]) -> None:
     """Keep the summaries of the maps in the attributes of their group."""
     settings = context.config.maps
+    status = context.store.read("fit/fit_status")
+    flagged = (status & int(FLAGGED)) != 0
     found: dict[str, Any] = {}
     for name in names:
         values = context.store.read(f"maps/{name}")
-        summary = summarise(values, percentiles=settings.percentiles, outlier_sigmas=settings.outlier_sigmas)
+        summary = summarise(
+            values,
+            left_out=flagged,
+            percentiles=settings.percentiles,
+            outlier_sigmas=settings.outlier_sigmas,
+        )
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
         found[name] = without_nan(asdict(summary) | {"percentiles": percentiles})
-    status = context.store.read("fit/fit_status")
     facts = {"summary": found, "fit_status": status_counts(status), "goodness": _misfits(context)}
     context.store.set_attributes("maps", facts)
 

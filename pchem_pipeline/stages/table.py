@@ -103,7 +103,7 @@ _ALL = (
     ),
     Stage(
         "maps",
-        version=3,
+        version=4,
         upstream=("fit",),
         settings=("maps", "run.tile"),
         reads=("fit", "samples"),
@@ -125,7 +125,7 @@ _ALL = (
     ),
     Stage(
         "report",
-        version=2,
+        version=3,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
         reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "samples", "truth"),

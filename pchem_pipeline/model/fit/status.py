@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntFlag
 
-__all__ = ["FAILED", "MEANINGS", "FitStatus", "describe"]
+__all__ = ["FAILED", "FLAGGED", "MEANINGS", "FitStatus", "describe"]
 
 
 class FitStatus(IntFlag):
@@ -37,6 +37,10 @@ FAILED = (
     | FitStatus.EXPOSURE_AT_BOUND
 )
 
+#: Bits of pixels whose value the data leave open by whole electrons, or altogether, whatever its standard
+#: error says. Medians and tables over the sensor are of the other pixels.
+FLAGGED = FitStatus.BIAS_AMBIGUOUS | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
+
 #: A sentence for every bit.
 MEANINGS: dict[FitStatus, str] = {
     FitStatus.NO_DATA: "no frame inside the histogram window",
@@ -44,7 +48,7 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.NOT_CONVERGED: "the fit did not converge",
     FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the conversion gain is not identified",
     FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons seen",
-    FitStatus.BIAS_AMBIGUOUS: "bias ambiguous by one electron",
+    FitStatus.BIAS_AMBIGUOUS: "bias ambiguous by one electron or more",
     FitStatus.NOT_INFORMATIVE: "read noise too high for one sample; take several exposures",
     FitStatus.ADC_LIMIT: "values at the limits of the ADC",
     FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window were left out",
@@ -65,7 +69,7 @@ def describe(word: int) -> str:
         >>> describe(0)
         'good fit'
         >>> describe(32)
-        'bias ambiguous by one electron'
+        'bias ambiguous by one electron or more'
     """
     sentences = [meaning for bit, meaning in MEANINGS.items() if word & bit]
     return "; ".join(sentences) if sentences else "good fit"

@@ -34,8 +34,9 @@ class MapSummary:
     """Robust description of a map; a few hot pixels do not move it.
 
     Attributes:
-        n_valid: pixels with a value.
-        n_missing: pixels without.
+        n_valid: pixels that are described: with a value, and not left out.
+        n_missing: pixels without a value.
+        n_left_out: pixels with a value that are left out.
         median: median of the values, in the unit of the map.
         median_stderr: standard error of the median, from order statistics.
         robust_sd: 1.4826 MAD, the standard deviation of a normal core.
@@ -46,6 +47,7 @@ class MapSummary:
 
     n_valid: int
     n_missing: int
+    n_left_out: int
     median: float
     median_stderr: float
     robust_sd: float
@@ -139,6 +141,7 @@ def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
 def summarise(
     values: FloatArray,
     *,
+    left_out: NDArray[np.bool_] | None = None,
     percentiles: tuple[float, ...] = (1, 5, 25, 50, 75, 95, 99),
     outlier_sigmas: float = 6.0,
 ) -> MapSummary:
@@ -149,17 +152,21 @@ def summarise(
 
     Args:
         values: the map; NaN where there is no value.
+        left_out: pixels whose values do not count, same shape; None: none.
         percentiles: in %.
         outlier_sigmas: outliers lie beyond so many ``1.4826 MAD`` of the median.
 
     Returns:
         The summary; NaN throughout where no pixel has a value.
     """
-    ordered = np.sort(values[np.isfinite(values)], axis=None)
-    n, missing = ordered.size, values.size - ordered.size
+    known = np.isfinite(values)
+    kept = known if left_out is None else known & ~left_out
+    ordered = np.sort(values[kept], axis=None)
+    n, missing = ordered.size, values.size - int(np.count_nonzero(known))
+    without = values.size - missing - n
     if n == 0:
         nan = float("nan")
-        return MapSummary(0, missing, nan, nan, nan, dict.fromkeys(percentiles, nan), nan, nan, 0, 0)
+        return MapSummary(0, missing, without, nan, nan, nan, dict.fromkeys(percentiles, nan), nan, nan, 0, 0)
     median = float(np.median(ordered))
     half = 0.5 * np.sqrt(n)
     ranks = np.arange(n)
@@ -169,6 +176,7 @@ def summarise(
     return MapSummary(
         n_valid=n,
         n_missing=missing,
+        n_left_out=without,
         median=median,
         median_stderr=0.5 * float(high - low) if n > 1 else float("nan"),
         robust_sd=robust_sd,

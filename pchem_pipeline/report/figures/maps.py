@@ -76,13 +76,19 @@ def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
 
 def _map_alt(data: ReportData, name: str, what: str) -> str:
     _, words, unit = symbol(name)
-    summary = summarise(data.maps[name], percentiles=(5.0, 95.0), outlier_sigmas=data.outlier_sigmas)
+    summary = summarise(
+        data.maps[name],
+        left_out=data.flagged,
+        percentiles=(5.0, 95.0),
+        outlier_sigmas=data.outlier_sigmas,
+    )
     low, high = summary.percentiles[5.0], summary.percentiles[95.0]
     return (
         f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
         f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
         f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; "
-        f"{count(summary.n_missing, data.noun)} without a value."
+        f"{count(summary.n_missing, data.noun)} without a value"
+        + (f", {count(summary.n_left_out, f'flagged {data.noun}')} left out." if summary.n_left_out else ".")
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,15 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import status_counts
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import middle
-from pchem_pipeline.report.pages.summary import flags, pixel_counts, sentence, summaries
+from pchem_pipeline.report.pages.next_steps import next_steps
+from pchem_pipeline.report.pages.summary import (
+    answers,
+    flags,
+    key_numbers,
+    pixel_counts,
+    sentence,
+    summaries,
+)
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import stored_unit
 
@@ -35,7 +44,10 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             "report_version": REPORT_VERSION,
             "title": data.title,
             "sentence": sentence(data),
-            "flags": [{"level": flag.level, "text": flag.text} for flag in flags(data)],
+            "answers": [asdict(answer) for answer in answers(data)],
+            "headline": [asdict(number) for number in key_numbers(data)],
+            "flags": [asdict(flag) for flag in flags(data)],
+            "next": [asdict(step) for step in next_steps(data)],
             "sensor": {
                 "ny": data.shape[0],
                 "nx": data.shape[1],
@@ -68,7 +80,7 @@ def report_json(data: ReportData) -> str:
 def _summary(data: ReportData) -> dict[str, Any]:
     found = {}
     for name, summary in summaries(data).items():
-        errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
+        errors = finite(np.where(data.flagged, np.nan, data.maps.get(f"{name}_stderr", np.nan)))
         found[name] = {
             "unit": stored_unit(name),
             "median": summary.median,
@@ -80,6 +92,7 @@ def _summary(data: ReportData) -> dict[str, Any]:
             "maximum": summary.maximum,
             "n_pixels": summary.n_valid,
             "n_without_value": summary.n_missing,
+            "n_flagged": summary.n_left_out,
             "n_outliers_low": summary.n_low,
             "n_outliers_high": summary.n_high,
         }
@@ -94,6 +107,7 @@ def _fit_status(data: ReportData) -> dict[str, Any]:
         "n_pixels": pixels.total,
         "n_good": pixels.fitted - pixels.caution,
         "n_caution": pixels.caution,
+        "n_flagged": int(data.flagged.sum()),
         "n_failed": pixels.failed,
         "n_unfitted": int(data.unfitted.sum()),
         "reasons": {
@@ -147,11 +161,11 @@ def _truth(data: ReportData) -> dict[str, Any]:
     for name, truth in data.truth.items():
         if name not in data.maps:
             continue
-        error = data.maps[name] - truth
+        error = np.where(data.flagged, np.nan, data.maps[name] - truth)
         known = finite(error)
         pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
         found[name] = {
-            "median": float(np.median(truth)),
+            "median": float(np.median(truth[np.isfinite(error)])) if known.size else None,
             "rmse": float(np.sqrt(np.mean(known**2))) if known.size else None,
             "pull_mean": float(pull.mean()) if pull.size else None,
             "pull_sd": float(pull.std()) if pull.size else None,

@@ -15,6 +15,7 @@ from typing import Any
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import AXES
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
+from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import Table, provenance_tables
@@ -198,6 +199,8 @@ def _summary(material: Material) -> Section:
         "answers": answers(data),
         "sentence": sentence(data),
         "numbers": key_numbers(data),
+        "stepped_back": key_numbers(data, with_flagged=True) if data.mostly_flagged else [],
+        "next": [(step.of(str(data.run.get("store", "RUN"))), step.why) for step in next_steps(data)],
         "flags": flags(data),
         "verdict": material.view,
         "effects": data.discrepancy.found.effects if data.discrepancy else (),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from pchem_pipeline.model.fit.status import FLAGGED
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
-from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
+from pchem_pipeline.report.pages.criteria import Criterion, criteria, map_summary
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
 
@@ -25,6 +27,8 @@ _RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 _CAUTION_SHARE = 0.01
 #: A pixel's fit is poor below this probability.
 _POOR_P = 1e-3
+#: Read noise, e-, above which electrons cannot be told apart.
+_TOO_NOISY = 0.5
 
 
 @dataclass(frozen=True)
@@ -72,28 +76,34 @@ def pixel_counts(data: ReportData) -> PixelCounts:
 
 
 def summaries(data: ReportData) -> dict[str, MapSummary]:
-    """Describe every map by order statistics."""
-    return {
-        name: summarise(values, percentiles=data.percentiles, outlier_sigmas=data.outlier_sigmas)
-        for name, values in data.maps.items()
-        if not name.endswith("_stderr")
-    }
+    """Describe every map by order statistics, flagged pixels left out."""
+    return {name: map_summary(data, name) for name in data.maps if not name.endswith("_stderr")}
 
 
-def key_numbers(data: ReportData) -> list[KeyNumber]:
-    """Return the numbers of the first screen."""
+def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
+    """Return the numbers of the first screen.
+
+    Args:
+        data: what the run found.
+        with_flagged: of all pixels with a value; else flagged ones are left out, and of a sensor of which
+            most are flagged nothing is said.
+    """
+    if data.mostly_flagged and not with_flagged:
+        return []
+    left_out = np.zeros(data.shape, dtype=bool) if with_flagged else data.flagged
     found = []
+    which = f" of unflagged {data.noun}s" if data.often_flagged and not with_flagged else ""
     for name in _KEY_MAPS:
         if not data.has_values(name):
             continue
         _, words, unit = symbol(name)
-        summary = summarise(data.maps[name], percentiles=(5.0, 95.0))
+        summary = summarise(data.maps[name], left_out=left_out, percentiles=(5.0, 95.0))
         low, high = summary.percentiles[5.0], summary.percentiles[95.0]
-        errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
+        errors = finite(np.where(left_out, np.nan, data.maps.get(f"{name}_stderr", np.nan)))
         found.append(
             KeyNumber(
                 name,
-                words,
+                f"{words}{which}",
                 measured(summary.median, summary.median_stderr, unit),
                 f"5–95 % of the {data.noun}s: {short(low)} to {short(high)} {unit}",
                 f"one {data.noun} is known to ± {short(float(np.median(errors)), 2)} {unit}"
@@ -111,15 +121,6 @@ def sentence(data: ReportData) -> str:
         return (
             f"None of the {count(pixels.total, data.noun)} could be fitted; the table of fit status says why."
         )
-    parts = []
-    for name, lead in (
-        ("read_noise_e", "read noise"),
-        ("conversion_gain", "conversion gain"),
-        ("dark_current", "dark current"),
-    ):
-        if data.has_values(name):
-            summary = summarise(data.maps[name])
-            parts.append(f"{lead} {measured(summary.median, summary.median_stderr, symbol(name)[2])}")
     frames = f" from {count(data.n_frames, 'frame')}" if data.n_frames else ""
     share = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} were"
     if pixels.failed == 0 and pixels.total > 1:
@@ -127,7 +128,7 @@ def sentence(data: ReportData) -> str:
     text = f"{share} fitted{frames}. "
     if "model" in data.run:
         text += f"The model is {data.run['model']}. "
-    text += f"Medians over the {data.noun}s: " + ", ".join(parts) + "."
+    text += _medians(data)
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     if "epcd_exact" in rmse and rmse.get("noise_floor"):
         text += (
@@ -137,17 +138,27 @@ def sentence(data: ReportData) -> str:
     return text
 
 
+def _medians(data: ReportData) -> str:
+    """Return the medians in a sentence, or why there are none."""
+    flagged = int(data.flagged.sum())
+    if data.mostly_flagged:
+        return (
+            f"{percent(flagged, pixel_counts(data).fitted)} of them are flagged, so no medians are given: "
+            "those of the others would be of pixels that chance chose."
+        )
+    parts = []
+    for name in ("read_noise_e", "conversion_gain", "dark_current"):
+        if data.has_values(name):
+            summary = map_summary(data, name)
+            unit = symbol(name)[2]
+            parts.append(f"{symbol(name)[1]} {measured(summary.median, summary.median_stderr, unit)}")
+    left_out = f" ({count(flagged, 'flagged one')} left out)" if flagged else ""
+    return f"Medians over the {data.noun}s{left_out}: {', '.join(parts)}."
+
+
 def flags(data: ReportData) -> list[Flag]:
     """Return what speaks for and against the results, the gravest first."""
-    found = [
-        *_failed_pixels(data),
-        *_unfitted(data),
-        *_cautions(data),
-        *_goodness(data),
-        *_agreement(data),
-        *_discrepancy(data),
-        *_conditions(data),
-    ]
+    found = [flag for check in CHECKS for flag in check(data)]
     order = ("serious", "caution", "note", "good")
     return sorted(found, key=lambda flag: order.index(flag.level))
 
@@ -183,6 +194,30 @@ def _unfitted(data: ReportData) -> list[Flag]:
     return [Flag("serious", f"{count(missing, data.noun)} not fitted yet; continue the run.")]
 
 
+def _flagged(data: ReportData) -> list[Flag]:
+    """Say where many pixels are open by whole electrons, and what helps."""
+    if not data.often_flagged:
+        return []
+    share = percent(int(data.flagged.sum()), pixel_counts(data).fitted)
+    cure = "more frames, or more exposures" if data.samples is not None else "several exposures (pchem joint)"
+    if not data.mostly_flagged:
+        return [
+            Flag(
+                "caution",
+                f"{share} of the {data.noun}s with a value are flagged and left out. The others are a "
+                "selection, as a rule quieter than the sensor: their median read noise is likely too low, by "
+                f"more than its error says. What helps: {cure}.",
+            )
+        ]
+    return [
+        Flag(
+            "serious",
+            f"{share} of the {data.noun}s with a value are flagged: the data leave their electrons open; "
+            f"gain, bias and read noise may be wrong by far more than their errors say. What helps: {cure}.",
+        )
+    ]
+
+
 def _cautions(data: ReportData) -> list[Flag]:
     status = data.fit.get("fit_status")
     if status is None:
@@ -190,8 +225,12 @@ def _cautions(data: ReportData) -> list[Flag]:
     # what else is odd about a pixel without a value misleads nobody
     kept = status[(status & data.failed_mask) == 0]
     return [
-        Flag("caution", f"{percent(n, kept.size)} of the {data.noun}s with a value: {text}.")
-        for _, text, n in status_counts(kept, data.status_words)
+        Flag(
+            "caution",
+            f"{percent(n, kept.size)} of the {data.noun}s with a value: {text}"
+            f"{' (left out of medians and tables)' if int(bit) & int(FLAGGED) else ''}.",
+        )
+        for bit, text, n in status_counts(kept, data.status_words)
         if n > _CAUTION_SHARE * kept.size
     ]
 
@@ -253,13 +292,12 @@ def _conditions(data: ReportData) -> list[Flag]:
         for part in ("dark_current", "ensemble")
         if part in data.missing
     ]
-    read_noise = finite(data.maps.get("read_noise_e", np.empty(0)))
-    if data.samples is None and read_noise.size and float(np.median(read_noise)) > 0.5:
+    noisy = data.has_values("read_noise_e") and map_summary(data, "read_noise_e").median > _TOO_NOISY
+    if data.samples is None and noisy:
         found.append(
             Flag("caution", "Read noise above 0.5 e⁻: one exposure tells little; take several exposures.")
         )
-    gain = finite(data.maps.get("conversion_gain", np.empty(0)))
-    if gain.size and float(np.median(gain)) > 0.4:
+    if data.has_values("conversion_gain") and map_summary(data, "conversion_gain").median > 0.4:
         found.append(
             Flag(
                 "caution",
@@ -288,24 +326,33 @@ def _model(data: ReportData, article: str = "The") -> str:
     return f"{article} model {data.run['model']}" if "model" in data.run else f"{article} PCD"
 
 
+#: What looks for remarks; a further check is a further row.
+CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
+    _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _discrepancy, _conditions,
+)  # fmt: skip
+
+
 def _as_sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-#: Share of outliers in a map above which the sensor is not called even.
-_MANY_OUTLIERS = 0.01
-#: Read noise, e-, above which electrons cannot be told apart.
-_TOO_NOISY = 0.5
-
-
 @dataclass(frozen=True)
 class Answer:
-    """A question with its answer; ``level`` is the class of the style sheet."""
+    """A question with its answer; ``level`` is the class of the style sheet.
+
+    Attributes:
+        question: what is asked.
+        level: good, note, caution or serious.
+        word: the answer.
+        text: why, in a sentence.
+        criteria: the limits that the answer rests on, where it rests on such.
+    """
 
     question: str
     level: Level
     word: str
     text: str
+    criteria: tuple[Criterion, ...] = ()
 
 
 def answers(data: ReportData) -> tuple[Answer, Answer]:
@@ -318,40 +365,33 @@ def _sensor(data: ReportData) -> Answer:
     pixels = pixel_counts(data)
     if pixels.fitted == 0:
         return Answer(question, "serious", "Not known", f"No {data.noun} could be fitted.")
-    lost = pixels.failed / pixels.total
-    noise = finite(data.maps.get("read_noise_e", np.empty(0)))
-    median = float(np.median(noise)) if noise.size else float("nan")
-    share = "all" if pixels.failed == 0 else f"{percent(pixels.fitted, pixels.total)} of"
-    parts = [f"{share} {count(pixels.total, data.noun)} have a value"]
-    if noise.size:
-        below = percent(float((noise < _TOO_NOISY).sum()), noise.size)
-        parts.append(f"median read noise {short(median, 3)} e⁻, {below} below {_TOO_NOISY:g} e⁻")
-    odd, where = _outliers(data)
-    if odd:
-        parts.append(f"{percent(odd, 1.0)} are outliers in {where}")
-    text = "; ".join(parts) + "."
-    text = text[0].upper() + text[1:]
-    if lost > data.allowed_failed:
-        return Answer(question, "serious", "No", text)
-    if median > _TOO_NOISY:
-        return Answer(question, "caution", "Too noisy to count electrons", text)
-    if odd > _MANY_OUTLIERS or lost > _MANY_OUTLIERS:
-        return Answer(question, "caution", "Mostly", text)
-    return Answer(question, "good", "Yes", text)
+    judged = tuple(criteria(data))
+    if data.mostly_flagged:
+        kept = tuple(each for each in judged if each.setting in ("failed_pixels", "flagged_pixels"))
+        text = f"Most {data.noun}s are flagged: their read noise and gain are open, and with them the answer."
+        return Answer(question, "serious", "Not known", text, kept)
+    missed = [each for each in judged if not each.met]
+    limits = "; ".join(f"{each.words} {each.found} (limit {each.limit[2:]})" for each in missed)
+    met = f"the {len(judged)} criteria are met" if judged else "no limits are set (report.criteria)"
+    text = f"{_value_share(data)}; {limits or met}."
+    if pixels.failed > data.allowed_failed * pixels.total:
+        return Answer(question, "serious", "No", text, judged)
+    if any(each.setting == "read_noise_e" for each in missed):
+        noisy = map_summary(data, "read_noise_e").median > _TOO_NOISY
+        word = "Too noisy to count electrons" if noisy else "Too noisy"
+        return Answer(question, "caution", word, text, judged)
+    if data.often_flagged:
+        return Answer(question, "caution", "Known in part only", text, judged)
+    if missed:
+        return Answer(question, "caution", "Mostly", text, judged)
+    return Answer(question, "good", "Yes", text, judged)
 
 
-def _outliers(data: ReportData) -> tuple[float, str]:
-    """Return the largest share of outliers in a map, and the name of the map."""
-    worst, where = 0.0, ""
-    if data.few_channels:
-        return worst, where
-    found = summaries(data)
-    for name in MAP_NAMES:
-        if name in found and found[name].n_valid:
-            share = (found[name].n_low + found[name].n_high) / found[name].n_valid
-            if share > worst:
-                worst, where = share, name.removesuffix("_e").replace("_", " ")
-    return worst, where
+def _value_share(data: ReportData) -> str:
+    pixels = pixel_counts(data)
+    if pixels.failed == 0:
+        return f"All {count(pixels.total, data.noun)} have a value"
+    return f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} have a value"
 
 
 def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
@@ -363,7 +403,8 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     cautions = [flag for flag in about if flag.level == "caution"]
     if serious:
         more = f" ({len(serious) - 1} more below)" if len(serious) > 1 else ""
-        return Answer(question, "serious", "Not as they are", f"{serious[0].text}{more}")
+        word = "No" if data.mostly_flagged else "Not as they are"
+        return Answer(question, "serious", word, f"{serious[0].text}{more}")
     if cautions:
         more = f" ({len(cautions) - 1} more below)" if len(cautions) > 1 else ""
         return Answer(question, "caution", "With caution", f"{cautions[0].text}{more}")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.plan import frames_text, target_text
@@ -42,8 +43,8 @@ class Table:
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
     makers = (
-        _channels, _parameters, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals, _status,
-        _samples, _plan,
+        _channels, _parameters, _flagged, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals,
+        _status, _samples, _plan,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)).rows]
 
@@ -69,7 +70,7 @@ def _parameters(data: ReportData) -> Table:
     found = summaries(data)
     for name, summary in ((name, found[name]) for name in _ORDER if data.has_values(name)):
         _, words, unit = symbol(name)
-        errors = finite(data.maps.get(f"{name}_stderr", np.empty(0)))
+        errors = finite(np.where(data.flagged, np.nan, data.maps.get(f"{name}_stderr", np.nan)))
         values = [short(value, 4) for value in summary.percentiles.values()]
         rows.append(
             (
@@ -87,7 +88,7 @@ def _parameters(data: ReportData) -> Table:
         "Parameters",
         f"Median over the {data.noun}s with its standard error, robust standard deviation between them "
         f"(1.4826 MAD), median standard error of one {data.noun}, percentiles, and outliers beyond "
-        f"{data.outlier_sigmas:g} robust standard deviations.",
+        f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
         (
             "parameter",
             "median",
@@ -97,6 +98,31 @@ def _parameters(data: ReportData) -> Table:
             "outliers",
             "pixels",
         ),
+        tuple(rows),
+    )
+
+
+def _left_out(data: ReportData) -> str:
+    flagged = int(data.flagged.sum())
+    return f" {count(flagged, f'flagged {data.noun}')} left out: the table below has them." if flagged else ""
+
+
+def _flagged(data: ReportData) -> Table:
+    """Return what flagged pixels read; their errors are no errors and are not shown."""
+    rows = []
+    for name in _ORDER if data.flagged.any() else ():
+        if not data.has_values(name):
+            continue
+        summary = summarise(data.maps[name], left_out=~data.flagged, percentiles=(5.0, 95.0))
+        _, words, unit = symbol(name)
+        numbers = (summary.median, *summary.percentiles.values(), summary.minimum, summary.maximum)
+        rows.append((f"{words} ({unit})", *(short(number, 4) for number in numbers), f"{summary.n_valid:,}"))
+    return Table(
+        "flagged",
+        f"Flagged {data.noun}s",
+        "The data leave these values open by one electron or more, or altogether: they may be far from the "
+        "truth, and their standard errors do not say so. They are left out of the other tables.",
+        ("parameter", "median", "5 %", "95 %", "smallest", "largest", f"{data.noun}s"),
         tuple(rows),
     )
 
@@ -147,7 +173,8 @@ def _against_truth(data: ReportData) -> Table:
     for name, truth in data.truth.items():
         if name not in data.maps:
             continue
-        error = data.maps[name] - truth
+        estimate = np.where(data.flagged, np.nan, data.maps[name])
+        error = estimate - truth
         known = finite(error)
         if known.size == 0:
             continue
@@ -156,8 +183,8 @@ def _against_truth(data: ReportData) -> Table:
         rows.append(
             (
                 f"{words} ({unit})",
-                short(float(np.median(truth)), 4),
-                short(float(np.median(data.maps[name][np.isfinite(data.maps[name])])), 4),
+                short(float(np.median(truth[np.isfinite(error)])), 4),
+                short(float(np.median(finite(estimate))), 4),
                 short(float(np.sqrt(np.mean(known**2)))),
                 measured(float(pull.mean()), float(1 / np.sqrt(pull.size))) if pull.size else "not known",
                 measured(float(pull.std()), float(1 / np.sqrt(2 * pull.size))) if pull.size else "not known",
@@ -167,7 +194,7 @@ def _against_truth(data: ReportData) -> Table:
         "truth",
         "Estimates against the truth",
         "Simulated data only. Pulls are (estimate − truth) / standard error: mean 0 and standard deviation 1 "
-        "if estimates are unbiased and errors right.",
+        f"if estimates are unbiased and errors right.{_left_out(data)}",
         ("parameter", "true median", "estimated median", "RMSE", "mean pull", "sd of pulls"),
         tuple(rows),
     )

@@ -216,6 +216,7 @@ def report_data(
         percentiles=config.maps.percentiles,
         outlier_sigmas=config.maps.outlier_sigmas,
         allowed_failed=config.run.allowed_failed_pixels,
+        criteria=config.report.criteria,
         config_yaml=dump_config(config),
         run=_run_facts(run, config),
         inputs=[

@@ -1,0 +1,140 @@
+"""The end of ``pchem run``: what the report's first screen says, for a terminal and for cron."""
+
+from __future__ import annotations
+
+import json
+import os
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.base.errors import IncompleteRunError, NotBelievedError, quoted
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.store.remote_path import RemotePath
+
+__all__ = ["first_screen", "run_to_first_screen"]
+
+_WIDTH = 100
+
+
+def run_to_first_screen(
+    target: Target,
+    stages: Sequence[str],
+    command: Command,
+    say: Callable[[str], None],
+    *,
+    strict: bool = False,
+) -> None:
+    """Bring stages up to date; then tell the report's first screen on stderr and its path by ``say``.
+
+    Answers that are serious are one line of warning, also where the command is quiet.
+
+    Args:
+        target: the run.
+        stages: what is to be done, in order; without the report its store is told alone.
+        command: what the command line asked for.
+        say: writes a line of results.
+        strict: answers that are serious are an error.
+
+    Raises:
+        NotBelievedError: ``strict``, and an answer is serious.
+        PchEmError: the stages raised it; the first screen is told all the same where there is a report.
+    """
+    if command.options.dry_run:
+        run_stages(target, stages, command)
+        return
+    try:
+        run_stages(target, stages, command)
+    except IncompleteRunError:
+        _tell(target, stages, command, say, warn=True)
+        raise
+    serious = _tell(target, stages, command, say, warn=not strict)
+    if strict and serious:
+        raise NotBelievedError(f"--strict: {serious}")
+
+
+def _tell(
+    target: Target, stages: Sequence[str], command: Command, say: Callable[[str], None], *, warn: bool
+) -> str:
+    """Tell the first screen and the path; return what is serious in one line, or nothing."""
+    path = target.store / "report.json"
+    if "report" not in stages or not path.exists():
+        say(str(target.store))
+        return ""
+    numbers = json.loads(path.read_text(encoding="utf-8"))
+    reporter = Reporter("off", quiet=command.quiet, log=command.log_json)
+    try:
+        reporter.event("verdict", answers=numbers["answers"], next=numbers["next"])
+        if not command.quiet:
+            for line in first_screen(numbers, typed(target)):
+                reporter.info(line)
+        serious = " ".join(_one_line(each) for each in numbers["answers"] if each["level"] == "serious")
+        if serious and warn:
+            reporter.warning(serious)
+    finally:
+        reporter.close()
+    say(str(target.store / "report.html"))
+    return serious
+
+
+def typed(target: Target) -> str:
+    """Return how the run is named in a command typed here: its YAML, or its store."""
+    path = target.config_path if target.config_path is not None else target.store
+    if isinstance(path, RemotePath):
+        return quoted(path)
+    near = os.path.relpath(path)
+    return quoted(Path(near if not near.startswith("..") else path))
+
+
+def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
+    """Return the first screen of a report as lines of text.
+
+    Args:
+        numbers: content of ``report.json``.
+        run: the run, as it is typed in a command.
+    """
+    lines = [""]
+    for answer in numbers["answers"]:
+        lines.append(f"{answer['question']} {answer['word']}.")
+        lines += _wrapped(answer["text"], "  ")
+        lines += _criteria(answer["criteria"])
+    if numbers["headline"]:
+        lines += ["", *_headline(numbers["headline"])]
+    cautions = [flag for flag in numbers["flags"] if flag["level"] == "caution"]
+    lines += [line for flag in cautions for line in _wrapped(f"Caution: {flag['text']}", "  ", "")]
+    lines.append("")
+    for i, step in enumerate(numbers["next"]):
+        words = " ".join(run if word == "RUN" else word for word in step["command"].split(" "))
+        lines += _wrapped(f"{'Or' if i else 'Next'}: {step['why']}:", "  ", "")
+        lines.append(f"  {words}")
+    return lines
+
+
+def _one_line(answer: Mapping[str, Any]) -> str:
+    """Return question and answer, with the first of its reasons."""
+    return (
+        f"{answer['question']} {answer['word']}: {answer['text'].split(': ')[0].split('. ')[0].rstrip('.')}."
+    )
+
+
+def _wrapped(text: str, indent: str, first: str | None = None) -> list[str]:
+    start = indent if first is None else first
+    return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=indent)
+
+
+def _criteria(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the criteria as a table: met or not, what was found, the limit."""
+    wide = max((len(row["words"]) for row in rows), default=0)
+    return [
+        f"  {'ok ' if row['met'] else 'NOT'} {row['words']:<{wide}}  {row['found']:>10}  ({row['limit']})"
+        for row in rows
+    ]
+
+
+def _headline(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the headline numbers with their errors, a line each."""
+    wide = max(len(row["label"]) for row in rows)
+    return [f"median {row['label']:<{wide}}  {row['value']}   ({row['spread']})" for row in rows]

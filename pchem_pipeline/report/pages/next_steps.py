@@ -1,0 +1,61 @@
+"""What to type next: the commands that a run's remarks ask for, the most urgent first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import ReportData
+
+#: Stands for the run in a command.
+RUN = "RUN"
+#: Frames that a search for what the model is missing needs.
+_SEARCHED = 600
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command, with :data:`RUN` in place of the run, and what it is for."""
+
+    command: str
+    why: str
+
+    def of(self, run: str) -> str:
+        """Return the command as it is typed for a run."""
+        return " ".join(run if word == RUN else word for word in self.command.split(" "))
+
+
+def next_steps(data: ReportData) -> list[Step]:
+    """Return what to do next; the first is the one to begin with."""
+    if any(stage.get("state") not in (None, "complete") for stage in data.stages) or data.unfitted.any():
+        return [Step(f"pchem run {RUN}", "finish the run: a part of it is missing")]
+    found = []
+    if data.often_flagged and data.samples is None:
+        found += [
+            Step(
+                f"pchem joint {RUN} BRIGHTER.yaml --bias BIAS.yaml --store joint.zarr",
+                "fit several exposures together: a second one, or frames without charge, settle what one "
+                "leaves open",
+            ),
+            Step(
+                "pchem plan --read-noise 0.6 --samples 0,2,8 --target conversion_gain=1%",
+                "how many frames of which exposures are enough, at the read noise that you expect",
+            ),
+        ]
+    if _coarse(data):
+        found.append(
+            Step(f"pchem run {RUN}", "with fit.likelihood: auto in the YAML, which integrates the codes")
+        )
+    if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
+        found.append(Step(f"pchem discrepancy {RUN}", "look for what the model is missing"))
+    if not found:
+        found.append(Step(f"pchem view {RUN}", "look at every pixel in the browser"))
+    return found
+
+
+def _coarse(data: ReportData) -> bool:
+    """Tell whether rounding biases most pixels."""
+    status = data.fit.get("fit_status")
+    return status is not None and bool(np.mean((status & int(FitStatus.COARSE_STEPS)) != 0) > 0.5)

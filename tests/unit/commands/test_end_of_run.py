@@ -1,0 +1,104 @@
+"""The end of ``pchem run``, for a terminal and for cron."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pchem_pipeline.base.errors import ExitCode, IncompleteRunError, NotBelievedError
+from pchem_pipeline.commands import first_screen
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.run.session import Command
+from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.target import Target
+
+STAGES = ("maps", "report")
+
+
+def numbers(level: str) -> dict:
+    word = {"good": "Yes", "caution": "With caution", "serious": "No"}[level]
+    return {
+        "answers": [
+            {"question": "All right?", "level": "good", "word": "Yes", "text": "All met.", "criteria": [
+                {"words": "hot pixels", "found": "2 %", "limit": "≤ 1 %", "met": False},
+            ]},
+            {"question": "To be believed?", "level": level, "word": word, "text": "60 % flagged: so. More.",
+             "criteria": []},
+        ],
+        "headline": [{"label": "read noise", "value": "0.280 ± 0.001 e⁻", "spread": "5–95 %: 0.2 to 0.3 e⁻"}],
+        "flags": [{"level": "caution", "text": "Rounding."}, {"level": "good", "text": "Fine."}],
+        "next": [{"command": "pchem view RUN", "why": "look"}],
+    }  # fmt: skip
+
+
+@pytest.fixture
+def target(tmp_path, monkeypatch) -> Target:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(first_screen, "run_stages", lambda *_: [])
+    (tmp_path / "my run.zarr").mkdir()
+    config = parse_config("input: {files: [a.tif]}\n")
+    return Target(config, tmp_path, tmp_path / "my run.zarr", tmp_path / "my run.yaml")
+
+
+def run(target: Target, level: str, *, strict: bool = False, stages=STAGES, **options) -> list[str]:
+    (target.store / "report.json").write_text(json.dumps(numbers(level)))
+    said: list[str] = []
+    try:
+        first_screen.run_to_first_screen(target, stages, Command(**options), said.append, strict=strict)
+    finally:
+        assert said == [str(target.store / "report.html")]
+    return said
+
+
+def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys) -> None:
+    run(target, "good")
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = said.err.splitlines()
+    assert "All right? Yes." in lines
+    assert "  NOT hot pixels         2 %  (≤ 1 %)" in lines
+    assert "median read noise  0.280 ± 0.001 e⁻   (5–95 %: 0.2 to 0.3 e⁻)" in lines
+    assert "Caution: Rounding." in lines
+    assert lines[-1] == "  pchem view 'my run.yaml'"
+
+
+def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys) -> None:
+    run(target, "serious", quiet=True)
+    assert capsys.readouterr().err == "warning: To be believed? No: 60 % flagged.\n"
+    for level in ("caution", "good"):
+        run(target, level, quiet=True, strict=True)
+        assert capsys.readouterr().err == ""
+
+
+def test_strict_makes_it_exit_code_3(target, capsys) -> None:
+    with pytest.raises(NotBelievedError, match="To be believed") as raised:
+        run(target, "serious", quiet=True, strict=True)
+    assert raised.value.exit_code == ExitCode.INCOMPLETE == 3
+    assert capsys.readouterr().err == ""  # the error says it
+
+
+def test_an_incomplete_run_tells_what_it_has(target, capsys, monkeypatch) -> None:
+    def fail(*_):
+        raise IncompleteRunError("12 of 40 pixels")
+
+    monkeypatch.setattr(first_screen, "run_stages", fail)
+    with pytest.raises(IncompleteRunError):
+        run(target, "serious")
+    assert "To be believed? No." in capsys.readouterr().err
+
+
+def test_without_a_report_the_store_is_told(target, capsys) -> None:
+    said: list[str] = []
+    first_screen.run_to_first_screen(target, ("maps",), Command(), said.append, strict=True)
+    assert said == [str(target.store)]
+    dry: list[str] = []
+    first_screen.run_to_first_screen(target, STAGES, Command(Options(dry_run=True)), dry.append)
+    assert dry == []
+    assert capsys.readouterr().err == ""
+
+
+def test_a_json_log_has_the_answers(target) -> None:
+    run(target, "serious", log_json=Path("log.jsonl"), quiet=True)
+    events = [json.loads(line) for line in Path("log.jsonl").read_text().splitlines()]
+    assert [event["event"] for event in events] == ["verdict", "warning"]
+    assert events[0]["answers"][1]["word"] == "No"

@@ -1,0 +1,117 @@
+"""The first screen: criteria with their numbers, flagged pixels apart, and what to type next."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.report_material import report_data
+
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.criteria import criteria
+from pchem_pipeline.report.pages.next_steps import next_steps
+from pchem_pipeline.report.pages.report_json import report_json
+from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
+from pchem_pipeline.report.pages.tables import result_tables
+from pchem_pipeline.report.settings import Criteria
+
+
+def flagged(share: float, bit: FitStatus = FitStatus.BIAS_AMBIGUOUS, read_noise: float = 0.9) -> ReportData:
+    """A sensor of which the first rows are flagged and read far from their truth."""
+    data = report_data((40, 50), failed=0.0)
+    mask = np.arange(2000).reshape(40, 50) < round(share * 2000)
+    status = np.where(mask, int(bit), 0).astype(np.uint16)
+    maps = {**data.maps, "read_noise_e": np.where(mask, read_noise, data.maps["read_noise_e"])}
+    return replace(data, maps=maps, fit={**data.fit, "fit_status": status})
+
+
+def table(data: ReportData, name: str):
+    return next((table for table in result_tables(data) if table.id == name), None)
+
+
+def test_where_most_pixels_are_flagged_the_answer_is_no() -> None:
+    data = flagged(0.6)
+    sensor, belief = answers(data)
+    assert (sensor.level, sensor.word) == ("serious", "Not known")
+    assert (belief.level, belief.word) == ("serious", "No")
+    assert "pchem joint" in belief.text
+    assert key_numbers(data) == []
+    assert len(key_numbers(data, with_flagged=True)) == 5
+    assert "±" not in sentence(data).split("RMSE")[0]
+    assert next_steps(data)[0].of("a.yaml").startswith("pchem joint a.yaml ")
+
+
+def test_just_below_half_is_a_caution_and_says_that_the_rest_is_a_selection() -> None:
+    data = flagged(0.45)
+    sensor, belief = answers(data)
+    assert (sensor.level, sensor.word) == ("caution", "Known in part only")
+    assert belief.level == "caution"
+    assert any("a selection, as a rule quieter" in flag.text for flag in flags(data))
+    assert key_numbers(data)[0].label == "read noise of unflagged pixels"
+    assert next_steps(data)[0].command.startswith("pchem joint")
+
+
+@pytest.mark.parametrize(
+    ("bit", "left_out"),
+    [
+        (FitStatus.BIAS_AMBIGUOUS, True),
+        (FitStatus.NOT_INFORMATIVE, True),
+        (FitStatus.WEAKLY_IDENTIFIED, True),
+        (FitStatus.OUTSIDE_WINDOW, False),
+    ],
+)
+def test_flagged_pixels_leave_medians_maxima_and_the_truth_table(bit: FitStatus, left_out: bool) -> None:
+    data = flagged(0.05, bit)
+    numbers = json.loads(report_json(data))
+    noise = numbers["summary"]["read_noise_e"]
+    assert noise["n_flagged"] == (100 if left_out else 0)
+    assert (noise["maximum"] < 0.9) == left_out
+    assert (numbers["truth"]["read_noise_e"]["rmse"] < 0.01) == left_out
+    assert (table(data, "flagged") is not None) == left_out
+    assert ("100 flagged pixels left out" in table(data, "parameters").caption) == left_out
+    if left_out:
+        row = next(row for row in table(data, "flagged").rows if row[0] == "read noise (e⁻)")
+        assert row[1:] == ("0.9000",) * 5 + ("100",)
+
+
+def test_criteria_stand_with_their_numbers_and_limits() -> None:
+    found = {each.setting: each for each in criteria(flagged(0.2))}
+    assert set(found) == set(Criteria.model_fields)
+    assert (found["flagged_pixels"].found, found["flagged_pixels"].limit) == ("20 %", "≤ 10 %")
+    assert not found["flagged_pixels"].met
+    assert found["read_noise_e"].met
+    assert found["gain_nonuniformity"].found == "2 %"  # what the gains were drawn with
+
+
+@pytest.mark.parametrize(
+    ("limits", "word"),
+    [
+        (Criteria(), "Yes"),
+        (Criteria(read_noise_e=0.2), "Too noisy"),
+        (Criteria(gain_nonuniformity=0.01), "Mostly"),
+        (Criteria(**dict.fromkeys(Criteria.model_fields)), "Yes"),
+    ],
+)
+def test_limits_decide(limits: Criteria, word: str) -> None:
+    data = replace(flagged(0.0), criteria=limits)
+    sensor = answers(data)[0]
+    assert sensor.word == word
+    assert all(f"{each.found} (limit" in sensor.text for each in sensor.criteria if not each.met)
+
+
+def test_hot_pixels_are_counted_though_they_are_flagged() -> None:
+    data = flagged(0.03)
+    hot = np.where(data.flagged, 60.0, data.maps["quanta_exposure"])
+    found = criteria(replace(data, maps={**data.maps, "quanta_exposure": hot}))
+    share = next(each for each in found if each.setting == "hot_pixels")
+    assert share.found.startswith("3")
+    assert not share.met
+
+
+def test_next_is_what_the_run_lacks() -> None:
+    data = flagged(0.0)
+    assert next_steps(data)[0].of("run.yaml") == "pchem discrepancy run.yaml"
+    assert next_steps(replace(data, n_frames=500))[0].command == "pchem view RUN"
+    unfinished = replace(data, stages=[{"stage": "fit", "state": "3 of 4 units"}])
+    assert [step.command for step in next_steps(unfinished)] == ["pchem run RUN"]
