@@ -21,13 +21,28 @@ __all__ = [
     "NotBelievedError",
     "PchEmError",
     "StoreError",
+    "one_line",
     "quoted",
 ]
+
+#: characters of a message
+_LONGEST = 4000
 
 
 def quoted(path: Path) -> str:
     """Return a path as it must be typed in a command that a message recommends."""
     return shlex.quote(str(path))
+
+
+def one_line(text: str) -> str:
+    """Return a text as one line that a terminal can show: control characters escaped, not above 4,000 long.
+
+    Of a longer one the beginning (what and where) and the end (the cure) stay.
+    """
+    line = " ".join(text.split())
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
 
 
 class ExitCode(IntEnum):
@@ -47,6 +62,10 @@ class PchEmError(Exception):
     """Base of all errors of this package; ``str(error)`` is one line for the user."""
 
     exit_code: ExitCode = ExitCode.INTERNAL
+
+    def __str__(self) -> str:
+        """Return the message as one line, whatever a file name or a library's words bring along."""
+        return one_line(str(self.args[0])) if self.args else ""
 
 
 class ConfigError(PchEmError):

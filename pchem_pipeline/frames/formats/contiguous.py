@@ -24,7 +24,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import FileHasher
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 
-__all__ = ["ContiguousReader", "Layout", "OpenedFile", "unsigned_type", "unstore"]
+__all__ = ["ContiguousReader", "Layout", "OpenedFile", "even_offsets", "unsigned_type", "unstore"]
 
 _MOST_BYTES = 1 << 30
 #: targets of one call of preadv
@@ -70,6 +70,38 @@ class Layout:
 def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
     """Return the native unsigned type of the same size."""
     return np.dtype(f"=u{stored.itemsize}")
+
+
+def even_offsets(
+    path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
+) -> NDArray[np.int64]:
+    """Return the byte offset of each of the frames that lie evenly in a file.
+
+    Args:
+        path: the file, for the message.
+        n_frames: their number, as the header says.
+        frame_bytes: bytes of a frame.
+        size: bytes of the file.
+        start: offset of the first frame.
+        step: bytes from one frame to the next; None: they follow each other.
+
+    Raises:
+        InputError: they do not fit into the file. The numbers of a damaged header must not take memory.
+    """
+    step = frame_bytes if step is None else step
+    if n_frames and frame_bytes < 1:
+        raise InputError(f"{path}: holds no frames; leave it out")
+    if n_frames and start + step * (n_frames - 1) + frame_bytes > size:
+        whole = max(0, (size - start - frame_bytes) // step + 1)
+        raise _truncated(path, n_frames, start + step * (n_frames - 1) + frame_bytes, size, whole)
+    return start + step * np.arange(n_frames, dtype=np.int64)
+
+
+def _truncated(path: Path, n_frames: int, needed: int, size: int, whole: int) -> InputError:
+    return InputError(
+        f"{path}: truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} whole "
+        "frames); copy the file again"
+    )
 
 
 class OpenedFile:
@@ -149,11 +181,7 @@ class ContiguousReader(FrameReader):
         """
         if layout.end > size:
             whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
-            raise InputError(
-                f"{path}: truncated: {layout.offsets.size} frames need {layout.end} bytes, the file has "
-                f"{size} "
-                f"({whole} whole frames); copy the file again"
-            )
+            raise _truncated(path, layout.offsets.size, layout.end, size, whole)
         self.paths = (path,)
         self.shape = (layout.offsets.size, layout.rows, layout.columns)
         self.dtype = unsigned_type(layout.stored)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, MissingDependencyError
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, unsigned_type
-from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
+from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
@@ -87,8 +87,9 @@ class FitsReader(ContiguousReader):
             self.paths, self.shape, self.dtype = (path,), (n, rows, columns), unsigned_type(stored)
             self._compressed, self._size, self._signed = number, size, signed
             self._full = tuple(sizes)
+            check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
-        offsets = start + rows * columns * stored.itemsize * np.arange(n, dtype=np.int64)
+        offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=start)
         self._set_layout(path, Layout(offsets, rows, columns, stored, biased=biased, signed=signed), size)
 
     def _read_facts(self, *headers: Any) -> None:

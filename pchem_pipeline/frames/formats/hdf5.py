@@ -8,6 +8,7 @@ wait for each other, and the bytes would be read a second time for the hash of t
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -19,8 +20,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, unsigned_type
-from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
+from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
@@ -75,10 +76,14 @@ class Hdf5Reader(ContiguousReader):
         self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
         self.dtype = unsigned_type(dataset.dtype)
         self._full = tuple(dataset.shape)
-        offsets = _plain_offsets(file, dataset, self.shape)
+        size = path.stat().st_size
+        if dataset.chunks is not None:
+            check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
+            self.notes = _missing_chunks(path, dataset)
+        offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
             layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
-            self._set_layout(path, layout, path.stat().st_size)
+            self._set_layout(path, layout, size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         self._read_facts(dataset)
@@ -135,7 +140,20 @@ class Hdf5Reader(ContiguousReader):
         buffer[...] = values.reshape(buffer.shape)
 
 
-def _plain_offsets(file: Any, dataset: Any, shape: tuple[int, int, int]) -> NDArray[np.int64] | None:
+def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
+    """Say how many chunks of a dataset were never written; the library reads them as the fill value."""
+    pairs = zip(dataset.shape, dataset.chunks, strict=True)
+    wanted = math.prod(-(-length // chunk) for length, chunk in pairs)
+    missing = wanted - dataset.id.get_num_chunks()
+    words = (
+        f"{path.name}: {missing} of {wanted} chunks were never written; they are read as {dataset.fillvalue}"
+    )
+    return (words,) if missing > 0 else ()
+
+
+def _plain_offsets(
+    path: Path, file: Any, dataset: Any, shape: tuple[int, int, int]
+) -> NDArray[np.int64] | None:
     """Return the byte offset of each frame that lies plainly in the file, or None where they do not all."""
     from h5py import h5t
 
@@ -146,7 +164,8 @@ def _plain_offsets(file: Any, dataset: Any, shape: tuple[int, int, int]) -> NDAr
         return None
     if dataset.chunks is None:  # None where it lies elsewhere, is virtual, or was never written
         start = dataset.id.get_offset()
-        return None if start is None else start + frame_bytes * np.arange(n_frames, dtype=np.int64)
+        size = path.stat().st_size
+        return None if start is None else even_offsets(path, n_frames, frame_bytes, size, start=start)
     filters = dataset.id.get_create_plist().get_nfilters()
     whole = dataset.ndim == 3 and dataset.chunks[1:] == dataset.shape[1:]
     if filters or not whole or not hasattr(dataset.id, "chunk_iter"):

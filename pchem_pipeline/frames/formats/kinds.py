@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,12 @@ import numpy as np
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["check_samples", "full_window", "stack_shape"]
+__all__ = ["check_coded", "check_samples", "full_window", "stack_shape"]
+
+#: rows or columns, above which a header is damaged; it keeps a row of frames in memory
+_MOST_PIXELS = 1 << 20
+#: a file of coded frames, and a coded piece of it, that may hold much in little
+_MOST_CODED, _MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
 
 
 def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> bool:
@@ -62,6 +68,8 @@ def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[
         InputError: too few or too many axes.
     """
     sizes = list(shape)
+    if min(sizes, default=0) < 0 or max(sizes[-2:], default=0) > _MOST_PIXELS:
+        raise InputError(f"{path}: damaged header: {what} of shape {tuple(shape)}; copy the file again")
     if len(sizes) < 2:
         raise InputError(f"{path}: {what} of shape {tuple(shape)}; frames need (frames, rows, columns)")
     leading = [size for size in sizes[:-2] if size != 1]
@@ -76,6 +84,33 @@ def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[
             f"{path}: {what} of shape {tuple(shape)} looks like colour images; monochrome is needed"
         )
     return (leading[0] if leading else 1), sizes[-2], sizes[-1]
+
+
+def check_coded(
+    path: Path, shape: tuple[int, int, int], piece: Sequence[int], itemsize: int, size: int
+) -> None:
+    """Check that coded frames can be what their header says, before memory is taken for them.
+
+    Args:
+        path: the file, for the message.
+        shape: (frames, rows, columns).
+        piece: shape of a chunk, tile or strip, which is decoded at once.
+        itemsize: bytes of a sample.
+        size: bytes of the file or folder.
+
+    Raises:
+        InputError: the frames are too many for so few bytes, or a piece is far larger than they all.
+    """
+    total, one = math.prod(shape) * itemsize, math.prod(piece) * itemsize
+    if total > max(_MOST_CODED, _MOST_RATIO * size):
+        raise InputError(
+            f"{path}: damaged header: {size} bytes cannot hold {shape[0]} frames of {shape[1]} x {shape[2]}; "
+            "copy the file again"
+        )
+    if one > max(_MOST_PIECE, 4 * total):
+        raise InputError(
+            f"{path}: damaged header: pieces of {' x '.join(map(str, piece))} samples; copy the file again"
+        )
 
 
 def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tuple[Any, ...]:

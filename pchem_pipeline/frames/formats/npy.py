@@ -11,7 +11,7 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
@@ -41,7 +41,7 @@ class NpyReader(ContiguousReader):
                 start, size = stream.tell(), path.stat().st_size
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-        except ValueError as error:
+        except Exception as error:  # a damaged header can break the parser of Python's literals anywhere
             raise InputError(
                 f"{path}: not a sound npy file, or truncated; write it again by numpy.save"
             ) from error
@@ -56,9 +56,14 @@ class NpyReader(ContiguousReader):
             raise InputError(
                 f"{path}: in Fortran order; save it by numpy.save(..., numpy.ascontiguousarray(frames))"
             )
-        offsets = start + rows * columns * dtype.itemsize * np.arange(n, dtype=np.int64)
+        offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
         reader = cls()
         reader._set_layout(path, Layout(offsets, rows, columns, dtype, signed=signed), size)
+        behind = size - max(start, reader._layout.end)
+        if behind:
+            reader.notes = (
+                f"{path.name}: {behind} bytes behind the array that its header names are left out",
+            )
         return reader
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import unsigned_type
-from pchem_pipeline.frames.formats.kinds import check_samples, full_window, stack_shape
+from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
+from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
@@ -63,6 +64,8 @@ class ZarrReader(FrameReader):
         self._full = tuple(array.shape)
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         self._array = array
+        piece = getattr(array, "shards", None) or array.chunks
+        check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         time, depth = attributes.get("integration_time"), attributes.get("bit_depth")
         if isinstance(time, int | float) and 0 < time < np.inf:
             self.integration_time = float(time)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
@@ -128,7 +128,7 @@ class RawReader(ContiguousReader):
             )
         if n < whole:
             self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
-        offsets = header + step * np.arange(n, dtype=np.int64)
+        offsets = even_offsets(path, n, frame, size, start=header, step=step)
         self._set_layout(path, Layout(offsets, rows, columns, stored), size)
 
 

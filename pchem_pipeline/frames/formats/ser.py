@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
@@ -58,7 +58,7 @@ class SerReader(ContiguousReader):
             )
         order = settings.byte_order or ("big" if flag else "little")
         stored = np.dtype("u1" if depth <= 8 else (">u2" if order == "big" else "<u2"))
-        offsets = _HEADER.size + rows * columns * stored.itemsize * np.arange(n, dtype=np.int64)
+        offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
         reader = cls()
         reader._set_layout(path, Layout(offsets, rows, columns, stored), size)
         reader.bit_depth = depth

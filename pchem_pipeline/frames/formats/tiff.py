@@ -9,6 +9,7 @@ the wanted rows need.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,10 +24,11 @@ from pchem_pipeline.frames.formats.contiguous import (
     ContiguousReader,
     Layout,
     OpenedFile,
+    even_offsets,
     unsigned_type,
     unstore,
 )
-from pchem_pipeline.frames.formats.kinds import check_samples
+from pchem_pipeline.frames.formats.kinds import check_coded, check_samples
 from pchem_pipeline.frames.formats.tiff_facts import (
     check_chain,
     images_behind_one_page,
@@ -82,6 +84,7 @@ class TiffReader(ContiguousReader):
         reader._decoders = {}
         try:
             size = path.stat().st_size
+            check_chain(path, size)
             with tifffile.TiffFile(path) as file:
                 reader._inspect(path, file, size, settings)
         except InputError:
@@ -102,7 +105,6 @@ class TiffReader(ContiguousReader):
         reduced = len(file.pages) - len(pages)
         if not pages:
             raise InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
-        check_chain(path, file, size)
         notes = [f"{path.name}: {reduced} reduced pages (previews) are left out"] if reduced else []
         first = pages[0]
         _check_pages(path, pages)
@@ -142,6 +144,9 @@ class TiffReader(ContiguousReader):
             )
         first = pages[0]
         rows, columns = first.shape
+        piece = max((page.chunks for page in pages), key=math.prod)
+        itemsize = np.dtype(first.dtype).itemsize
+        check_coded(path, (len(pages), rows, columns), piece, itemsize, size)
         height = np.array([page.chunks[0] for page in pages], np.int64)
         width = np.array([page.chunks[1] for page in pages], np.int64)
         self.paths = (path,)
@@ -237,9 +242,10 @@ def _check_pages(path: Path, pages: Sequence[Any]) -> None:
     """Refuse colour, and pages of different shape or type."""
     first = pages[0]
     for number, page in enumerate(pages):
-        if page.dtype is None:
+        if page.dtype is None or not all(isinstance(length, int) for length in page.shape):
             raise InputError(
-                f"{path}: page {number} has samples of an unknown type; write it as uint8 or uint16"
+                f"{path}: page {number} has samples of an unknown type, or a damaged header; write it as "
+                "uint8 or uint16"
             )
         if (page.shape, page.dtype) != (first.shape, first.dtype):
             raise InputError(
@@ -274,14 +280,15 @@ def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) 
     rows, columns = first.shape[-2:]
     frame = rows * columns * dtype.itemsize
     planes = first.samplesperpixel
+    if len(pages) == 1 and planes == 1 and (first.is_contiguous or _adjoining(first, frame)):
+        start = int(first.dataoffsets[0])
+        return even_offsets(path, images_behind_one_page(file), frame, size, start=start)
     offsets = []
     for page in pages:
         if not page.is_contiguous and not _adjoining(page, frame * planes):
             return None
         start = int(page.dataoffsets[0])
         offsets += [start + plane * frame for plane in range(planes)]
-    if len(pages) == 1 and planes == 1:
-        offsets = [offsets[0] + i * frame for i in range(images_behind_one_page(file))]
     return np.asarray(offsets, np.int64)
 
 

@@ -6,39 +6,70 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from pchem_pipeline.base.errors import InputError
 
 __all__ = ["check_chain", "images_behind_one_page", "stated_bit_depth", "stated_channels", "stated_time"]
 
+
+class _Kind(NamedTuple):
+    """Bytes of the parts of a directory, and where the header names the first one."""
+
+    count_size: int
+    tag: int
+    pointer: int
+    first: int
+
+
+_CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
+#: tags of a directory, as in tifffile
+_MOST_TAGS = 4096
 _EXPOSURE_TAG = 33434
 _MICRO_MANAGER_TAG = 51123
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "\u00b5s": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
-def check_chain(path: Path, file: Any, size: int) -> None:
-    """Refuse a file whose chain of pages points behind its end: the library stops there silently."""
-    last = file.pages[-1]
-    offset_size = file.tiff.offsetsize
-    count_size = file.tiff.tagnosize
-    end = last.offset + count_size + file.tiff.tagsize * _tag_count(file, last)
-    handle = file.filehandle
-    handle.seek(end)
-    data = handle.read(offset_size)
-    following = int.from_bytes(data, "big" if file.byteorder == ">" else "little")
-    if len(data) < offset_size or following >= size:
-        raise InputError(
-            f"{path}: truncated: only {len(file.pages)} pages are within the file's {size} bytes; copy it "
-            "again"
-        )
+def check_chain(path: Path, size: int) -> None:
+    """Walk from directory to directory: the library stops silently at one that is damaged, or never.
+
+    Raises:
+        InputError: no TIFF file, a directory that is not within the file, or a chain that runs in a circle.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(16)
+        order: Literal["little", "big"] = "big" if head[:2] == b"MM" else "little"
+        version = int.from_bytes(head[2:4], order)
+        if len(head) < 8 or head[:2] not in (b"II", b"MM") or version not in (42, 43):
+            raise InputError(f"{path}: not a sound TIFF file, or truncated (header); copy it again")
+        kind = _BIG if version == 43 else _CLASSIC
+        following = int.from_bytes(head[kind.first : kind.first + kind.pointer], order)
+        seen: set[int] = set()
+        while following:
+            if following in seen:
+                raise InputError(
+                    f"{path}: damaged: after {len(seen)} pages the chain of pages runs in a circle; copy it "
+                    "again"
+                )
+            here = following
+            stream.seek(here)
+            tags = int.from_bytes(stream.read(kind.count_size), order)
+            stream.seek(here + kind.count_size + min(tags, _MOST_TAGS) * kind.tag)
+            data = stream.read(kind.pointer)
+            if tags > _MOST_TAGS or len(data) < kind.pointer:
+                raise _broken_chain(path, len(seen), size)
+            seen.add(here)
+            following = int.from_bytes(data, order)
+        if not seen:
+            raise _broken_chain(path, 0, size)
 
 
-def _tag_count(file: Any, page: Any) -> int:
-    handle = file.filehandle
-    handle.seek(page.offset)
-    data = handle.read(file.tiff.tagnosize)
-    return int.from_bytes(data, "big" if file.byteorder == ">" else "little")
+def _broken_chain(path: Path, pages: int, size: int) -> InputError:
+    if not pages:
+        return InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
+    return InputError(
+        f"{path}: truncated: only {pages} pages are within the file's {size} bytes; copy it again"
+    )
 
 
 def images_behind_one_page(file: Any) -> int:

@@ -1,0 +1,386 @@
+"""Camera files of all formats in many layouts, damaged: the same frames, or one clear line.
+
+Run as a program (``python -m helpers.damaged_formats FOLDER FIRST END``) it works through cases in one
+process and prints a line of JSON before and after each, so that who reads knows to which case a crash or a
+hang belongs.
+"""
+
+import contextlib
+import json
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from helpers.damage import damaged, frames
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+
+#: what a case may take: seconds, and bytes above what the undamaged files take
+SECONDS, MEMORY = 10.0, 1 << 30
+#: bytes of frames that are read of a case, which may claim to have any number
+MOST_READ = 1 << 22
+
+
+# -- files -------------------------------------------------------------------------------------------------
+
+
+def _npy(path):
+    np.save(path / "a.npy", frames())
+
+
+def _npy_big_endian(path):
+    np.save(path / "a.npy", frames().astype(">u2"))
+
+
+def _npy_second_version(path):
+    with (path / "a.npy").open("wb") as file:
+        np.lib.format.write_array(file, frames(dtype="uint8"), version=(2, 0))
+
+
+def _tiff(path, *, name="a.tif", data=None, pages=True, **options):
+    import tifffile
+
+    data = frames() if data is None else data
+    kinds = {key: options.pop(key) for key in ("byteorder", "bigtiff", "imagej", "ome") if key in options}
+    options = {"photometric": "minisblack", **options}
+    with tifffile.TiffWriter(path / name, **kinds) as writer:
+        for frame in data if pages else [data]:
+            writer.write(frame, **options)
+
+
+def _tiff_sequence(path):
+    for number, frame in enumerate(frames(n=3)):
+        _tiff(path, name=f"f{number}.tif", data=frame[None], metadata=None)
+
+
+def _fits(path, *, compressed=False, extension=False):
+    from astropy.io import fits
+
+    if compressed:
+        fits.CompImageHDU(frames(), compression_type=compressed).writeto(path / "a.fits")
+    elif extension:
+        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(frames(), name="DATA")]).writeto(path / "a.fits")
+    else:
+        fits.PrimaryHDU(frames()).writeto(path / "a.fits")
+
+
+def _hdf5(path, libver=None, **options):
+    import h5py
+
+    with h5py.File(path / "a.h5", "w", libver=libver) as file:
+        file.create_dataset("entry/data", data=frames(), **options)
+        file["entry/count_time"] = 0.5
+
+
+def _hdf5_plugin(path):
+    import hdf5plugin
+
+    _hdf5(path, chunks=(2, 8, 9), **hdf5plugin.Bitshuffle())
+
+
+def _zarr(path, version=3, chunks=(3, 4, 9), **options):
+    import zarr
+
+    array = zarr.create_array(
+        path / "a.zarr", shape=(6, 8, 9), chunks=chunks, dtype="uint16", zarr_format=version, **options
+    )
+    array[...] = frames()
+
+
+def _ome_zarr(path):
+    import zarr
+
+    group = zarr.create_group(path / "a.zarr")
+    group.create_array("0", data=frames(), chunks=(3, 8, 9))
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [{"datasets": [{"path": "0"}]}]}
+
+
+def _ser(path, dtype="uint16", times=True):
+    from pchem_pipeline.frames.writing import write_frames
+
+    write_frames("ser", path / "a.ser", iter([frames(dtype=dtype)]), (6, 8, 9), dtype)
+    if times:
+        with (path / "a.ser").open("ab") as file:
+            file.write((621_355_968_000_000_000 + np.arange(6, dtype="<i8")).tobytes())
+
+
+def _raw(path, text='{"shape": [8, 9], "dtype": "uint16", "bit_depth": 12, "header_bytes": 16}', kind="json"):
+    (path / "a.raw").write_bytes(bytes(16) + frames().tobytes())
+    (path / f"a.raw.{kind}").write_text(text)
+
+
+def _raw_yaml(path):
+    _raw(path, "shape: [6, 8, 9]\ndtype: uint16\nheader_bytes: 16\nintegration_time: 2.5\n", "yaml")
+
+
+def _csv(path, mark=","):
+    (path / "a.csv").write_text(
+        f"dn{mark}a{mark}b\n" + "".join(f"{d}{mark}{9 * d}{mark}7\n" for d in range(90, 130))
+    )
+
+
+def _npz(path):
+    np.savez_compressed(path / "a.npz", dn=np.arange(40), counts=frames(n=3, shape=(8, 5)).reshape(3, 40))
+
+
+#: name -> what writes the undamaged files into a folder
+SEEDS = {
+    "npy": _npy,
+    "npy, big-endian": _npy_big_endian,
+    "npy, version 2": _npy_second_version,
+    "tiff": lambda p: _tiff(p, metadata=None),
+    "tiff, series": lambda p: _tiff(p, pages=False),
+    "tiff, big-endian": lambda p: _tiff(p, byteorder=">", metadata=None),
+    "tiff, 8 bit": lambda p: _tiff(p, data=frames(dtype="uint8"), metadata=None),
+    "bigtiff": lambda p: _tiff(p, bigtiff=True, metadata=None),
+    "tiff, one directory": lambda p: _tiff(p, pages=False, data=frames(), metadata={"truncate": True}),
+    "tiff, zlib in strips": lambda p: _tiff(
+        p, compression="zlib", rowsperstrip=3, predictor=True, metadata=None
+    ),
+    "tiff, lzw": lambda p: _tiff(p, compression="lzw", metadata=None),
+    "tiff, packbits": lambda p: _tiff(p, compression="packbits", metadata=None),
+    "tiff, zstd": lambda p: _tiff(p, compression="zstd", metadata=None),
+    "tiff, jpeg": lambda p: _tiff(p, data=frames(dtype="uint8"), compression="jpeg", metadata=None),
+    "tiff, tiles": lambda p: _tiff(p, tile=(16, 16), compression="zlib", metadata=None),
+    "tiff, imagej": lambda p: _tiff(p, imagej=True, pages=False),
+    "tiff, ome": lambda p: _tiff(p, ome=True, pages=False, metadata={"axes": "TYX"}),
+    "tiff, a file a frame": _tiff_sequence,
+    "fits": _fits,
+    "fits, extension": lambda p: _fits(p, extension=True),
+    "fits, Rice": lambda p: _fits(p, compressed="RICE_1"),
+    "fits, gzip": lambda p: _fits(p, compressed="GZIP_2"),
+    "hdf5": _hdf5,
+    "hdf5, newest": lambda p: _hdf5(p, libver="latest"),
+    "hdf5, plain chunks": lambda p: _hdf5(p, chunks=(2, 8, 9)),
+    "hdf5, gzip": lambda p: _hdf5(p, chunks=(2, 4, 9), compression="gzip", shuffle=True),
+    "hdf5, newest, checksums": lambda p: _hdf5(p, libver="latest", chunks=(2, 8, 9), fletcher32=True),
+    "hdf5, bitshuffle": _hdf5_plugin,
+    "zarr": _zarr,
+    "zarr, format 2": lambda p: _zarr(p, 2),
+    "zarr, shards": lambda p: _zarr(p, shards=(6, 8, 9)),
+    "zarr, ome": _ome_zarr,
+    "ser": _ser,
+    "ser, 8 bit": lambda p: _ser(p, "uint8", times=False),
+    "raw": _raw,
+    "raw, YAML": _raw_yaml,
+    "histogram, csv": _csv,
+    "histogram, semicolons": lambda p: _csv(p, ";"),
+    "histogram, npz": _npz,
+}
+
+
+def write_seeds(folder):
+    """Write the undamaged files, each layout into a folder of its own."""
+    for number, write in enumerate(SEEDS.values()):
+        place = folder / str(number)
+        place.mkdir(parents=True)
+        write(place)
+
+
+# -- a case ------------------------------------------------------------------------------------------------
+
+
+class TookTooLong(BaseException):
+    """No Exception, so that no reader takes it for a broken file."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What became of one damaged file.
+
+    Attributes:
+        number: of the case, from which all is drawn.
+        layout: key of `SEEDS`.
+        outcome: same, silent (other frames, no word), refused; or what must not be: foreign (an error that is
+            not ours, or not one line), slow, greedy, crashed.
+        words: the message, or the traceback's last line.
+        seconds: of reading.
+        memory: bytes at its peak above those before.
+    """
+
+    number: int
+    layout: str
+    outcome: str
+    words: str = ""
+    seconds: float = 0.0
+    memory: int = 0
+
+    @property
+    def bad(self):
+        return self.outcome not in ("same", "silent", "refused")
+
+
+def layout_of(number):
+    return list(SEEDS)[number % len(SEEDS)]
+
+
+def make_case(seeds, number, place):
+    """Write the damaged files of a case to a folder; return it."""
+    rng = np.random.default_rng([14, number])
+    source = seeds / str(number % len(SEEDS))
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(source, place)
+    files = sorted(path for path in place.rglob("*") if path.is_file())
+    victim = files[int(rng.integers(len(files)))]
+    victim.write_bytes(damaged(victim.read_bytes(), rng))
+    return place
+
+
+def read_all(place):
+    """Return what a command would read of a folder: frames, or histograms."""
+    (only,) = [p for p in place.iterdir() if p.suffix == ".zarr"] or [place]
+    names = {path.suffix for path in only.iterdir()}
+    if names & {".csv", ".npz"}:
+        only = next(only.iterdir())
+    settings = InputSettings(files=(str(only),))
+    if is_histogram_input(settings, place):
+        found = read_histograms(settings, place)
+        return np.concatenate([found.origin.ravel(), found.counts.ravel().astype(np.int64)])
+    with open_frames(settings, place) as stack:
+        stack.identity()
+        n, rows, columns = stack.shape
+        step = max(1, MOST_READ // max(1, columns * stack.dtype.itemsize))
+        rows = min(rows, step)
+        many = min(n, max(1, step // rows), 64)
+        first = stack.read(0, many, 0, rows)
+        if many < n:
+            stack.read(n - 1, n, 0, rows)
+        return first
+
+
+def peak_memory():
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) << 10
+    return 0
+
+
+def forget_peak():
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def outcome_of(place, expected):
+    """Read a damaged case; return the outcome and its words."""
+    try:
+        found = read_all(place)
+    except InputError as error:
+        words = str(error)
+        proper = words.isprintable() and str(place) in words and len(words) < 4100
+        return ("refused" if proper else "foreign"), words
+    except TookTooLong:
+        return "slow", f"more than {SECONDS:g} s"
+    except MemoryError as error:
+        return "greedy", str(error)
+    except BaseException as error:
+        import traceback
+
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return "foreign", f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+    same = found.shape == expected.shape and bool((found == expected).all())
+    return ("same" if same else "silent"), "" if same else str(found.shape)
+
+
+def _stop(*unused):
+    raise TookTooLong
+
+
+def run_case(seeds, number, folder, expected):
+    """Make a case and read it, within its time and memory."""
+    layout = layout_of(number)
+    place = make_case(seeds, number, folder / "case")
+    forget_peak()
+    before, clock = peak_memory(), time.perf_counter()
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    try:
+        outcome, words = outcome_of(place, expected[layout])
+    except TookTooLong:
+        outcome, words = "slow", "while it was leaving"
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    memory = peak_memory() - before
+    if memory > MEMORY:
+        outcome = "greedy"
+    return Case(number, layout, outcome, words, time.perf_counter() - clock, memory)
+
+
+def main(folder, first, end):
+    """Work through cases ``first`` to ``end``, in this process, with lines of JSON."""
+    import warnings
+
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGALRM, _stop)
+    seeds = Path(folder) / "seeds"
+    expected = {name: read_all(seeds / str(i)) for i, name in enumerate(SEEDS)}
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limit = size + 3 * MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    for number in range(int(first), int(end)):
+        print(json.dumps({"begun": number}), flush=True)
+        print(json.dumps(run_case(seeds, number, Path(folder), expected).__dict__), flush=True)
+
+
+# -- many cases --------------------------------------------------------------------------------------------
+
+
+def run_cases(folder, first, end):
+    """Yield the `Case` of each number ``first`` to ``end``; a process that dies is replaced by another."""
+    seeds = folder / "seeds"
+    if not seeds.exists():
+        write_seeds(seeds)
+    while first < end:
+        command = [sys.executable, "-m", "helpers.damaged_formats", str(folder), str(first), str(end)]
+        tests = str(Path(__file__).parents[1])
+        begun = None
+        with subprocess.Popen(
+            command, cwd=tests, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            watch = _Watch(process)
+            for line in process.stdout:
+                record = json.loads(line)
+                if "begun" in record:
+                    begun = record["begun"]
+                    watch.patience(3 * SECONDS)
+                else:
+                    begun, first = None, record["number"] + 1
+                    yield Case(**record)
+            watch.cancel()
+            _, words = process.communicate()
+        if begun is not None:
+            first = begun + 1
+            yield Case(begun, layout_of(begun), "crashed", f"exit code {process.returncode}: {words[-300:]}")
+        elif process.returncode:
+            raise AssertionError(words)
+
+
+class _Watch:
+    """Kills a process that says nothing for too long (a hang below Python, where no alarm is heard)."""
+
+    def __init__(self, process):
+        self._process, self._timer = process, None
+        self.patience(120)
+
+    def patience(self, seconds):
+        import threading
+
+        self.cancel()
+        self._timer = threading.Timer(seconds, self._process.kill)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def cancel(self):
+        if self._timer is not None:
+            self._timer.cancel()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
