@@ -12,6 +12,7 @@ from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.config.edit import write_model
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.discrepancy.verdict import parameters_of, read_verdict
+from pchem_pipeline.effects.framework.compose import effect_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.run.model_versions import (
@@ -116,9 +117,10 @@ def _words(version: ModelVersion) -> str:
 
 def _effect_words(effect: Effect) -> str:
     if not effect.strength:
-        return effect.tag
+        return effect_words(effect)
     strength = parameters_of(effect, math.nan)[effect.strength]
-    return f"{effect.tag} {strength.value:.4g} {strength.unit}".rstrip()
+    tag, *place = effect_words(effect).partition(" in ")
+    return f"{tag} {strength.value:.4g} {strength.unit}".rstrip() + "".join(place)
 
 
 def use_model(target: Target, number: int) -> str:

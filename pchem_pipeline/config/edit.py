@@ -74,30 +74,31 @@ def write_model(path: Path, model: ModelSettings) -> None:
         text = path.read_bytes().decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
-    changed = with_model(text, model, str(path))
+    changed = with_model(text, model, str(path), path.parent)
     if changed != text:
         check_writable(path)
         write_atomic(path, changed.encode())
 
 
-def with_model(text: str, model: ModelSettings, name: str) -> str:
+def with_model(text: str, model: ModelSettings, name: str, folder: Path | None = None) -> str:
     """Return the YAML text with this model; all that it says beside stays.
 
     Args:
         text: the YAML of a run.
         model: its new section.
         name: of the file, for messages.
+        folder: of the file.
 
     Raises:
         ConfigError: the text is no configuration, or the library cannot edit it.
     """
-    content, before = yaml_content(text, name), parse_config(text, name).model
+    content, before = yaml_content(text, name), parse_config(text, name, folder).model
     if before == model:
         return text
     for edit in (_with_lines, _with_document):
         try:
             changed = edit(text, before, model)
-            if _says(changed, content, model):
+            if _says(changed, content, model, folder):
                 return changed
         except (YAMLError, yaml.YAMLError, ConfigError, ValueError, KeyError, TypeError, AttributeError):
             continue
@@ -106,12 +107,12 @@ def with_model(text: str, model: ModelSettings, name: str) -> str:
     raise ConfigError(f"{name}: its section model cannot be edited; write it by hand: {words}")
 
 
-def _says(text: str, content: dict[str, Any], model: ModelSettings) -> bool:
+def _says(text: str, content: dict[str, Any], model: ModelSettings, folder: Path | None) -> bool:
     """Tell whether a text says the same as before but for the model."""
     others, before = (
         {k: v for k, v in c.items() if k != _SECTION} for c in (yaml_content(text, ""), content)
     )
-    return others == before and parse_config(text).model == model
+    return others == before and parse_config(text, folder=folder).model == model
 
 
 def _with_lines(text: str, before: ModelSettings, model: ModelSettings) -> str:
@@ -250,8 +251,10 @@ def _entries(effects: CommentedSeq, before: Sequence[Effect], wanted: Sequence[E
         if same is None:
             old = before[place].model_dump(mode="json")
             for name, value in effect.model_dump(mode="json").items():
-                if old[name] != value:
+                if old.get(name) != value:
                     effects[place][name] = value
+            for name in old.keys() - effect.model_dump(mode="json").keys():
+                del effects[place][name]
         found.append(effects[place])
     return found
 

@@ -53,16 +53,21 @@ def load_config(path: Path) -> RunConfig:
         raise ConfigError(f"{path}: no such file; write one with: pchem init {quoted(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
-    return parse_config(text, str(path))
+    return parse_config(text, str(path), path.parent)
 
 
-def parse_config(text: str, name: str = "config") -> RunConfig:
-    """Return the configuration in a YAML text; ``name`` is used in messages.
+def parse_config(text: str, name: str = "config", folder: Path | None = None) -> RunConfig:
+    """Return the configuration in a YAML text.
+
+    Args:
+        text: YAML.
+        name: used in messages.
+        folder: to which the paths of files that are read with the YAML refer; None: the working directory.
 
     Raises:
         ConfigError: the text is not YAML or a setting is wrong.
     """
-    return make_config(yaml_content(text, name), name)
+    return make_config(yaml_content(text, name), name, folder)
 
 
 def yaml_content(text: str, name: str) -> dict[str, Any]:
@@ -80,14 +85,15 @@ def yaml_content(text: str, name: str) -> dict[str, Any]:
     return content
 
 
-def make_config(content: Mapping[str, Any], name: str) -> RunConfig:
-    """Return the configuration with these settings; ``name`` is used in messages.
+def make_config(content: Mapping[str, Any], name: str, folder: Path | None = None) -> RunConfig:
+    """Return the configuration with these settings; ``name`` and ``folder`` as in :func:`parse_config`.
 
     Raises:
         ConfigError: a setting is wrong.
     """
     try:
-        return RunConfig.model_validate(_of_earlier_version(_renamed(content, name), name))
+        settings = _of_earlier_version(_renamed(content, name), name)
+        return RunConfig.model_validate(settings, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(f"{name}: {complaints(error)}") from error
 

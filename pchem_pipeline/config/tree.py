@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -88,7 +88,7 @@ class RunConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _read_what_is_simulated(cls, data: Any) -> Any:
+    def _read_what_is_simulated(cls, data: Any, info: ValidationInfo) -> Any:
         """Set the input to the simulated camera's files, where no files are named."""
         if not isinstance(data, dict) or data.get("simulate") is None:
             return data
@@ -96,7 +96,7 @@ class RunConfig(Section):
         if not isinstance(given, dict) or given.get("files") or given.get("samples"):
             return data
         try:
-            simulated = SimulateSettings.model_validate(data["simulate"])
+            simulated = SimulateSettings.model_validate(data["simulate"], context=info.context)
         except ValidationError:
             return data  # said once more, with its place in the tree, by the field itself
         files = [str(simulated.output)]

@@ -5,7 +5,7 @@ Hendrickson et al., eq. PCD_RV_definition: ``X = round((K + R) / g + mu)``, ``K 
 ends at 0 or at 2**bit_depth - 1: that cut always happens, with or without effects.
 
 Without effects one compiled pass does everything. With effects the same numbers go plane by plane; an
-effect of no strength changes nothing, not even the last bit.
+effect of no strength changes nothing, not even the last bit, and one with a region nothing elsewhere.
 """
 
 from __future__ import annotations
@@ -213,8 +213,12 @@ class _Block:
 
     def _apply(self, plane: Plane, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         for position, effect in _of_plane(self.settings.effects, plane):
+            inside = _inside(effect, context)
+            if not inside.any():
+                continue
             random = self._streams(f"effect/{effect.tag}/{position}")
-            values = _checked(effect, plane, values, replace(context, random=random))
+            changed = _checked(effect, plane, values, replace(context, random=random))
+            values = changed if inside.all() else np.where(inside, changed, values)
         return values
 
 
@@ -222,6 +226,16 @@ def _of_plane(effects: Sequence[Effect], plane: Plane) -> list[tuple[int, Effect
     """Return the effects of a plane, each with how many of its tag come before it in the whole list."""
     tags = [effect.tag for effect in effects]
     return [(tags[:i].count(effect.tag), effect) for i, effect in enumerate(effects) if effect.plane is plane]
+
+
+def _inside(effect: Effect, context: EffectContext) -> NDArray[np.bool_]:
+    """Return the samples on which an effect acts, an array that broadcasts against (frame, y, x)."""
+    inside = np.ones((1, 1, 1), np.bool_)
+    if effect.when is not None:
+        inside = effect.when.frames(context.frames)[:, None, None]
+    if effect.region is not None:
+        inside = inside & effect.region.mask(context.shape, context.rows)
+    return inside
 
 
 def _checked(effect: Effect, plane: Plane, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:

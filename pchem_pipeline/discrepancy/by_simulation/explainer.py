@@ -304,14 +304,17 @@ class FrameExplainer:
         if self.rounds:
             code = self.evidence[0].code
             codes = code.first + np.arange(code.observed.size)
-            expected = expected_codes(maps, self.model, codes, frames.splits.train.size)
+            expected = expected_codes(maps, self.model, codes, frames.numbers[frames.splits.train])
         try:
             added = added_exposures(model, frames.stack, frames.numbers, plain.maps)
         except ConfigError as error:
             self.left_out["added exposure"] = str(error)
             added = None
         if added is not None:
-            maps = refit_maps(frames.stack[frames.seen], plain.maps, model, plain.covariance, added).maps
+            seen = frames.seen
+            maps = refit_maps(
+                frames.stack[seen], plain.maps, model, plain.covariance, added, frames.numbers[seen]
+            ).maps
         return Fitted(maps, expected, added)
 
     # -- pieces ---------------------------------------------------------------------------------
@@ -321,8 +324,14 @@ class FrameExplainer:
         plain, fit = self.plain, None
         assert plain.covariance is not None
         if self.model:
-            seen = self.frames.stack[self.frames.seen]
-            fit = refit_maps(seen, plain.maps, self.model, plain.covariance)
+            seen = self.frames.seen
+            fit = refit_maps(
+                self.frames.stack[seen],
+                plain.maps,
+                self.model,
+                plain.covariance,
+                numbers=self.frames.numbers[seen],
+            )
         fit = fit or Refit(plain.maps, {}, plain.covariance)
         return fit, equivalent_sensor(fit.maps, fit.covariance)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.fit.api import fit_histograms
@@ -53,6 +53,7 @@ def refit_maps(
     effects: Sequence[Effect],
     covariance: NDArray[np.float64],
     added: AddedExposure | None = None,
+    numbers: NDArray[np.int64] | None = None,
 ) -> Refit:
     """Fit the pixels of some frames with effects in their law.
 
@@ -62,6 +63,7 @@ def refit_maps(
         effects: of the model.
         covariance: of the plain fit, shape (y, x, 4, 4).
         added: exposure that the effects add to each pixel; None: it counts as part of H.
+        numbers: of the frames in the run, shape (frame,); None: 0, 1, 2, ...
 
     Returns:
         New maps; the old ones where the effects cannot be fitted with.
@@ -70,7 +72,9 @@ def refit_maps(
     old = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
     flat = tuple(values.ravel() for values in old)
     try:
-        law = sample_law(effects, pixel_maps(flat, maps.usable), added)
+        numbers = np.arange(frames.shape[0]) if numbers is None else numbers
+        places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers)
+        law = sample_law(effects, pixel_maps(flat, maps.usable), added, places)
     except ConfigError:
         return Refit(maps, {}, covariance)
     histograms = histogram_frames(frames)
@@ -90,7 +94,7 @@ def refit_maps(
 
 
 def expected_codes(
-    maps: PixelMaps, effects: Sequence[Effect], codes: NDArray[np.integer], n_samples: int
+    maps: PixelMaps, effects: Sequence[Effect], codes: NDArray[np.integer], numbers: NDArray[np.int64]
 ) -> NDArray[np.float64] | None:
     """Return the samples that a model expects at each code, all usable pixels together.
 
@@ -98,7 +102,7 @@ def expected_codes(
         maps: parameters of the pixels under the model.
         effects: of the model.
         codes: successive DN, shape (c,).
-        n_samples: of each pixel.
+        numbers: of the frames in the run, one sample of each pixel in each.
 
     Returns:
         Shape (c,); None where the effects give no law.
@@ -107,10 +111,12 @@ def expected_codes(
     every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
     flat = tuple(values.ravel()[usable] for values in every)
     try:
-        law = sample_law(effects, pixel_maps(flat, usable[usable]))
+        shape = maps.usable.shape
+        places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers).of(usable)
+        law = sample_law(effects, pixel_maps(flat, usable[usable]), places=places)
     except ConfigError:
         return None
-    return np.asarray(n_samples * sample_mass(law, flat, codes, far_tails=False).sum(axis=0))
+    return np.asarray(numbers.size * sample_mass(law, flat, codes, far_tails=False).sum(axis=0))
 
 
 def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:

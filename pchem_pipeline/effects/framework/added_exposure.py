@@ -66,7 +66,7 @@ def added_exposures(
     for effect in effects:
         # effects may come from other packages: whatever they raise is told with their name
         try:
-            added = effect.added_exposure(frames, numbers, maps)
+            added = _in_its_place(effect, frames, numbers, maps)
         except Exception as error:
             raise ConfigError(
                 f"model.effects: {effect.tag} ({type(effect).__module__}) cannot tell what it adds to the "
@@ -75,3 +75,24 @@ def added_exposures(
         if added is not None:
             found = added if found is None else found.combined_with(added)
     return found
+
+
+def _in_its_place(
+    effect: Effect,
+    frames: NDArray[np.unsignedinteger],
+    numbers: NDArray[np.int64],
+    maps: PixelMaps,
+) -> AddedExposure | None:
+    """Return what an effect adds inside its region, found in its frames; nothing in the others."""
+    when = np.ones(numbers.size, np.bool_) if effect.when is None else effect.when.frames(numbers)
+    added = effect.added_exposure(frames if when.all() else frames[when], numbers[when], maps)
+    if added is None or effect.everywhere:
+        return added
+    rows, columns = maps.bias.shape
+    inside = np.ones((rows, columns), np.bool_)
+    if effect.region is not None:
+        inside = effect.region.mask((rows, columns))
+    share = when.mean()
+    none = np.zeros((1, *inside.shape))
+    weight = np.concatenate([none + 1.0 - share * inside, share * np.where(inside, added.weight, 0.0)])
+    return AddedExposure(np.concatenate([none, np.where(inside, added.exposure_e, 0.0)]), weight)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -16,7 +18,7 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["model_words", "pixel_maps", "sample_law"]
+__all__ = ["PixelPlaces", "effect_words", "model_words", "pixel_maps", "sample_law"]
 
 
 def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.bool_]) -> PixelMaps:
@@ -32,33 +34,127 @@ def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.boo
     return PixelMaps(exposure, gain, bias, sigma, known)
 
 
-def sample_law(effects: Sequence[Effect], maps: PixelMaps, added: AddedExposure | None = None) -> SampleLaw:
+@dataclass(frozen=True)
+class PixelPlaces:
+    """Where pixels lie on the sensor, and which frames they were seen in.
+
+    Attributes:
+        rows, columns: of each pixel on the sensor, shape (n,).
+        shape: rows and columns of the sensor.
+        frames: numbers of the frames in the run, shape (frame,); none where they have no order.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    shape: tuple[int, int]
+    frames: NDArray[np.int64]
+
+    @classmethod
+    def of_block(
+        cls, block: tuple[slice, slice] | None, shape: tuple[int, int], frames: NDArray[np.int64]
+    ) -> PixelPlaces:
+        """Return those of a block of the sensor, row by row; None: all of it."""
+        block = block or (slice(None), slice(None))
+        y, x = (np.arange(size)[part] for size, part in zip(shape, block, strict=True))
+        rows, columns = np.meshgrid(y, x, indexing="ij")
+        return cls(rows.ravel(), columns.ravel(), shape, frames)
+
+    def of(self, pixels: NDArray[np.bool_] | NDArray[np.intp]) -> PixelPlaces:
+        """Return those of some of the pixels."""
+        return replace(self, rows=self.rows[pixels], columns=self.columns[pixels])
+
+    def inside(self, effect: Effect) -> NDArray[np.bool_]:
+        """Return which pixels an effect acts on, shape (n,)."""
+        if effect.region is None:
+            return np.ones(self.rows.size, np.bool_)
+        return np.asarray(effect.region.mask(self.shape)[self.rows, self.columns])
+
+    def share(self, effect: Effect) -> float:
+        """Return the share of the frames in which an effect acts."""
+        if effect.when is None:
+            return 1.0
+        if not self.frames.size:
+            raise ValueError("these samples have no order in time; leave out `when`")
+        return effect.when.share(self.frames)
+
+
+def sample_law(
+    effects: Sequence[Effect],
+    maps: PixelMaps,
+    added: AddedExposure | None = None,
+    places: PixelPlaces | None = None,
+) -> SampleLaw:
     """Return the law of the pixels' samples with all effects, composed in their order.
+
+    An effect with a region changes the law of its pixels only; one that acts in some of the frames makes it a
+    mixture, see :meth:`~pchem_pipeline.model.law.sample_law.SampleLaw.mixed_with`.
 
     Args:
         effects: of the run's model.
         maps: what is known of the n pixels before, each (n,).
         added: exposure that effects add to these pixels, (j, n) each or of that many pixels; None: nothing.
+        places: of these pixels; None: not known, which effects with a place or a time need.
 
     Raises:
         ConfigError: if an effect cannot say what it does to these pixels; it is named.
     """
-    model = SampleLaw()
+    n = maps.bias.size
+    groups = [(np.arange(n), SampleLaw())]
     for effect in effects:
         # effects may come from other packages: whatever they raise is told with their name
         try:
-            model = effect.sample_law(model, maps)
+            groups = [part for group in groups for part in _with_effect(effect, *group, maps, places)]
         except Exception as error:
             raise ConfigError(
-                f"model.effects: {effect.tag} ({type(effect).__module__}) cannot be fitted with: "
+                f"model.effects: {effect_words(effect)} ({type(effect).__module__}) cannot be fitted with: "
                 f"{type(error).__name__}: {error}; remove it from model.effects"
             ) from error
+    model = groups[0][1] if len(groups) == 1 else SampleLaw.joined(groups, n)
     if added is not None:
         exposure, weight = added.flat()
         model = model.with_added_exposure(exposure.T, weight.T)
     return model
 
 
+def _with_effect(
+    effect: Effect,
+    pixels: NDArray[np.intp],
+    law: SampleLaw,
+    maps: PixelMaps,
+    places: PixelPlaces | None,
+) -> list[tuple[NDArray[np.intp], SampleLaw]]:
+    """Return groups of pixels with their laws: of one group, those on which an effect acts and the others."""
+    if effect.everywhere:
+        return [(pixels, effect.sample_law(law, _some(maps, pixels)))]
+    if places is None:
+        raise ValueError("where and when these samples were taken is not known")
+    inside = places.inside(effect)[pixels]
+    share = places.share(effect)
+    if share == 0.0 or not inside.any():
+        return [(pixels, law)]
+    within, outside = pixels[inside], pixels[~inside]
+    own, near = law.of(inside), _some(maps, within)
+    changed = effect.sample_law(own, near)
+    if share < 1.0:
+        noise = np.nan_to_num(near.read_noise_dn**2 - QUANTISATION_VARIANCE, nan=1.0)
+        step = np.nan_to_num(1.0 / near.conversion_gain, nan=1.0)
+        changed = own.mixed_with(changed, share, noise, step)
+    return [(within, changed), *([(outside, law.of(~inside))] if outside.size else [])]
+
+
+def _some(maps: PixelMaps, pixels: NDArray[np.intp]) -> PixelMaps:
+    """Return the parameters of some pixels."""
+    if pixels.size == maps.bias.size:
+        return maps
+    return PixelMaps(*(getattr(maps, each.name)[pixels] for each in fields(PixelMaps)))
+
+
+def effect_words(effect: Effect) -> str:
+    """Return an effect in words, for example ``row_noise in columns 120 to 159, frames 0 to 99``."""
+    places = [place.words() for place in (effect.region, effect.when) if place is not None]
+    return f"{effect.tag} in {', '.join(places)}" if places else effect.tag
+
+
 def model_words(effects: Sequence[Effect]) -> str:
     """Return the model in words, for example ``PCD + row_noise + rts_noise``."""
-    return " + ".join(["PCD", *(effect.tag for effect in effects)])
+    return " + ".join(["PCD", *map(effect_words, effects)])

@@ -16,6 +16,11 @@ numbers keyed on position, so that the simulated frames do not depend on how the
 
 Halos and histories of several effects add up.
 
+Any effect may have a place and a time (:attr:`~Effect.region`, :attr:`~Effect.when`): it is then applied as
+ever, and what it makes of the samples is kept only there. No effect has to know of it, nor one of another
+package. Several entries of one effect in different regions have strengths and random numbers of their own: so
+are taps described that differ.
+
 The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
 :attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
 (:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.sample_law`), so that the
@@ -29,9 +34,12 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.plane import Plane
+from pchem_pipeline.effects.framework.region import Region, When
 
 if TYPE_CHECKING:
     import numpy as np
@@ -77,6 +85,24 @@ class Effect(Section):
     separate: ClassVar[Mapping[str, str]] = {}
     erratic: ClassVar[bool] = False
     untestable: ClassVar[str] = ""
+    region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
+    when: When | None = Field(default=None, description="in which frames it acts; null: in all")
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write place and time only where there are any."""
+        found: dict[str, Any] = handler(self)
+        place = {name: found.pop(name, None) for name in ("region", "when")}
+        return found | {name: value for name, value in place.items() if value is not None}
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it acts on all pixels, in all frames."""
+        return self.region is None and self.when is None
+
+    def at_place(self, region: Region | None, when: When | None = None) -> Self:
+        """Return a copy with another place and time."""
+        return self.model_copy(update={"region": region, "when": when})
 
     @abstractmethod
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:

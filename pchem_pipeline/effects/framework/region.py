@@ -21,10 +21,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
     Field,
@@ -35,12 +33,14 @@ from pydantic import (
     model_validator,
 )
 
-from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["GRAMMAR", "Region", "Span", "Taps", "When", "overlap", "parse_place"]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-BoolArray = NDArray[np.bool_]
+__all__ = ["GRAMMAR", "Region", "Span", "Taps", "When", "parse_place"]
+
 Quadrant = Literal["top left", "top right", "bottom left", "bottom right"]
 
 #: The syntax of a place and a time in one line, for messages.
@@ -48,8 +48,6 @@ GRAMMAR = (
     "rows=A:B, columns=A:B, taps=WIDTH/NUMBER, every=N/PHASE, quadrant=top-left, frames=A:B, frames=A|B|C, "
     "period=N/PHASE, joined by commas (A:B ends before B; columns=40:50 are 40 to 49)"
 )
-# a set of pixels longer than that is no place that anybody could read; it would not fit a YAML either
-_MOST_RUNS = 20_000
 _FEW = 6  # numbers that are listed in words
 
 
@@ -118,11 +116,6 @@ class Taps(_Place):
             raise ValueError("groups of one column without a period; give width, or every")
         return self
 
-    def lines(self, numbers: NDArray[np.int64]) -> BoolArray:
-        """Return which of these columns (rows) belong to the groups, shape of ``numbers``."""
-        group = (numbers - self.first) // self.width
-        return np.isin(group if self.every is None else group % self.every, self.which)
-
     def words(self) -> str:
         """Return them in words: ``columns of tap 3 (40 each)``, ``every 8th column from 5``."""
         which = _listed(self.which)
@@ -160,7 +153,9 @@ class Region(_Place):
         rest = {name: each for name, each in value.items() if name != "mask"}
         if rest.get("pixels"):
             raise ValueError("mask and pixels together; give one of them")
-        return {**rest, "pixels": _runs(_mask_file(Path(folder or ".") / str(value["mask"])))}
+        from pchem_pipeline.effects.framework.pixel_sets import mask_file, runs_of
+
+        return {**rest, "pixels": runs_of(mask_file(Path(folder or ".") / str(value["mask"])))}
 
     @field_validator("rows", "columns")
     @classmethod
@@ -176,24 +171,17 @@ class Region(_Place):
         return self
 
     @classmethod
-    def of_mask(cls, mask: BoolArray) -> Region:
-        """Return the region of a map of pixels, in the simplest form that it has: ranges, else single pixels.
+    def of_mask(cls, mask: NDArray[np.bool_]) -> Region:
+        """Return the region of a map of pixels, in its simplest form: ranges, else single pixels.
 
         Raises:
             ConfigError: it holds no pixel, or too many single ones.
         """
-        rows, columns = np.asarray(mask.any(axis=1)), np.asarray(mask.any(axis=0))
-        if not rows.any():
-            raise ConfigError("a region without a pixel; leave it out")
-        if np.array_equal(mask, rows[:, None] & columns):
-            # all rows, or all columns, go without saying, but not both
-            return cls(
-                rows=() if rows.all() and not columns.all() else _spans_of(rows),
-                columns=() if columns.all() else _spans_of(columns),
-            )
-        return cls(pixels=_runs(mask))
+        from pchem_pipeline.effects.framework.pixel_sets import simplest_region
 
-    def mask(self, shape: tuple[int, int], rows: NDArray[np.int64] | None = None) -> BoolArray:
+        return cls.model_validate(simplest_region(mask))
+
+    def mask(self, shape: tuple[int, int], rows: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
         """Return which pixels of a sensor, or of a band of its rows, lie in the region, (y, x).
 
         Args:
@@ -201,43 +189,16 @@ class Region(_Place):
             rows: numbers of the band's rows; None: all.
 
         Raises:
-            ConfigError: the region has no pixel on such a sensor, or reaches beyond it.
+            ConfigError: it reaches beyond the sensor.
         """
-        self._check(shape)
-        numbers = np.arange(shape[0]) if rows is None else np.asarray(rows)
-        inside = self._lines("rows", numbers)[:, None] & self._lines("columns", np.arange(shape[1]))
-        if self.quadrant is not None:
-            upper = numbers < shape[0] // 2
-            left = np.arange(shape[1]) < shape[1] // 2
-            inside &= (upper == self.quadrant.startswith("top"))[:, None]
-            inside &= left == self.quadrant.endswith("left")
-        if self.pixels:
-            listed = np.zeros(shape, np.bool_)
-            for row, first, last in self.pixels:
-                listed[row, first:last] = True
-            inside &= listed[numbers]
-        return np.asarray(inside)
+        from pchem_pipeline.effects.framework.pixel_sets import region_mask
 
-    def _lines(self, along: Literal["rows", "columns"], numbers: NDArray[np.int64]) -> BoolArray:
-        inside = _within(getattr(self, along), numbers)
-        if self.taps is not None and self.taps.along == along:
-            inside &= self.taps.lines(numbers)
-        return inside
-
-    def _check(self, shape: tuple[int, int]) -> None:
-        """Refuse what lies beyond the sensor."""
-        ends = {
-            "rows": [last for _, last in self.rows] + [row + 1 for row, _, _ in self.pixels],
-            "columns": [last for _, last in self.columns] + [last for _, _, last in self.pixels],
-        }
-        for (name, beyond), size in zip(ends.items(), shape, strict=True):
-            if beyond and max(beyond) > size:
-                raise ConfigError(
-                    f"region: {self.words()}: the sensor has {size} {name}, from 0; correct the region"
-                )
+        return region_mask(self, shape, rows)
 
     def overlap(self, other: Region, shape: tuple[int, int]) -> float:
         """Return the pixels of both over those of either (Jaccard's index), 0 to 1."""
+        from pchem_pipeline.effects.framework.pixel_sets import overlap
+
         return overlap(self.mask(shape), other.mask(shape))
 
     def words(self) -> str:
@@ -304,14 +265,11 @@ class When(_Place):
             del found["phase"], found["length"]
         return found
 
-    def frames(self, numbers: NDArray[np.int64]) -> BoolArray:
+    def frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which of these frames are meant, shape of ``numbers``; those before the run never are."""
-        inside = _within(self.range, numbers) & (numbers >= 0)
-        if self.every is not None:
-            inside &= (numbers - self.phase) % self.every < self.length
-        if self.single:
-            inside &= np.isin(numbers, self.single)
-        return inside
+        from pchem_pipeline.effects.framework.pixel_sets import frames_of
+
+        return frames_of(self, numbers)
 
     def share(self, numbers: NDArray[np.int64]) -> float:
         """Return the share of these frames that are meant."""
@@ -319,6 +277,10 @@ class When(_Place):
 
     def overlap(self, other: When, n_frames: int) -> float:
         """Return the frames of both over those of either (Jaccard's index), 0 to 1."""
+        import numpy as np
+
+        from pchem_pipeline.effects.framework.pixel_sets import overlap
+
         numbers = np.arange(n_frames)
         return overlap(self.frames(numbers), other.frames(numbers))
 
@@ -340,12 +302,6 @@ class When(_Place):
         parts += [f"period={self.every}/{self.phase}"] if self.every is not None else []
         parts += [f"frames={'|'.join(map(str, self.single))}"] if self.single else []
         return ",".join(parts)
-
-
-def overlap(one: BoolArray, other: BoolArray) -> float:
-    """Return the elements of both sets over those of either (Jaccard's index), 0 to 1; of empty ones 0."""
-    either = int((one | other).sum())
-    return float((one & other).sum() / either) if either else 0.0
 
 
 def parse_place(text: str) -> tuple[Region | None, When | None]:
@@ -395,53 +351,6 @@ _KEYS = {
     "frames": _frames,
     "period": _period,
 }
-
-
-def _within(spans: tuple[Span, ...], numbers: NDArray[np.int64]) -> BoolArray:
-    """Return which numbers lie in some range; all where there is no range."""
-    inside = np.full(numbers.shape, not spans)
-    for first, last in spans:
-        inside |= (numbers >= first) & (numbers < last)
-    return inside
-
-
-def _mask_file(path: Path) -> BoolArray:
-    """Return the map (y, x) in a file of numpy.
-
-    Raises:
-        ValueError: there is none, or it is no map of truth values.
-    """
-    try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            if isinstance(content, np.lib.npyio.NpzFile):
-                if len(content.files) != 1:
-                    raise ValueError(f"it holds {len(content.files)} arrays; save one")
-                content = content[content.files[0]]
-    except (OSError, ValueError, EOFError) as error:
-        raise ValueError(
-            f"mask {path}: cannot be read ({error}); save a bool array (y, x) with numpy"
-        ) from None
-    if content.ndim != 2 or content.dtype != np.bool_:
-        raise ValueError(f"mask {path}: {content.dtype}{content.shape}; save a bool array (y, x)")
-    return np.asarray(content)
-
-
-def _runs(mask: BoolArray) -> tuple[tuple[int, int, int], ...]:
-    """Return the runs of pixels of a map: row, first column, behind the last."""
-    edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, first), last = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
-    if row.size > _MOST_RUNS:
-        raise ValueError(
-            f"the mask has {row.size} runs of pixels, more than {_MOST_RUNS}: take a simpler one"
-        )
-    return tuple(zip(row.tolist(), first.tolist(), last.tolist(), strict=True))
-
-
-def _spans_of(lines: BoolArray) -> tuple[Span, ...]:
-    """Return the ranges of lines that are True."""
-    edges = np.flatnonzero(np.diff(np.pad(lines, 1).astype(np.int8)))
-    return tuple((int(first), int(last)) for first, last in edges.reshape(-1, 2))
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -16,7 +16,7 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BeforeValidator, SerializeAsAny
+from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 
 import pchem_pipeline.effects
 from pchem_pipeline.base.errors import ConfigError
@@ -88,7 +88,7 @@ def _import_own() -> None:
             importlib.import_module(module.name)
 
 
-def _as_effect(entry: Any) -> Effect:
+def _as_effect(entry: Any, info: ValidationInfo) -> Effect:
     if isinstance(entry, Effect):
         return entry
     if isinstance(entry, str):
@@ -99,7 +99,7 @@ def _as_effect(entry: Any) -> Effect:
         found = effect_class(entry["tag"])
     except ConfigError as error:
         raise ValueError(str(error)) from None
-    return found.model_validate(dict(entry))
+    return found.model_validate(dict(entry), context=info.context)
 
 
 #: A list of effects in a YAML section: each is looked up by its tag and checked by its own class.

@@ -199,7 +199,7 @@ class _Batch:
         if near is not None and near.shape[1] > size:
             gaps = np.where(np.isnan(near[:, size]), np.inf, near[:, size])
         known = np.empty((0, size)) if near is None else np.ascontiguousarray(near[:, :size], np.float64)
-        starts = Starts(known, gaps, np.empty(0))
+        starts = Starts(known, gaps, np.empty(0), np.ones(1, np.bool_))
         laws = [SampleLaw()] * self.n_samples
         return self._result(self._fit(self.given, laws, starts, self._limits(None)), cells=False, adjust=True)
 
@@ -289,6 +289,7 @@ class _Batch:
             np.ascontiguousarray(near[some], np.float64),
             np.ascontiguousarray(gap, np.float64),
             np.array(own[0].free_satellites, np.float64),
+            np.ascontiguousarray(own[0].may_have_satellites),
         )
         limits = self._limits(own, warm=warm, scan=scan)
         adjust = all(each.neutral for each in own)
@@ -377,10 +378,11 @@ class _Batch:
             part = slice(self.given.places[j], self.given.places[j + 1])
             codes = self.given.origin[:, j, None] + np.arange(part.stop - part.start)
             beyond = np.zeros(codes.shape, np.bool_)
+            # of some pixels there may be no limit: NaN is below and above nothing
             if each.clip_low is not None:
-                beyond |= codes <= each.clip_low
+                beyond |= codes <= np.reshape(each.clip_low, (-1, 1))
             if each.clip_high is not None:
-                beyond |= codes >= each.clip_high
+                beyond |= codes >= np.reshape(each.clip_high, (-1, 1))
             found |= (beyond & (self.given.counts[:, part] > 0)).any(axis=1)
         return found
 
@@ -529,5 +531,5 @@ def _count_near(given: Histograms) -> None:
 def _reshapes(law: SampleLaw) -> bool:
     """Tell whether a law changes more than the width of peaks: the plain fit may then be an electron off."""
     one_peak = law.satellite_weights.shape[1] == 1
-    one_law = law.law == "poisson" and law.exposure_weights.size == 1
-    return not (one_peak and one_law and law.curvature == 0.0 and law.variance_per_electron2 == 0.0)
+    one_law = bool(np.all(np.asarray(law.law) == "poisson")) and law.exposure_weights.shape[-1] == 1
+    return not (one_peak and one_law and not np.any(law.curvature) and not np.any(law.variance_per_electron2))

@@ -71,11 +71,13 @@ class Starts(NamedTuple):
             (0, J + 3).
         gaps: nats of that answer above its runner-up, shape (n,).
         amplitudes: of free satellites to try, e-.
+        looked: pixels in which they are tried, shape (n,) or (1,).
     """
 
     parameters: FloatArray
     gaps: FloatArray
     amplitudes: FloatArray
+    looked: NDArray[np.bool_]
 
 
 class Answers(NamedTuple):
@@ -188,7 +190,7 @@ def make_room(given: Histograms, law: Law) -> Pixel:
     for j in range(given.dark.size):
         most = max(most, given.places[j + 1] - given.places[j])
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
-    n_exposures = max(law.exposures.shape[2], law.added.shape[3])
+    n_exposures = max(law.exposures.shape[3], law.added.shape[3])
     room: Pixel = make_pixel(given.dark, most, n_peaks, n_exposures, law.table)
     return room
 
@@ -244,9 +246,9 @@ def fit_tile(
         if starts.parameters.shape[0] > 0:
             theta_of(starts.parameters[index], pixel, limits, near)
             gap = starts.gaps[index]
-        status, used, words[FREEDOM] = search(
-            pixel, tools, law, index, starts.amplitudes, near, gap, best, out
-        )
+        tried = starts.looked[index if starts.looked.size > 1 else 0]
+        amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
+        status, used, words[FREEDOM] = search(pixel, tools, law, index, amplitudes, near, gap, best, out)
         words[EVALUATIONS] += used
         if best[n + STEP] > 0.0:
             parameters, covariance = answers.parameters[index], answers.covariance[index]

@@ -94,13 +94,13 @@ class Law(NamedTuple):
     """The laws of J samples as the loops take them, see :mod:`pchem_pipeline.model.law.sample_law`.
 
     Attributes:
-        numbers: numbers of each sample, columns ``COUNT_LAW`` ... ``EDGE_FIRST`` of a pixel's facts.
+        numbers: columns ``COUNT_LAW`` ... ``EDGE_FIRST`` of a pixel's facts, shape (J, 1 or n, 10).
         own: level scale, level shift (e-), extra variance (e-^2, DN^2), shape (J, 1 or n, 4).
         peaks: weight, shifts (e-, DN, sigma) and width of the noise's levels, shape (J, 1 or n, 5, enough).
         n_peaks: levels in use, shape (J,).
-        exposures: weights and factors of the exposures, shape (J, 2, enough).
+        exposures: weights and factors of the exposures, shape (J, 1 or n, 2, enough).
         added: weights and values (e-) of added exposures, shape (J, 1 or n, 2, enough).
-        edge_shift: shifts of the code edges from ``EDGE_FIRST`` on, DN, shape (J, enough).
+        edge_shift: shifts of the code edges from ``EDGE_FIRST`` on, DN, shape (J, 1 or n, enough).
         pattern: shift, in units of the amplitude, and weight of free satellites, shape (enough, 2).
         table: of the normal law.
     """
@@ -231,13 +231,15 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     """
     for j in range(pixel.facts.shape[0]):
         facts, edges = pixel.facts[j], pixel.bins[j, EDGE]
-        for i in range(law.numbers.shape[1]):
-            facts[COUNT_LAW + i] = law.numbers[j, i]
+        row = _row(law.numbers, index)
+        for i in range(law.numbers.shape[2]):
+            facts[COUNT_LAW + i] = law.numbers[j, row, i]
         for i in range(4):
             facts[LEVEL_SCALE + i] = law.own[j, _row(law.own, index), i]
-        for i in range(law.exposures.shape[2]):
-            pixel.mixtures[j, EXPOSURE_WEIGHT, i] = law.exposures[j, 0, i]
-            pixel.mixtures[j, EXPOSURE_FACTOR, i] = law.exposures[j, 1, i]
+        row = _row(law.exposures, index)
+        for i in range(law.exposures.shape[3]):
+            pixel.mixtures[j, EXPOSURE_WEIGHT, i] = law.exposures[j, row, 0, i]
+            pixel.mixtures[j, EXPOSURE_FACTOR, i] = law.exposures[j, row, 1, i]
         for i in range(law.added.shape[3]):
             pixel.mixtures[j, ADDED_WEIGHT, i] = law.added[j, _row(law.added, index), 0, i]
             pixel.mixtures[j, ADDED_EXPOSURE, i] = law.added[j, _row(law.added, index), 1, i]
@@ -245,10 +247,11 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
         code = pixel.centre + int(facts[CENTRE] + first)
         margin = 0.0
         bottom, top = -1, n_bins + 1
-        n_shifts, edge_first = law.edge_shift.shape[1], int(facts[EDGE_FIRST])
+        n_shifts, edge_first = law.edge_shift.shape[2], int(facts[EDGE_FIRST])
+        row = _row(law.edge_shift, index)
         for i in range(n_bins + 1):
             place = code + i - edge_first
-            shift = law.edge_shift[j, place] if 0 <= place < n_shifts else 0.0
+            shift = law.edge_shift[j, row, place] if 0 <= place < n_shifts else 0.0
             margin = max(margin, abs(shift))
             edges[i] = first + i - 0.5 + shift
             if code + i <= facts[CLIP_LOW]:

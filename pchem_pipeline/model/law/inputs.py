@@ -122,24 +122,32 @@ def _pack_one(model: SampleLaw, n: int) -> _Part:
 
     peaks = per_pixel(*(f"satellite_{name}" for name in _PEAK_FIELDS))
     added = per_pixel("added_weights", "added_exposure")
-    for weights in (model.exposure_weights[None], added[:, 0], peaks[:, 0]):
+    exposures = np.stack([np.atleast_2d(v) for v in (model.exposure_weights, model.exposure_factors)], axis=1)
+    for weights in (exposures[:, 0], added[:, 0], peaks[:, 0]):
         if not np.allclose(weights.sum(axis=1), 1.0, rtol=0, atol=1e-6):
             raise ValueError("the weights of a mixture do not sum to 1")
+    law = model.law
     numbers = (
-        _LAWS[model.law],
+        _LAWS[law] if isinstance(law, str) else np.array([_LAWS[str(each)] for each in law]),  # type: ignore[index]
         model.dispersion,
         model.curvature,
         model.variance_per_electron,
         model.variance_per_electron2,
-        -_NO_LIMIT if model.clip_low is None else model.clip_low,
-        _NO_LIMIT if model.clip_high is None else model.clip_high,
+        _limit(model.clip_low, -_NO_LIMIT),
+        _limit(model.clip_high, _NO_LIMIT),
         model.outlier_share,
         model.outlier_share / model.outlier_codes,
         model.edge_first,
     )
+    rows = [np.atleast_1d(np.asarray(each, np.float64)) for each in numbers]
     own = per_pixel("level_scale", "level_shift_e", "extra_variance_e2", "extra_variance_dn2")
-    exposures = np.stack([model.exposure_weights, model.exposure_factors])
-    return _Part(np.array(numbers, np.float64), own, peaks, exposures, added, np.asarray(model.edge_shift))
+    edges = np.atleast_2d(np.asarray(model.edge_shift, np.float64))
+    return _Part(np.stack(np.broadcast_arrays(*rows), axis=1), own, peaks, exposures, added, edges)
+
+
+def _limit(value: float | FloatArray | None, none: float) -> FloatArray | float:
+    """Return a limit of the scale, ``none`` where there is none."""
+    return none if value is None else np.where(np.isnan(value), none, value)
 
 
 def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
@@ -148,7 +156,7 @@ def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
     most = tuple(max(part.shape[axis] for part in parts) for axis in range(rank))
     found = np.zeros((len(parts), *most))
     for own, part in zip(found, parts, strict=True):
-        own[..., : part.shape[-1]] = part
+        own[..., : part.shape[-1]] = part  # one row is of all pixels
     return found
 
 

@@ -42,7 +42,7 @@ _LEAST_VARIANCE = 1e-6  # DN^2
 def _make_room(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
     """Return room for one sample of so many bins."""
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
-    n_exposures = max(law.exposures.shape[2], law.added.shape[3])
+    n_exposures = max(law.exposures.shape[3], law.added.shape[3])
     pixel = make_pixel(np.zeros(1, np.bool_), n_bins, n_peaks, n_exposures, law.table)
     return pixel, make_scratch(np.int64(1), n_bins, np.bool_(True))
 

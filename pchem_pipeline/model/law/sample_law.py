@@ -20,6 +20,8 @@ __all__ = ["CountLaw", "SampleLaw"]
 
 FloatArray = NDArray[np.float64]
 CountLaw = Literal["poisson", "negative_binomial", "borel"]
+#: A number of all pixels, or one of each, shape (n,).
+Number = float | FloatArray
 
 
 def _one() -> FloatArray:
@@ -41,6 +43,9 @@ class SampleLaw:
     sigma^2 - 1/12 is the analog part in DN^2 (cells are integrated exactly, so quantisation adds itself), and
     code edges ``e_x = x - 1/2 + edge_shift(x)``; what lies beyond ``clip_low``, ``clip_high`` counts there. A
     share of the samples may be outliers, anywhere.
+
+    Where below no shape is given there is one number for all pixels, unless the law was :meth:`joined` from
+    laws of groups: then there is a row for each.
 
     Attributes:
         law: law of the electron number; its mean is H whatever the law.
@@ -68,20 +73,21 @@ class SampleLaw:
         free_satellite_pattern: (shift in units of A, weight) of the levels beside the one at 0, which keeps
             1 - q; the weights sum to 1 and q multiplies them. The default is a trap read by correlated double
             sampling: -A, 0, +A with q/2, 1 - q, q/2.
+        may_have_satellites: in which pixels they are looked for, shape (n,) or (1,).
         free_satellite_alarm: about the probability that a pixel without such levels is given some.
     """
 
-    law: CountLaw = "poisson"
-    dispersion: float = 0.0
+    law: CountLaw | NDArray[np.str_] = "poisson"
+    dispersion: Number = 0.0
     exposure_weights: FloatArray = field(default_factory=_one)
     exposure_factors: FloatArray = field(default_factory=_one)
     added_exposure: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     added_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     level_scale: FloatArray = field(default_factory=_one)
     level_shift_e: FloatArray = field(default_factory=_zero)
-    curvature: float = 0.0
-    variance_per_electron: float = 0.0
-    variance_per_electron2: float = 0.0
+    curvature: Number = 0.0
+    variance_per_electron: Number = 0.0
+    variance_per_electron2: Number = 0.0
     extra_variance_e2: FloatArray = field(default_factory=_zero)
     extra_variance_dn2: FloatArray = field(default_factory=_zero)
     satellite_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
@@ -91,11 +97,12 @@ class SampleLaw:
     satellite_width: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     edge_first: int = 0
     edge_shift: FloatArray = field(default_factory=lambda: np.zeros(0))
-    clip_low: int | None = None
-    clip_high: int | None = None
-    outlier_share: float = 0.0
-    outlier_codes: int = 65536
+    clip_low: int | FloatArray | None = None
+    clip_high: int | FloatArray | None = None
+    outlier_share: Number = 0.0
+    outlier_codes: Number = 65536
     free_satellites: tuple[float, ...] = ()
+    may_have_satellites: NDArray[np.bool_] = field(default_factory=lambda: np.ones(1, np.bool_))
     free_satellite_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
     free_satellite_alarm: float = 1e-4
 
@@ -107,10 +114,76 @@ class SampleLaw:
 
     def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
-        return replace(
-            self,
-            **{name: values[pixels] for name in _PER_PIXEL if (values := getattr(self, name)).shape[0] != 1},
-        )
+        rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *self._differing())}
+        return replace(self, **{name: row[pixels] for name, row in rows.items() if row.shape[0] != 1})
+
+    def _differing(self) -> tuple[str, ...]:
+        """Return the fields that have one number for all pixels in other laws, and here a row of each."""
+        own = tuple(name for name in _NUMBERS if isinstance(getattr(self, name), np.ndarray))
+        return own + tuple(name for name in (*_TABLES, "edge_shift") if getattr(self, name).ndim == 2)
+
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> SampleLaw:
+        """Return the law of n pixels of which groups have laws of their own.
+
+        Args:
+            parts: the pixels of a group, and their law; each pixel is in one group.
+            n: number of pixels.
+
+        Raises:
+            ValueError: groups look for different free satellites.
+        """
+        laws = [law for _, law in parts]
+        found: dict[str, Any] = {}
+        for name in (*_PER_PIXEL[:-1], *_NUMBERS, *_TABLES):  # of satellites below
+            values = [np.asarray(_plain(name, getattr(law, name))) for law in laws]
+            of_all = name not in _PER_PIXEL or all(v.shape[0] == 1 for v in values)
+            if of_all and all(_same(v, values[0]) for v in values):
+                found[name] = getattr(laws[0], name)
+                continue
+            found[name] = _rows(name, [(pixels, v) for (pixels, _), v in zip(parts, values, strict=True)], n)
+        found |= _joined_edges(parts, n)
+        return cls(**found, **_joined_satellites(laws, [pixels for pixels, _ in parts], n))
+
+    def mixed_with(
+        self, other: SampleLaw, share: float, noise_dn2: FloatArray, step_dn: FloatArray
+    ) -> SampleLaw:
+        """Return the law of pixels of which a share of the samples follows another law, the others this one.
+
+        Noise and exposures become mixtures, which is exact; so are outliers. Of all other numbers the mean is
+        taken: right to first order in what the laws differ by, which holds for what is weak.
+
+        Args:
+            other: the law of the share; both are of the same n pixels.
+            share: 0 to 1.
+            noise_dn2: analog noise sigma_R^2 of the pixels, DN^2, shape (n,).
+            step_dn: 1/g, DN per electron, shape (n,).
+
+        Raises:
+            ValueError: the laws differ in their limits of the scale.
+        """
+        if (self.clip_low, self.clip_high) != (other.clip_low, other.clip_high):
+            raise ValueError("a limit of the scale in some frames only has no law; leave these frames out")
+        more = other.extra_variance_dn2 - self.extra_variance_dn2
+        more = more + (other.extra_variance_e2 - self.extra_variance_e2) * step_dn**2
+        found: dict[str, Any] = {"law": self.law if other.law == "poisson" else other.law}
+        for name in _MEANS:
+            found[name] = (1.0 - share) * getattr(self, name) + share * getattr(other, name)
+        found |= _mixed_edges(self, other, share)
+        mine, theirs = _satellites(self), _satellites(other)
+        if (np.abs(more) > _NARROW * noise_dn2).any():
+            width = np.sqrt(np.maximum(1.0 + more / np.maximum(noise_dn2, 1e-9), 0.0))
+            theirs["satellite_width"] = theirs["satellite_width"] * width[:, None]
+            found["extra_variance_dn2"] = self.extra_variance_dn2
+            found["extra_variance_e2"] = self.extra_variance_e2
+        if any(not np.array_equal(mine[name], theirs[name]) for name in mine):
+            found |= _united(mine, theirs, share, "satellite_weights")
+        mine, theirs = _exposures(self), _exposures(other)
+        if any(not np.array_equal(mine[name], theirs[name]) for name in mine):
+            found |= _united(mine, theirs, share, "exposure_weights")
+        free = other if other.free_satellites else self
+        names = ("free_satellites", "free_satellite_pattern", "free_satellite_alarm", "may_have_satellites")
+        return replace(self, **found, **{name: getattr(free, name) for name in names})
 
     def with_counts(self, law: CountLaw, dispersion: float) -> SampleLaw:
         """Return a copy with another law of the electron number."""
@@ -265,7 +338,135 @@ _PER_PIXEL = (
     "satellite_shift_dn",
     "satellite_shift_sigma",
     "satellite_width",
+    "may_have_satellites",
 )
+
+
+#: Fields that have one number for all pixels, unless laws were joined.
+_NUMBERS = (
+    "law",
+    "dispersion",
+    "curvature",
+    "variance_per_electron",
+    "variance_per_electron2",
+    "clip_low",
+    "clip_high",
+    "outlier_share",
+    "outlier_codes",
+)
+#: Fields that have one row for all pixels, and no axis for them, unless laws were joined.
+_TABLES = ("exposure_weights", "exposure_factors")
+#: What rows are filled up with where one pixel has fewer components than another.
+_FILL = {"satellite_width": 1.0, "exposure_factors": 1.0}
+#: Numbers of which the mean over the frames is taken where these differ.
+_MEANS = (
+    "dispersion",
+    "curvature",
+    "variance_per_electron",
+    "variance_per_electron2",
+    "extra_variance_e2",
+    "extra_variance_dn2",
+    "level_scale",
+    "level_shift_e",
+    "outlier_share",
+)
+# variance in some of the frames, relative to the noise, above which it is more than a mean variance: the
+# fourth cumulant that this misses is then 1e-3 of the squared variance
+_NARROW = 0.02
+
+
+def _same(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Tell whether arrays are equal; no limit is the same as no limit."""
+    return one.dtype.kind == other.dtype.kind and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Return a limit of the scale as a number: NaN for none."""
+    return np.nan if value is None and name.startswith("clip") else value
+
+
+def _rows(name: str, parts: Sequence[tuple[NDArray[np.intp], NDArray[Any]]], n: int) -> NDArray[Any]:
+    """Return a row for each of n pixels from those of groups, as long as the longest."""
+    values = [each[None] if name in _TABLES and each.ndim == 1 else each for _, each in parts]
+    most = max((each.shape[1] for each in values if each.ndim == 2), default=None)
+    found = np.full((n,) if most is None else (n, most), _FILL.get(name, 0.0), np.float64)
+    if name == "law":
+        found = np.full(n, "negative_binomial")
+    for (pixels, _), each in zip(parts, values, strict=True):
+        if most is None:
+            found[pixels] = each
+        else:
+            found[pixels, : each.shape[1]] = each
+    return found
+
+
+def _joined_edges(parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> dict[str, Any]:
+    """Return the shifts of the code edges of groups of pixels, from one code on."""
+    laws = [law for _, law in parts]
+    first = laws[0]
+    if all(law.edge_first == first.edge_first and _same(law.edge_shift, first.edge_shift) for law in laws):
+        return {"edge_first": first.edge_first, "edge_shift": first.edge_shift}
+    some = [law for law in laws if law.edge_shift.size]
+    low = min(law.edge_first for law in some)
+    shifts = np.zeros((n, max(law.edge_first + law.edge_shift.size for law in some) - low))
+    for pixels, law in parts:
+        place = law.edge_first - low
+        if law.edge_shift.size:
+            shifts[pixels, place : place + law.edge_shift.size] = law.edge_shift
+    return {"edge_first": low, "edge_shift": shifts}
+
+
+def _joined_satellites(
+    laws: Sequence[SampleLaw], pixels: Sequence[NDArray[np.intp]], n: int
+) -> dict[str, Any]:
+    """Return which free satellites groups of pixels look for, and which pixels do."""
+    looking = [law for law in laws if law.free_satellites]
+    if not looking:
+        return {}
+    first = looking[0]
+    kinds = {(law.free_satellites, law.free_satellite_pattern) for law in looking}
+    if len(kinds) > 1:
+        raise ValueError("two kinds of free satellites in one model; keep one of the effects")
+    where = np.zeros(n, np.bool_)
+    for law, some in zip(laws, pixels, strict=True):
+        where[some] = bool(law.free_satellites)
+    return {
+        "free_satellites": first.free_satellites,
+        "free_satellite_pattern": first.free_satellite_pattern,
+        "free_satellite_alarm": first.free_satellite_alarm,
+        "may_have_satellites": where,
+    }
+
+
+def _mixed_edges(one: SampleLaw, other: SampleLaw, share: float) -> dict[str, Any]:
+    """Return the mean shifts of the code edges of two laws."""
+    mine = replace(SampleLaw(), edge_first=one.edge_first, edge_shift=(1.0 - share) * one.edge_shift)
+    both = mine.with_edges(other.edge_first, share * other.edge_shift) if other.edge_shift.size else mine
+    return {"edge_first": both.edge_first, "edge_shift": both.edge_shift}
+
+
+def _satellites(law: SampleLaw) -> dict[str, FloatArray]:
+    return {name: getattr(law, name) for name in _PER_PIXEL if name.startswith("satellite")}
+
+
+def _exposures(law: SampleLaw) -> dict[str, FloatArray]:
+    return {name: getattr(law, name) for name in _TABLES}
+
+
+def _united(
+    mine: dict[str, FloatArray], theirs: dict[str, FloatArray], share: float, weights: str
+) -> dict[str, Any]:
+    """Return the components of both mixtures, weighted by their shares."""
+    mine = mine | {weights: (1.0 - share) * mine[weights]}
+    theirs = theirs | {weights: share * theirs[weights]}
+    found = {}
+    for name, own in mine.items():
+        other = theirs[name]
+        if own.ndim == 2:
+            rows = max(own.shape[0], other.shape[0])
+            own, other = (np.broadcast_to(each, (rows, each.shape[1])) for each in (own, other))
+        found[name] = np.concatenate([own, other], axis=-1)
+    return found
 
 
 def _values(model: SampleLaw) -> dict[str, Any]:

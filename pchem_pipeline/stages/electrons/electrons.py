@@ -21,7 +21,12 @@ from pchem_pipeline.model.electrons.electrons import LARGEST_NUMBER, NO_NUMBER, 
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_added_exposure, fitted_effects
+from pchem_pipeline.stages.fit.fitted_model import (
+    deciding_maps,
+    fitted_added_exposure,
+    fitted_effects,
+    pixel_places,
+)
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import FrameSource
@@ -87,7 +92,7 @@ def _do_band(band: Band, *, store: Path, source: FrameSource, depth: int) -> dic
     maps = [opened.read(f"fit/{name}", (rows, slice(None))) for name in PARAMETERS]
     effects = fitted_effects(opened)
     added = fitted_added_exposure(opened, (rows, slice(None)))
-    parameters = deciding_maps(maps, effects, added)
+    parameters = deciding_maps(maps, effects, added, pixel_places(opened, (rows, slice(None))))
     with FrameStream(source, [(band.y0, band.y1)], depth) as stream:
         for start, (frames,) in stream:
             region = (slice(start, start + frames.shape[0]), rows, slice(None))

@@ -35,7 +35,12 @@ from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps, fitted_added_exposure, fitted_effects
+from pchem_pipeline.stages.fit.fitted_model import (
+    deciding_maps,
+    fitted_added_exposure,
+    fitted_effects,
+    pixel_places,
+)
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
@@ -267,7 +272,10 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
-    errors = _compare(job, band, deciding_maps(maps, job.effects, added)) if job.truth is not None else {}
+    places = pixel_places(store, rows)
+    errors = {}
+    if job.truth is not None:
+        errors = _compare(job, band, deciding_maps(maps, job.effects, added, places))
     for key in band.keys:
         number, tile = job.tiles[key]
         part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
@@ -282,6 +290,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             None if satellites is None else (satellites[0][part].ravel(), satellites[1][part].ravel()),
             None if covariance is None else covariance[part].reshape(n, 4, 4),
             None if added is None else added.of(part).flat(),
+            pixel_places(store, (slice(tile.y0, tile.y1), slice(tile.x0, tile.x1))),
         )
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_counts
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, tally
@@ -58,6 +58,7 @@ def ensemble_tile(
     satellites: tuple[FloatArray, FloatArray] | None = None,
     covariance: FloatArray | None = None,
     added: AddedExposure | None = None,
+    places: PixelPlaces | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return what some pixels add to the ensemble.
 
@@ -71,6 +72,7 @@ def ensemble_tile(
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
         covariance: of the maps, shape (n, 4, 4); None: not known.
         added: exposure that the effects add to the pixels, (j, n); None: nothing.
+        places: of the pixels; None: not known.
 
     Returns:
         A row of integers and a row of floats, in the places that ``axes`` gives.
@@ -79,7 +81,8 @@ def ensemble_tile(
     floats = np.zeros(list(axes.floats.values())[-1].stop)
     pixels, mask = PixelParameters.from_maps(maps)
     added = None if added is None else added.of(mask)
-    deciding = PixelParameters(*deciding_maps(pixels.columns(), effects, added))
+    places = None if places is None else places.of(mask)
+    deciding = PixelParameters(*deciding_maps(pixels.columns(), effects, added, places))
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
     chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
@@ -100,7 +103,8 @@ def ensemble_tile(
             if effects:
                 own = None if satellites is None else (satellites[0][mask][group], satellites[1][mask][group])
                 more = None if added is None else added.of(group)
-                _add_extended(part, own, int(n), axes, (effects, more), floats)
+                law = effects, more, None if places is None else places.of(group)
+                _add_extended(part, own, int(n), axes, law, floats)
     return integers, floats
 
 
@@ -109,13 +113,14 @@ def _add_extended(
     satellites: tuple[FloatArray, FloatArray] | None,
     n: int,
     axes: EnsembleAxes,
-    law: tuple[Sequence[Effect], AddedExposure | None],
+    law: tuple[Sequence[Effect], AddedExposure | None, PixelPlaces | None],
     floats: FloatArray,
 ) -> None:
     """Add what the extended law predicts of pixels that have the same number of samples."""
-    effects, added = law
+    effects, added, places = law
     maps = pixel_maps(pixels.columns(), np.ones(len(pixels), bool))
-    extended = extended_sums(pixels, satellites, sample_law(effects, maps, added), axes.dn, axes.nuced)
+    model = sample_law(effects, maps, added, places)
+    extended = extended_sums(pixels, satellites, model, axes.dn, axes.nuced)
     sums = extended.sums
     parts: dict[str, Any] = {
         "pcd": sums.raw,

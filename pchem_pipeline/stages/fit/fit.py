@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import PixelPlaces
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.excluding_codes import Interval
@@ -21,6 +22,7 @@ from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
 from pchem_pipeline.stages.fit.samples import fit_samples
 from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
@@ -42,6 +44,7 @@ def fit_tile(
     set_aside: Sequence[Interval] = (),
     start: NDArray[np.float64] | None = None,
     added: AddedExposure | None = None,
+    places: PixelPlaces | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the group ``fit`` of a tile, by name.
 
@@ -55,6 +58,7 @@ def fit_tile(
         set_aside: codes that the fit leaves out, e- on the comb of the plain fit.
         start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
         added: exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
+        places: of the pixels; None: not known.
     """
     counts = histogram["counts"]
     shape = counts.shape[:2]
@@ -67,6 +71,7 @@ def fit_tile(
         set_aside,
         start=None if start is None else start.reshape(-1, start.shape[2]),
         added=added,
+        places=places,
     )
     arrays = fit_arrays(result, effects=bool(effects))
     return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
@@ -107,7 +112,8 @@ def run(context: StageContext) -> None:
 def _compile(dtype: np.dtype[Any], effects: Sequence[Effect]) -> None:
     """Compile the kernels once, into the cache, before other processes do it all at the same time."""
     histogram = {name: np.zeros((1, 1), np.int32) for name in ("origin", "under", "over")}
-    fit_tile({"counts": np.ones((1, 1, 8), dtype), **histogram}, FitSettings(), None, effects)
+    everywhere = [effect.at_place(None) for effect in effects]
+    fit_tile({"counts": np.ones((1, 1, 8), dtype), **histogram}, FitSettings(), None, everywhere)
 
 
 def _do_tile(
@@ -124,7 +130,8 @@ def _do_tile(
     start = kept_fit(store, tile.region)
     effects, set_aside = model.effects, model.settings.set_aside_e
     added = read_added_exposure(run_store, model, tile.region)
-    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start, added)
+    places = pixel_places(run_store, tile.region)
+    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start, added, places)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]

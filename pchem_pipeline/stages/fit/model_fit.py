@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.errors.fisher import correlations
 from pchem_pipeline.model.fit.excluding_codes import Interval
@@ -33,6 +33,7 @@ def fit_model(
     *,
     start: NDArray[np.float64] | None = None,
     added: AddedExposure | None = None,
+    places: PixelPlaces | None = None,
 ) -> FitResult:
     """Fit with the PCD or, where the model has effects, with the law that they compose after such a fit.
 
@@ -43,24 +44,28 @@ def fit_model(
         set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
         start: of a fit of fewer frames; see :func:`fit_histograms`.
         added: exposure that the effects add to the pixels, (j, n); None: it counts as part of H.
+        places: of the pixels; None: not known.
     """
     if not effects:
         return fit(settings=settings, start=start, excluding=set_aside)
     simple = settings.model_copy(update={"likelihood": "density", "intervals": "normal"})
     plain = fit(settings=simple, start=start)
-    return fit(settings=settings, start=plain, law=_laws(plain, effects, added), excluding=set_aside)
+    return fit(settings=settings, start=plain, law=_laws(plain, effects, added, places), excluding=set_aside)
 
 
 def _laws(
-    plain: FitResult, effects: Sequence[Effect], added: AddedExposure | None
+    plain: FitResult,
+    effects: Sequence[Effect],
+    added: AddedExposure | None,
+    places: PixelPlaces | None,
 ) -> SampleLaw | list[SampleLaw]:
     """Return the law that the effects compose after the plain fit, or a list of one for each sample."""
     usable = (plain.fit_status & int(_UNUSABLE)) == 0
     shared = [getattr(plain, name) for name in PARAMETERS[1:]]
     if plain.quanta_exposure.ndim == 1:
-        return sample_law(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added)
+        return sample_law(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added, places)
     return [
-        sample_law(effects, pixel_maps([np.ascontiguousarray(exposure), *shared], usable), added)
+        sample_law(effects, pixel_maps([np.ascontiguousarray(exposure), *shared], usable), added, places)
         for exposure in plain.quanta_exposure.T
     ]
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.effects.framework.compose import PixelPlaces
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.excluding_codes import Interval
@@ -22,6 +23,7 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
@@ -59,12 +61,15 @@ class SampleFit:
     set_aside: Sequence[Interval] = ()
 
 
-def fit_samples_tile(histograms: Sequence[Histogram], how: SampleFit) -> dict[str, NDArray[Any]]:
+def fit_samples_tile(
+    histograms: Sequence[Histogram], how: SampleFit, places: PixelPlaces | None = None
+) -> dict[str, NDArray[Any]]:
     """Return the arrays of the groups ``fit`` and ``samples`` of a tile, by path.
 
     Args:
         histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
         how: they are fitted.
+        places: of the pixels; None: not known.
     """
     shape = histograms[0]["counts"].shape[:2]
     fit = functools.partial(
@@ -75,7 +80,7 @@ def fit_samples_tile(histograms: Sequence[Histogram], how: SampleFit) -> dict[st
         dark=list(how.bias),
         adc_limits=how.adc_limits,
     )
-    found = fit_model(fit, how.settings, how.effects, how.set_aside)
+    found = fit_model(fit, how.settings, how.effects, how.set_aside, places=places)
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     own = {
@@ -132,7 +137,8 @@ def _compile(how: SampleFit) -> None:
     """Compile the kernels once, into the cache, before other processes do it all at the same time."""
     histogram = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
     histogram["counts"] = np.ones((1, 1, 8), np.uint32)
-    fit_samples_tile([histogram] * len(how.bias), how)
+    everywhere = [effect.at_place(None) for effect in how.effects]
+    fit_samples_tile([histogram] * len(how.bias), replace(how, effects=everywhere))
 
 
 def _do_tile(tile: Tile, *, store: Path, stores: Sequence[Path], how: SampleFit) -> dict[str, Any]:
@@ -141,8 +147,8 @@ def _do_tile(tile: Tile, *, store: Path, stores: Sequence[Path], how: SampleFit)
     for path in stores:
         sample = RunStore.open(path)
         histograms.append({name: sample.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM})
-    arrays = fit_samples_tile(histograms, how)
     target = open_store(store)
+    arrays = fit_samples_tile(histograms, how, pixel_places(target, tile.region))
     for path_, values in arrays.items():
         along = path_.startswith("samples/") and path_ != "samples/covariance"
         target.write(path_, (slice(None), *tile.region) if along else tile.region, values)

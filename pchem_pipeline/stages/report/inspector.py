@@ -235,5 +235,6 @@ def deciding_parameters(
     deciding = np.full((4, columns[0].size), np.nan)
     if known.size:
         some = model.at(known)
-        deciding[:, known] = deciding_maps([column[known] for column in columns], some.effects, some.added)
+        kept = [column[known] for column in columns]
+        deciding[:, known] = deciding_maps(kept, some.effects, some.added, some.places)
     return deciding

@@ -145,7 +145,8 @@ def bin_masses(
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))
     if known.size:
         kept = [column[known] for column in columns]
-        law = sample_law(model.effects, pixel_maps(kept, np.ones(known.size, bool)), model.at(known).added)
+        some = model.at(known)
+        law = sample_law(some.effects, pixel_maps(kept, np.ones(known.size, bool)), some.added, some.places)
         codes = histograms.origin[known][:, None] + np.arange(counts[0].size)
         amplitude, weight = histograms.satellites[:, known]
         found[known] = sample_mass(law, kept, codes, satellites=(amplitude, weight))

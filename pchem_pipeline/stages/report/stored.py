@@ -14,10 +14,12 @@ from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.methods.result import read_methods
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+    from pchem_pipeline.effects.framework.compose import PixelPlaces
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.run.model_versions import ModelVersion
     from pchem_pipeline.store.records import StageRecord
@@ -40,15 +42,21 @@ class FittedModel:
         effects: in their order.
         added: exposure that they add to single pixels, (j, n), the pixels in one axis; None: nothing.
         version: of the run's model; None without a fit.
+        places: of the pixels; None: not known.
     """
 
     effects: tuple[Effect, ...] = ()
     added: AddedExposure | None = None
     version: ModelVersion | None = None
+    places: PixelPlaces | None = None
 
     def at(self, index: NDArray[np.int64]) -> FittedModel:
         """Return the model of some pixels."""
-        return replace(self, added=None if self.added is None else self.added.of(index))
+        return replace(
+            self,
+            added=None if self.added is None else self.added.of(index),
+            places=None if self.places is None else self.places.of(index),
+        )
 
 
 @dataclass(frozen=True)
@@ -142,7 +150,8 @@ def read_model(store: RunStore) -> FittedModel:
     version = model_of(store, "fit")
     added = None if version is None else read_added_exposure(store, version, None)
     effects = () if version is None else version.effects
-    return FittedModel(effects, None if added is None else added.flat(), version)
+    places = pixel_places(store) if effects else None
+    return FittedModel(effects, None if added is None else added.flat(), version, places)
 
 
 def read_histograms(

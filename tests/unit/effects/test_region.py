@@ -9,7 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.effects.framework.region import Region, Taps, When, overlap, parse_place
+from pchem_pipeline.effects.framework.pixel_sets import overlap
+from pchem_pipeline.effects.framework.region import Region, Taps, When, parse_place
 
 SHAPE = (12, 20)
 
