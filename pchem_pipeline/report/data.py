@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
@@ -184,6 +185,7 @@ class ReportData:
         interval_level: probability that these cover the truth.
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
+        quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
         inspector: maps and pixels to look at in the browser, or None.
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
@@ -220,6 +222,7 @@ class ReportData:
     interval_level: float = 0.6827
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
+    quick_look: QuickLook | None = None
     inspector: InspectorData | None = None
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None

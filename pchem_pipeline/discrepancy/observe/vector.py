@@ -16,7 +16,15 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 
-__all__ = ["STANDS_OUT", "goodness_of", "in_order", "outliers", "sample_statistics", "without_skew"]
+__all__ = [
+    "STANDS_OUT",
+    "goodness_of",
+    "in_order",
+    "outliers",
+    "period_statistics",
+    "sample_statistics",
+    "without_skew",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -116,7 +124,9 @@ def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str,
 
 
 def _code_statistics(pixels: PixelLaws, residuals: CodeResiduals) -> dict[str, float]:
-    found = _periods(pixels.fold, pixels.fold_covariance) if pixels.fold_covariance.trace() > 0 else {}
+    found = (
+        period_statistics(pixels.fold, pixels.fold_covariance) if pixels.fold_covariance.trace() > 0 else {}
+    )
     expected, variance = pixels.codes[1], np.maximum(pixels.codes[3], 0.05 * pixels.codes[1])
     judged = expected >= _ENOUGH
     z = np.where(judged, pixels.codes[2] / np.sqrt(np.where(judged, variance, 1.0)), 0.0)
@@ -144,8 +154,13 @@ def _code_statistics(pixels: PixelLaws, residuals: CodeResiduals) -> dict[str, f
     return found
 
 
-def _periods(fold: FloatArray, covariance: FloatArray) -> dict[str, float]:
-    """Return the statistics of residuals by DN modulo 16; each period without the shorter ones in it."""
+def period_statistics(fold: FloatArray, covariance: FloatArray) -> dict[str, float]:
+    """Return the statistics of residuals by DN modulo 16; each period without the shorter ones in it.
+
+    Args:
+        fold: sums of the residuals, (16,).
+        covariance: of these, (16, 16).
+    """
     code = np.arange(16)
     sign = (-1.0) ** code
     found = {"code.alternating": float(sign @ fold / np.sqrt(max(float(sign @ covariance @ sign), 1e-300)))}

@@ -64,6 +64,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             "samples": _samples(data),
             "missing": dict(data.missing),
             "discrepancy": _discrepancy(data),
+            "quick_look": None if data.quick_look is None else data.quick_look.to_dict(),
             "run": dict(data.run),
             "inputs": list(data.inputs),
             "stages": list(data.stages),

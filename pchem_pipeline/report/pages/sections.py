@@ -243,6 +243,7 @@ def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> 
 def _discrepancy(material: Material) -> Section:
     content = {
         "view": material.view,
+        "tables": [table for table in material.tables if table.section == "discrepancy"],
         "command": f"pchem discrepancy {material.data.run.get('store', 'RUN')}",
     }
     return Section("discrepancy", "What the model is missing", "discrepancy", content)

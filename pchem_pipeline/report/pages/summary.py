@@ -13,6 +13,7 @@ from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.pages.criteria import Criterion, criteria, map_summary
+from pchem_pipeline.report.pages.quick_look import check_sentence, nothing_found
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
 
@@ -286,6 +287,18 @@ def _discrepancy(data: ReportData) -> list[Flag]:
     return [Flag(levels.get(found.verdict, "note"), _as_sentence(found.sentence.replace(" -> ", " → ")))]
 
 
+def _quick_look(data: ReportData) -> list[Flag]:
+    """Say what the quick look found, or what it would have found."""
+    look = data.quick_look
+    if look is None or not look.checks:
+        return []
+    if not look.found:
+        return [Flag("good", nothing_found(look))]
+    closer = f"; to look closer: {look.command}" if look.command and data.discrepancy is None else ""
+    flags = [Flag(check.level, f"{check_sentence(check)}{closer}.") for check in look.found[:1]]
+    return flags + [Flag(check.level, f"{check_sentence(check)}.") for check in look.found[1:]]
+
+
 def _conditions(data: ReportData) -> list[Flag]:
     found = [
         Flag("note", _as_sentence(data.missing[part]))
@@ -328,7 +341,8 @@ def _model(data: ReportData, article: str = "The") -> str:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
-    _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _discrepancy, _conditions,
+    _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _quick_look, _discrepancy,
+    _conditions,
 )  # fmt: skip
 
 
@@ -410,7 +424,7 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
         return Answer(question, "caution", "With caution", f"{cautions[0].text}{more}")
     passed = sum(flag.level == "good" for flag in about)
     checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check failed"
-    looked = "" if data.discrepancy is not None else " What the model may be missing was not looked for."
+    looked = "" if data.discrepancy is not None else _not_looked_for(data)
     pixels = pixel_counts(data)
     if pixels.failed > data.allowed_failed * pixels.total:
         word = f"For the {data.noun}s with a value"
@@ -418,3 +432,10 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
             question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} have none.{looked}"
         )
     return Answer(question, "good", "Yes", f"{checks}.{looked}")
+
+
+def _not_looked_for(data: ReportData) -> str:
+    """Say that nobody looked closely at what the model may be missing."""
+    if data.quick_look is None or not data.quick_look.checks:
+        return " What the model may be missing was not looked for."
+    return f" That was a quick look; {data.quick_look.command} compares far more with simulations."

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.plan import frames_text, target_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
+from pchem_pipeline.report.pages.quick_look import size_text as check_size
 from pchem_pipeline.report.pages.summary import summaries
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
@@ -44,9 +47,45 @@ def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
     makers = (
         _channels, _parameters, _flagged, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals,
-        _status, _samples, _plan,
+        _status, _samples, _plan, _quick_look,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)).rows]
+
+
+def _quick_look(data: ReportData) -> Table:
+    look = data.quick_look or QuickLook(())
+    rows = tuple(
+        (
+            check.title[:1].upper() + check.title[1:],
+            ("in the model" if check.in_model else "yes") if check.found else "no",
+            check_size(check) if check.found else "",
+            _limit_text(check),
+            _chance_text(check.p_global),
+            check.where if check.found else "",
+        )
+        for check in look.checks
+    )
+    missing = "".join(f" Not looked at: {part} ({why})." for part, why in look.missing.items())
+    return Table(
+        "quick-look",
+        "Quick look",
+        "Samples that follow the model are independent from pixel to pixel and from frame to frame. From "
+        "sums that every run keeps this is tested for all pixels; the probability is that of as much by "
+        f"chance anywhere in this table.{missing}",
+        ("what was looked for", "found", "size", "would be found from", "by chance", "where"),
+        rows,
+        "discrepancy",
+    )
+
+
+def _limit_text(check: Check) -> str:
+    if not math.isfinite(check.limit):
+        return ""
+    return f"{short(check.limit, 2)}{f' {check.unit}' if check.unit != '1' else ''}"
+
+
+def _chance_text(p: float) -> str:
+    return "< 10⁻¹⁰" if p < 1e-10 else short(p, 2) if p > 1e-3 else scientific(p, 1)
 
 
 def provenance_tables(data: ReportData) -> list[Table]:

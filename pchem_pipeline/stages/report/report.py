@@ -21,6 +21,7 @@ from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.inspector.inspector_data import PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
+from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
@@ -35,6 +36,7 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_index,
 )
 from pchem_pipeline.stages.report.plan_section import plan_section
+from pchem_pipeline.stages.report.quick import run_quick_look
 from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
@@ -84,7 +86,9 @@ def run(context: StageContext) -> None:
         _stage_rows(context),
         draw_by_workers(context.executor.workers, context.reporter, context.stage),
     )
-    context.run_units([WHOLE], task, unit_name="report")
+    done = context.run_units([WHOLE], task, unit_name="report")
+    for text in done.get(WHOLE.key, {}).get("warnings", ()):
+        context.note(text)
 
 
 def _write(
@@ -110,7 +114,20 @@ def _write(
         (path / DISCREPANCY_PAGE).unlink(missing_ok=True)
     store.write_file("report.json", rendered.json.encode())
     store.write_file("report.html", rendered.html.encode())
-    return {"figures": len(rendered.figures), "html_bytes": len(rendered.html.encode())}
+    return {
+        "figures": len(rendered.figures),
+        "html_bytes": len(rendered.html.encode()),
+        "warnings": _warnings(data),
+    }
+
+
+def _warnings(data: ReportData) -> list[str]:
+    """Return what the quick look found that is more than a remark, for the terminal."""
+    look = data.quick_look
+    if look is None or data.discrepancy is not None:
+        return []
+    found = [check_sentence(check) for check in look.found if check.level in ("caution", "serious")]
+    return [*found, f"to look closer: {look.command}"] if found else []
 
 
 def gather(
@@ -150,6 +167,7 @@ def gather(
         pixels=fits[: len(shown)],
         worst=fits[len(shown) :],
         inspector=inspector_data(run.name, shape, maps, sample),
+        quick_look=run_quick_look(store, run),
     )
 
 

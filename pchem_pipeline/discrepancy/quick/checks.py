@@ -1,0 +1,148 @@
+"""The outcome of a quick look: one check for each way in which samples may fail to be independent.
+
+A check has a size in DN, in electrons and as a share of the read noise, its probability by chance among all
+checks, and the size that would have been found for sure: without that a check that finds nothing says
+nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+__all__ = ["SIGNIFICANCE", "Check", "Level", "QuickLook", "graded"]
+
+Level = Literal["good", "note", "caution", "serious"]
+
+#: A check counts as failed when chance does as much, in any of the checks, with a smaller probability.
+SIGNIFICANCE = 1e-3
+#: Share of the read noise from which something is no mere remark, and from which it is serious: added in
+#: quadrature a tenth is half a per cent of the read noise, a half is an eighth.
+_SOME, _MUCH = 0.1, 0.5
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check.
+
+    Attributes:
+        name: row_noise, lag, ...
+        title: what was looked for, as the subject of a sentence.
+        p: probability of as much by chance, in this check alone.
+        size: estimate; the root of a variance has no sign, and is 0 where the variance comes out negative.
+        unit: of the size: DN, LSB, or 1 for correlations and shares.
+        limit: size that is found in 19 of 20 runs like this one; NaN where that is not known.
+        effects: tags of effects that show like this: where the model has one of them, the check says so.
+        where: rows, columns, frames or codes that carry it, in words; empty for all.
+        advice: what it does to the results, in words.
+        level: how grave it is; "good" where it is not beyond chance.
+        p_global: probability of as much by chance in any of the checks.
+        in_model: whether the fitted model has an effect like it.
+        size_e: the size in electrons, where it is in DN.
+        share: of the read noise, where the size is in DN.
+    """
+
+    name: str
+    title: str
+    p: float
+    size: float
+    unit: str
+    limit: float = math.nan
+    effects: tuple[str, ...] = ()
+    where: str = ""
+    advice: str = ""
+    level: Level = "good"
+    p_global: float = math.nan
+    in_model: bool = False
+    size_e: float = math.nan
+    share: float = math.nan
+
+    @property
+    def found(self) -> bool:
+        """Whether it is beyond chance."""
+        return self.p_global < SIGNIFICANCE
+
+
+@dataclass(frozen=True)
+class QuickLook:
+    """All checks of a run.
+
+    Attributes:
+        checks: in the order in which they were made.
+        missing: parts that were not looked at, and why.
+        samples: frames x pixels that the checks rest on.
+        command: what looks closer.
+    """
+
+    checks: tuple[Check, ...]
+    missing: dict[str, str] = field(default_factory=dict)
+    samples: int = 0
+    command: str = ""
+
+    @property
+    def found(self) -> tuple[Check, ...]:
+        """Return the checks that are beyond chance, the gravest first."""
+        order = ("serious", "caution", "note", "good")
+        beyond = [check for check in self.checks if check.found]
+        return tuple(sorted(beyond, key=lambda check: (order.index(check.level), check.p)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data for JSON; what is not known is NaN."""
+        return {
+            "checks": [{**asdict(check), "found": check.found} for check in self.checks],
+            "missing": dict(self.missing),
+            "samples": self.samples,
+            "significance": SIGNIFICANCE,
+            "command": self.command,
+        }
+
+
+def graded(checks: list[Check], gain: float, read_noise: float, model: tuple[str, ...]) -> tuple[Check, ...]:
+    """Return checks with their probability among all, their size in other units, and their level.
+
+    Args:
+        checks: those made.
+        gain: of the median pixel, e-/DN.
+        read_noise: of the median pixel, DN.
+        model: tags of the effects that the pixels were fitted with.
+    """
+    found = []
+    for check in checks:
+        p_global = -math.expm1(len(checks) * math.log1p(-min(check.p, 1.0 - 1e-16)))
+        in_dn = check.unit == "DN"
+        done = replace(
+            check,
+            p_global=p_global,
+            in_model=any(tag in model for tag in check.effects),
+            size_e=check.size * gain if in_dn else math.nan,
+            share=check.size / read_noise if in_dn else math.nan,
+        )
+        found.append(replace(done, level=_level(done)))
+    return tuple(found)
+
+
+#: Sizes from which a check is no mere remark, and from which it is serious, by its unit and name.
+_LIMITS: dict[str, tuple[float, float]] = {
+    "lag": (0.005, 0.05),
+    "frame_lag": (math.inf, math.inf),
+    "neighbours_x": (0.005, 0.05),
+    "neighbours_y": (0.005, 0.05),
+    "repeated_frames": (1e-3, 0.05),
+    "single_frames": (0.01, 0.1),
+    "wandering_pixels": (0.01, 0.2),
+    "codes": (0.1, 0.5),
+    "top_code": (1e-4, 1e-2),
+}
+
+
+def _level(check: Check) -> Level:
+    if not check.found:
+        return "good"
+    if check.in_model:
+        return "note"
+    size = check.share if check.unit == "DN" else abs(check.size)
+    some, much = (_SOME, _MUCH) if check.unit == "DN" else _LIMITS[check.name]
+    if size >= much:
+        return "serious"
+    return "caution" if size >= some else "note"

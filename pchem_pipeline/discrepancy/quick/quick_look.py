@@ -1,0 +1,418 @@
+"""A quick look at a run: do rows, columns, frames, neighbours and successive samples behave as independent?
+
+It rests on sums that the run has anyway, so it costs a second, and looks at every pixel and every frame.
+Given the histograms, samples without any effect are in random order and independent of those of other
+pixels. The expectation and the variance of all sums of products of different samples follow from that alone:
+a poor fit of a pixel, a hot pixel or a heavy tail imitates nothing here. What is common to a frame, a row, a
+column or to neighbours adds to the mean covariance of the pairs that share it; the shares are taken apart as
+in an analysis of variance.
+
+What is found here has a size, not a name: to say which effect it is, ``pchem discrepancy`` compares many more
+statistics with simulations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.discrepancy.observe.laws import chi_square
+from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
+from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
+from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
+from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+__all__ = ["quick_look"]
+
+FloatArray = NDArray[np.float64]
+
+#: Lines with a variance above this multiple of the median hold hot pixels, and are left out of frame means.
+_LOUD = 4.0
+#: Standard deviations beyond which single pixels and lines do not count any more: a few tracks of particles
+#: or blinking pixels are no property of the sensor.
+_CLIP = 5.0
+#: Squares of frame means beyond this multiple of their expectation count as that much.
+_LARGEST_SQUARE = 25.0
+#: Standard deviations from which on a check fails for sure (19 of 20), with a dozen checks.
+_SURE = 5.4
+_FEWEST_LINES = 4
+_FEWEST_BLOCKS = 4
+#: Probability below which a pixel wanders, whose means over blocks are not quite normal.
+_WANDERS = 1e-10
+_SHOWN = 6
+
+
+def quick_look(
+    sums: StackSums | None,
+    maps: PixelMaps,
+    codes: CodeSample | None = None,
+    model: tuple[str, ...] = (),
+    missing: dict[str, str] | None = None,
+    command: str = "",
+) -> QuickLook:
+    """Return the checks of a run.
+
+    Args:
+        sums: the summaries; None where there are none.
+        maps: the fitted parameters, (y, x).
+        codes: histograms of some pixels; None: codes are not looked at.
+        model: tags of the effects that the pixels were fitted with.
+        missing: parts that are not looked at, and why.
+        command: what looks closer.
+    """
+    checks: list[Check] = []
+    if sums is not None and sums.freedom > 0:
+        checks += _stack_checks(sums, maps)
+    if codes is not None:
+        checks += code_checks(codes)
+    usable = maps.usable
+    gain, noise = (
+        float(np.median(values[usable])) if usable.any() else math.nan
+        for values in (maps.conversion_gain, maps.read_noise_dn)
+    )
+    samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
+    return QuickLook(graded(checks, gain, noise, model), missing or {}, samples, command)
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """A mean covariance of pairs of pixels, DN^2, with its error and the freedom of the sum behind it."""
+
+    value: float
+    error: float
+    freedom: float
+
+    def less(self, other: _Estimate) -> _Estimate:
+        """Return the difference of independent estimates."""
+        return _Estimate(self.value - other.value, math.hypot(self.error, other.error), self.freedom)
+
+    @property
+    def z(self) -> float:
+        """Normal quantile: a sum of squares of so many degrees of freedom."""
+        deviation = self.value / self.error * math.sqrt(2.0 * self.freedom)
+        return float(chi_square(max(self.freedom + deviation, 0.0), self.freedom))
+
+
+_NOTHING = _Estimate(0.0, math.inf, 1.0)
+
+
+def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
+    frame, of_columns = _frame_covariance(sums)
+    rows, columns = _of_lines(sums.rows), of_columns
+    checks = []
+    if math.isfinite(frame.error):
+        checks.append(_noise_check("frame_noise", "the pixels of a frame move together", frame,
+                                   ("frame_noise", "exposure_flicker", "bias_jumps", "bias_drift",
+                                    "exposure_drift")))  # fmt: skip
+    if math.isfinite(rows.error):
+        more = ("row_noise", "periodic_pickup")
+        checks.append(_noise_check("row_noise", "the pixels of a row move together",
+                                   rows.less(frame) if math.isfinite(frame.error) else rows, more,
+                                   sums.rows, "row"))  # fmt: skip
+    if math.isfinite(columns.error):
+        checks.append(_noise_check("column_noise", "the pixels of a column move together",
+                                   columns.less(frame) if math.isfinite(frame.error) else columns,
+                                   ("column_noise",), sums.columns, "column", sums.shape[1]))  # fmt: skip
+    mean, error, skewness = _frame_means(sums, maps)
+    checks += series_checks(mean, error, skewness)
+    common = _Common(frame, rows, columns, sums)
+    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps)]
+    return [*checks, *_repeats(sums)]
+
+
+# -- what is common to lines and frames ----------------------------------------------------------
+
+
+def _of_lines(lines: Lines) -> _Estimate:
+    """Return the mean covariance of the pixels of a line, a few odd lines not counted in full."""
+    value, error = lines.covariance
+    some = np.isfinite(error) & (lines.n_pairs > 0)
+    if some.sum() < _FEWEST_LINES:
+        return _NOTHING
+    value, error = value[some], error[some]
+    z = value / error
+    centre = float(np.median(z))
+    reach = _CLIP * max(1.0, 1.4826 * float(np.median(np.abs(z - centre))))
+    value = np.clip(z, centre - reach, centre + reach) * error
+    weight = error**-2
+    total = float(weight.sum())
+    effective = total**2 / float((weight**2).sum())
+    return _Estimate(float(weight @ value) / total, total**-0.5, effective * lines.freedom)
+
+
+def _quiet(sums: StackSums) -> NDArray[np.bool_]:
+    """Return the rows that count in the means of frames, (y,)."""
+    variance = sums.rows.variance
+    some = variance > 0
+    return np.asarray(some & (variance <= _LOUD * np.median(variance[some]))) if some.any() else some
+
+
+def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
+    """Return the mean covariance of pixels in different rows and columns, and that within columns."""
+    columns = _of_lines(sums.columns)
+    quiet = _quiet(sums)
+    m, nx = int(quiet.sum()), sums.shape[1]
+    if m < _FEWEST_LINES or nx < _FEWEST_LINES:
+        return _NOTHING, columns
+    rows, variance = sums.rows.values[:, quiet], sums.rows.variance[quiet]
+    total = rows.sum(axis=1)
+    products = total**2 - np.einsum("ty,ty->t", rows, rows)
+    scale = float(variance.sum())
+    # a few frames with a track of a particle do not count in full
+    typical = max(1.0, float(np.median(total**2)) / (0.455 * scale))
+    products = np.minimum(products, _LARGEST_SQUARE * typical * scale)
+    freedom = sums.freedom
+    value = float(products.sum()) / freedom
+    chance = math.sqrt(2.0 / freedom * (scale**2 - float((variance**2).sum())))
+    pairs, along = float(nx * m * (m - 1)), 2.0 * nx * (m - 1)
+    down = sums.next_y[quiet]
+    neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
+    pairs_all = pairs * nx
+    in_columns = columns.value if math.isfinite(columns.error) else 0.0
+    others = pairs_all - pairs - along * 0.0
+    estimate = (value - neighbours - (pairs - along) * in_columns) / others
+    error = chance / others
+    if math.isfinite(columns.error):
+        error = math.hypot(error, pairs / others * columns.error)
+    return _Estimate(estimate, error, freedom), columns
+
+
+def _noise_check(
+    name: str,
+    title: str,
+    found: _Estimate,
+    effects: tuple[str, ...],
+    lines: Lines | None = None,
+    line: str = "",
+    width: int = 0,
+) -> Check:
+    """Return the check of a covariance that pixels share, and of single lines that share more than others."""
+    p, where = normal_p(found.z), ""
+    if lines is not None:
+        single, where = _single_lines(lines, line, width)
+        p = of_many(min(p, single), 2.0)
+    return Check(
+        name,
+        title,
+        p,
+        math.sqrt(max(found.value, 0.0)),
+        "DN",
+        limit=math.sqrt(_SURE * found.error),
+        effects=effects,
+        where=where,
+        advice="it is part of what is called read noise, but does not average out over pixels",
+    )
+
+
+def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
+    """Return the probability of the line that stands out most, and those that stand out in words."""
+    value, error = lines.covariance
+    some = np.flatnonzero(np.isfinite(error) & (lines.n_pairs > 0))
+    if some.size < _FEWEST_LINES:
+        return 1.0, ""
+    z = value[some] / error[some]
+    centre = float(np.median(z))
+    spread = max(1.0, 1.4826 * float(np.median(np.abs(z - centre))))
+    freedom = lines.freedom
+    normal = chi_square(np.maximum(freedom + (z - centre) / spread * np.sqrt(2.0 * freedom), 0.0), freedom)
+    p = special.ndtr(-normal)
+    out = some[p < 1e-3 / p.size]
+    if width:
+        out = np.unique(out % width)
+    shown = ", ".join(str(i) for i in out[:_SHOWN])
+    more = f" and {out.size - _SHOWN} more" if out.size > _SHOWN else ""
+    words = f"most in {line}{'s' if out.size > 1 else ''} {shown}{more}" if out.size else ""
+    return of_many(float(p.min()), p.size), words
+
+
+def _frame_means(sums: StackSums, maps: PixelMaps) -> tuple[FloatArray, float, float]:
+    """Return the mean of each frame over the quiet rows, its standard deviation and skewness by chance.
+
+    Where the sums of some frames are not at hand, over all rows.
+    """
+    quiet = _quiet(sums) if sums.whole else sums.rows.variance > 0
+    if not quiet.any():
+        return np.zeros(0), math.nan, 0.0
+    pixels = quiet.sum() * sums.shape[1]
+    mean = sums.row_sum[:, quiet].sum(axis=1) / pixels if sums.whole else sums.frame_mean
+    scale = float(sums.rows.variance[quiet].sum())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        third = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain**3, 0.0)[quiet].sum()
+    return mean, math.sqrt(scale) / pixels, float(third / scale**1.5)
+
+
+# -- successive samples and neighbours -----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Common:
+    """What pixels share, for what it does to correlations of single pixels and of neighbours."""
+
+    frame: _Estimate
+    rows: _Estimate
+    columns: _Estimate
+    sums: StackSums
+
+    def _value(self, which: _Estimate) -> float:
+        return which.value if math.isfinite(which.error) else 0.0
+
+    def of_row(self) -> float:
+        """Covariance of pixels of a row, DN^2."""
+        return self._value(self.rows if math.isfinite(self.rows.error) else self.frame)
+
+    def of_column(self) -> float:
+        """Covariance of pixels of a column, DN^2."""
+        return self._value(self.columns if math.isfinite(self.columns.error) else self.frame)
+
+    def inflation(self) -> float:
+        """Return by how much correlated pixels raise the variance of a mean over them."""
+        ny, nx = self.sums.shape
+        variance = self.sums.variance
+        typical = float(np.median(variance[variance > 0]))
+        frame = self._value(self.frame)
+        row, column = self.of_row() - frame, self.of_column() - frame
+        return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
+
+
+def _mean_correlation(z: FloatArray, common: _Common) -> tuple[float, float]:
+    """Return the mean of correlations that are z standard errors each, and its error, both over 1."""
+    freedom = common.sums.freedom_of_all
+    kept = np.clip(z, -_CLIP, _CLIP)
+    return float(kept.mean()) / math.sqrt(freedom), math.sqrt(common.inflation() / freedom / kept.size)
+
+
+def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
+    """Return whether samples of a pixel resemble those of the frame before, beyond what frames share."""
+    some = (sums.variance > 0) & np.isfinite(sums.lag)
+    if not some.any():
+        return []
+    variance = sums.variance[some]
+    mean, error = _mean_correlation(sums.lag[some] / variance * math.sqrt(sums.freedom_of_all), common)
+    quiet = _quiet(sums)
+    total = sums.rows.values[:, quiet].sum(axis=1)
+    inside = np.ones(total.size, np.bool_)
+    inside[sums.starts] = False
+    at = np.flatnonzero(inside)
+    pixels = float(quiet.sum() * sums.shape[1])
+    # a centred series is anticorrelated with itself
+    shared = (float(total[at] @ total[at - 1]) + float(np.mean(total**2)) * sums.lengths.size) / sums.freedom
+    shared = (shared - float(np.nansum(sums.lag[quiet]))) / pixels**2
+    if common.frame.z > 3.0:
+        mean -= shared * float(np.mean(1.0 / variance))
+        error = math.hypot(
+            error, math.sqrt(2.0 / sums.freedom) * abs(common.frame.value) / float(variance.mean())
+        )
+    return [
+        Check(
+            "lag",
+            "samples resemble those of the frame before",
+            normal_p(mean / error, two_sided=True),
+            mean,
+            "1",
+            limit=(_SURE + 0.2) * error,
+            effects=("analog_memory", "flicker_noise", "repeated_frames"),
+            advice="charge or signal is carried over: gain and exposure are off by about as much",
+        )
+    ]
+
+
+def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
+    """Return whether neighbours resemble each other, beyond what their line shares."""
+    v = sums.variance
+    found = []
+    for axis, product, covariance, shared in (
+        ("x", v[:, :-1] * v[:, 1:], sums.next_x[:, :-1], common.of_row()),
+        ("y", v[:-1] * v[1:], sums.next_y[:-1], common.of_column()),
+    ):
+        some = (product > 0) & np.isfinite(covariance)
+        if not some.any():
+            continue
+        size = np.sqrt(product[some])
+        z = covariance[some] / size * math.sqrt(sums.freedom_of_all)
+        mean, error = _mean_correlation(z, common)
+        which, line = (common.rows, "row") if axis == "x" else (common.columns, "column")
+        ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / np.median(size))))
+        if math.isfinite(which.error):
+            mean -= shared * ratio
+            error = math.hypot(error, which.error * ratio)
+        found.append(
+            Check(
+                f"neighbours_{axis}",
+                f"neighbours in a {line} resemble each other",
+                normal_p(mean / error, two_sided=True),
+                mean,
+                "1",
+                limit=(_SURE + 0.2) * error,
+                effects=("interpixel_capacitance", "optical_crosstalk", "cosmic_rays"),
+                advice="coupling lowers the gain by about twice the correlation",
+            )
+        )
+    return found
+
+
+def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
+    """Return whether single pixels change their level along the run, less what all pixels do."""
+    lengths = sums.lengths
+    if lengths.size < _FEWEST_BLOCKS:
+        return []
+    means = sums.block_sum / lengths[:, None, None]
+    means -= np.average(means, axis=0, weights=lengths)
+    some = sums.variance > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        charge = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain, 0.0)[some]
+    weight = 1.0 / sums.variance[some]
+    values = means[:, some]
+    basis = np.stack([np.ones(charge.size), charge])
+    inner = (basis * weight) @ basis.T
+    shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]
+    chi2 = (lengths[:, None] * (values - shared.T @ basis) ** 2).sum(axis=0) * weight
+    p = special.chdtrc(lengths.size - 1.0, chi2)
+    out = np.flatnonzero(p < _WANDERS)
+    share = out.size / p.size
+    places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
+    shown = ", ".join(f"({y}, {x})" for y, x in places)
+    return [
+        Check(
+            "wandering_pixels",
+            "single pixels change their level along the run",
+            1e-12 if out.size else 1.0,
+            share,
+            "1",
+            limit=2.0 / p.size,
+            effects=("dark_current_rts", "flicker_noise", "persistence"),
+            where=f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else "",
+            advice="their exposure is a mean over states",
+        )
+    ]
+
+
+def _repeats(sums: StackSums) -> list[Check]:
+    """Return whether frames repeat the one before: all sums over rows, and of squares, are the same."""
+    variance = sums.rows.variance
+    some = variance > 0
+    # a row repeats its sum by chance with the density of the difference at 0
+    log_chance = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * variance[some]))).sum())
+    if not some.any() or log_chance + math.log(sums.n_frames) > math.log(1e-9):
+        return []
+    same = sums.repeated.tolist()
+    words = ", ".join(str(t) for t in same[:_SHOWN]) + (
+        f" and {len(same) - _SHOWN} more" if len(same) > _SHOWN else ""
+    )
+    return [
+        Check(
+            "repeated_frames",
+            "frames repeat the one before",
+            1e-12 if same else 1.0,
+            len(same) / sums.n_frames,
+            "1",
+            limit=1.0 / sums.n_frames,
+            effects=("repeated_frames",),
+            where=f"frame{'s' if len(same) > 1 else ''} {words}" if same else "",
+            advice="there are fewer samples than frames, and standard errors are too small",
+        )
+    ]

@@ -1,0 +1,184 @@
+"""Checks of the mean of the frames as a series in time: drift, periods, memory, single frames, repeats."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.discrepancy.observe.laws import best, chi_square
+from pchem_pipeline.discrepancy.quick.checks import Check
+
+__all__ = ["normal_p", "of_many", "series_checks"]
+
+FloatArray = NDArray[np.float64]
+
+_SLOWEST = (2, 4, 8, 16, 32)
+_FEWEST_FRAMES = 64
+#: Frequencies on either side from which the noise around one is taken.
+_AROUND = 64
+_CLIP = 6.0
+_SHOWN = 6
+
+
+def normal_p(z: float, *, two_sided: bool = False) -> float:
+    """Return the probability that a normal deviate is larger (or larger in magnitude)."""
+    return float(2.0 * special.ndtr(-abs(z)) if two_sided else special.ndtr(-z))
+
+
+def of_many(p: float, n: float) -> float:
+    """Return the probability that the smallest of n independent p-values is this small (Sidak)."""
+    return float(-np.expm1(n * np.log1p(-min(max(p, 0.0), 1.0 - 1e-16))))
+
+
+def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check]:
+    """Return the checks of the frames' means.
+
+    All but that of single frames compare the series with itself in another order, so that noise of frame to
+    frame is none of them.
+
+    Args:
+        mean: of each frame, over the same pixels, DN, (n,).
+        error: its standard deviation where pixels are independent, DN.
+        skewness: likewise.
+    """
+    n = mean.size
+    if n < _FEWEST_FRAMES:
+        return []
+    centre = float(np.median(mean))
+    spread = max(1.4826 * float(np.median(np.abs(mean - centre))), 1e-300)
+    series = np.clip(mean - centre, -_CLIP * spread, _CLIP * spread)
+    series -= series.mean()
+    # of frames two apart: neither a drift nor a difference of even and odd frames adds to it
+    noise = float(np.mean((series[2:] - series[:-2]) ** 2)) / 2.0
+    if not noise > 0:
+        return []
+    smooth, drift = _drift(series, noise)
+    rest = series - smooth
+    return [drift, _period(rest), _memory(rest, noise), _single(mean - smooth, spread, error, skewness)]
+
+
+def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
+    """Return the slow part of a series, and whether it is more than chance (Neyman's test; Fan 1996)."""
+    n = series.size
+    cuts = [k for k in _SLOWEST if k <= n // 16]
+    time = np.pi * (np.arange(n) + 0.5) / n
+    waves = np.sqrt(2.0 / n) * np.cos(np.arange(1, cuts[-1] + 1)[:, None] * time)
+    heights = waves @ series
+    energy = np.cumsum(heights**2) / noise
+    # the noise is itself an estimate, from n differences that overlap
+    z = [float(chi_square(energy[k - 1], k, 2.0 * k + 3.0 * k * k / n)) for k in cuts]
+    chosen = cuts[int(np.argmax(z))]
+    smooth = heights[:chosen] @ waves[:chosen]
+    p = normal_p(best(*z, independent=0.5 * (1 + len(z))))
+    excess = max(float(energy[chosen - 1]) - chosen, 0.0) * noise / n
+    peak = float(np.ptp(smooth))
+    check = Check(
+        "drift",
+        "the mean of the frames drifts",
+        p,
+        math.sqrt(excess),
+        "DN",
+        limit=math.sqrt(16.0 * noise / n),
+        effects=("bias_drift", "exposure_drift", "gain_drift", "persistence", "bias_jumps"),
+        where=f"{peak:.2g} DN from its lowest to its highest",
+        advice="it widens the read noise, and what is taken for dark current changes along the run",
+    )
+    return (smooth if p < 1e-3 else np.zeros(n)), check
+
+
+def _period(series: FloatArray) -> Check:
+    """Return whether one frequency stands out of those around it."""
+    n = series.size
+    power = np.abs(np.fft.rfft(series)[1:]) ** 2
+    frequency = np.arange(1, power.size + 1) / n
+    alternating = n % 2 == 0
+    last = math.nan
+    if alternating:
+        last, power, frequency = float(power[-1]), power[:-1], frequency[:-1]
+    around, width = _around(power)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(around > 0, power / around, 0.0)
+    # a power over the mean of w others: F(2, 2 w)
+    log_tail = -width * np.log1p(ratio / width)
+    at = int(np.argmin(log_tail))
+    p = of_many(math.exp(max(float(log_tail[at]), -700.0)), power.size)
+    # a line between two frequencies spreads over those around it
+    near = power[max(at - 2, 0) : at + 3]
+    height = max(float(near.sum()) - near.size * float(around[at]), 0.0)
+    words, amplitude = f"period {1.0 / frequency[at]:.4g} frames", 2.0 * math.sqrt(height) / n
+    if alternating and around.size:
+        # the last frequency has one degree of freedom
+        ends = 2.0 * normal_p(math.sqrt(last / max(float(around[-1]), 1e-300)))
+        w = float(width[-1])
+        ends = max(
+            ends, float(2.0 * special.stdtr(2.0 * w, -math.sqrt(last / max(float(around[-1]), 1e-300))))
+        )
+        if ends < p:
+            p, words, amplitude = ends, "even and odd frames differ", math.sqrt(last) / n * math.sqrt(2.0)
+        p = of_many(p, 2.0)
+    return Check(
+        "period",
+        "the mean of the frames has a period",
+        p,
+        amplitude / math.sqrt(2.0),
+        "DN",
+        effects=("periodic_pickup", "readout_alternation"),
+        where=words,
+        advice="it widens the read noise",
+    )
+
+
+def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean power around each frequency, itself left out, and of how many it is."""
+    size = power.size
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    index = np.arange(size)
+    low, high = np.maximum(index - _AROUND, 0), np.minimum(index + _AROUND + 1, size)
+    inner_low, inner_high = np.maximum(index - 1, 0), np.minimum(index + 2, size)
+    count = (high - low) - (inner_high - inner_low)
+    sums = total[high] - total[low] - total[inner_high] + total[inner_low]
+    return np.maximum(sums, 0.0) / np.maximum(count, 1), np.maximum(count, 1).astype(np.float64)
+
+
+def _memory(series: FloatArray, noise: float) -> Check:
+    """Return whether the mean of a frame resembles that of the frame before."""
+    n = series.size
+    total = float(series @ series)
+    correlation = float(series[1:] @ series[:-1]) / max(total, 1e-300) + 1.0 / n
+    return Check(
+        "frame_lag",
+        "the mean of a frame resembles that of the frame before",
+        normal_p(correlation * math.sqrt(n), two_sided=True),
+        correlation,
+        "1",
+        limit=5.7 / math.sqrt(n),
+        effects=("flicker_noise", "bias_jumps", "analog_memory", "exposure_flicker", "bias_drift"),
+        advice="noise that the frames share has a memory",
+    )
+
+
+def _single(series: FloatArray, spread: float, error: float, skewness: float) -> Check:
+    """Return whether single frames stand out."""
+    centre = float(np.median(series))
+    z = (series - centre) / max(spread, error)
+    # the law of a sum of counts is a little skewed (Wilson and Hilferty)
+    skew = skewness if abs(skewness) > 1e-6 else 1e-6
+    normal = 6.0 / skew * (np.cbrt(np.maximum(1.0 + 0.5 * skew * z, 0.0)) - 1.0) + skew / 6.0
+    p = 2.0 * special.ndtr(-np.abs(normal))
+    out = np.flatnonzero(p < 1e-3 / p.size)
+    largest = int(np.argmin(p))
+    shown = out[np.argsort(p[out])][:_SHOWN] if out.size else np.array([largest])
+    more = f" and {out.size - shown.size} more" if out.size > shown.size else ""
+    return Check(
+        "single_frames",
+        "single frames stand out",
+        of_many(float(p[largest]), p.size),
+        max(out.size, 1) / series.size,
+        "1",
+        effects=("cosmic_rays", "bias_jumps", "readout_glitches"),
+        where=f"frame{'s' if shown.size > 1 else ''} {', '.join(str(i) for i in np.sort(shown))}{more}",
+        advice="leave them out (input.frame_range), or see what happened there",
+    )

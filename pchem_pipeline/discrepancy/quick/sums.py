@@ -1,0 +1,173 @@
+"""What a quick look needs of the summaries of a stack, and the variances and covariances that they give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+
+__all__ = ["Lines", "StackSums"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Sums over lines (rows, or columns within a group of rows) of some frames, with what they are made of.
+
+    Attributes:
+        values: sums, less their mean over each block of frames, (frame, line), DN.
+        freedom: frames less blocks.
+        variance: sum of the variances of a line's pixels, (line,), DN^2.
+        pairs: sum over ordered pairs of pixels of the line, neighbours left out, of the product of their
+            variances, (line,), DN^4.
+        neighbours: sum of the covariances of pixels next to each other along the line, (line,), DN^2.
+        length: pixels of each line.
+    """
+
+    values: FloatArray
+    freedom: float
+    variance: FloatArray
+    pairs: FloatArray
+    neighbours: FloatArray
+    length: NDArray[np.int64]
+
+    @property
+    def n_pairs(self) -> FloatArray:
+        """Ordered pairs of pixels of a line that are no neighbours, (line,)."""
+        return np.maximum((self.length - 1.0) * (self.length - 2.0), 0.0)
+
+    @cached_property
+    def covariance(self) -> tuple[FloatArray, FloatArray]:
+        """Mean covariance of such pairs in each line, and its standard error by chance, DN^2, (line,).
+
+        Given the samples of each pixel, in random order and independent of those of others, the sum of the
+        products of all pairs has the expectation 0 and exactly this variance, whatever the pixels' law.
+        """
+        square = np.einsum("tl,tl->l", self.values, self.values) / self.freedom
+        rest = square - self.variance - 2.0 * self.neighbours
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.sqrt(2.0 * self.pairs / self.freedom) / self.n_pairs
+            return rest / self.n_pairs, np.where(error > 0, error, np.nan)
+
+
+@dataclass(frozen=True)
+class StackSums:
+    """Summaries of a stack, as the stage ``histogram`` makes them; of a long run those of some blocks.
+
+    Attributes:
+        n_frames: frames of the stack.
+        n_blocks: blocks of the stack.
+        lengths: frames of each block whose sums are at hand, (b,).
+        block_sum, block_sum_square: of each pixel, (b, y, x), DN, DN^2.
+        row_sum: of the frames of these blocks, (frame, y), DN.
+        column_blocks: which of these blocks have column sums at hand, increasing.
+        column_sum: of the frames of those, sums over groups of rows, (frame, group, x), DN.
+        frame_mean: of all frames of the stack, over all pixels, DN.
+        repeated: frames with the sums, and sums of squares, of the one before in every row.
+        lag: covariance of successive frames within all blocks, (y, x), DN^2.
+        next_x, next_y: covariance with the next pixel along x and y, NaN without one.
+    """
+
+    n_frames: int
+    n_blocks: int
+    lengths: IntArray
+    block_sum: NDArray[np.int64]
+    block_sum_square: NDArray[np.int64]
+    row_sum: NDArray[np.int64]
+    column_blocks: IntArray
+    column_sum: NDArray[np.signedinteger]
+    frame_mean: FloatArray
+    repeated: IntArray
+    lag: FloatArray
+    next_x: FloatArray
+    next_y: FloatArray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.block_sum.shape[1], self.block_sum.shape[2]
+
+    @property
+    def whole(self) -> bool:
+        """Whether the sums of all blocks are at hand."""
+        return self.lengths.size == self.n_blocks
+
+    @property
+    def starts(self) -> IntArray:
+        """First frame of each block among those at hand, (b,)."""
+        return np.asarray(np.cumsum(self.lengths) - self.lengths)
+
+    @property
+    def freedom(self) -> float:
+        """Frames less blocks: degrees of freedom of what is taken within the blocks at hand."""
+        return float(self.lengths.sum() - self.lengths.size)
+
+    @property
+    def freedom_of_all(self) -> float:
+        """The same of all blocks, within which the covariances are taken."""
+        return float(self.n_frames - self.n_blocks)
+
+    @cached_property
+    def within(self) -> FloatArray:
+        """Sum of squares of each pixel about its mean over the block, (b, y, x), DN^2."""
+        sums = self.block_sum.astype(np.float64)
+        return np.asarray(self.block_sum_square - sums**2 / self.lengths[:, None, None])
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """Variance of each pixel within blocks, (y, x), DN^2."""
+        return np.asarray(self.within.sum(axis=0) / self.freedom)
+
+    @cached_property
+    def rows(self) -> Lines:
+        """Sums over the rows of all frames."""
+        ny, nx = self.shape
+        v = self.variance
+        pairs = v.sum(axis=1) ** 2 - (v**2).sum(axis=1) - 2.0 * (v[:, :-1] * v[:, 1:]).sum(axis=1)
+        return Lines(
+            _centred(self.row_sum.astype(np.float64), self.starts),
+            self.freedom,
+            v.sum(axis=1),
+            pairs,
+            np.nansum(self.next_x, axis=1),
+            np.full(ny, nx),
+        )
+
+    @cached_property
+    def columns(self) -> Lines:
+        """Sums over the columns of each group of rows, (group, x) in one axis, of some blocks."""
+        ny, nx = self.shape
+        lengths = self.lengths[self.column_blocks]
+        starts = np.cumsum(lengths) - lengths
+        freedom = float(lengths.sum() - lengths.size)
+        v = self.within[self.column_blocks].sum(axis=0) / freedom
+        tops = np.arange(0, ny, ROW_GROUP)
+        total, square = (np.add.reduceat(values, tops, axis=0) for values in (v, v**2))
+        product, inside = np.zeros_like(v), np.zeros_like(v)
+        product[:-1] = v[:-1] * v[1:]
+        inside[:] = np.nan_to_num(self.next_y)
+        product[ROW_GROUP - 1 :: ROW_GROUP] = 0.0  # no product crosses the border of a group
+        along, covariance = (np.add.reduceat(values, tops, axis=0) for values in (product, inside))
+        heights = np.diff(np.append(tops, ny))
+        values = self.column_sum.reshape(self.column_sum.shape[0], -1).astype(np.float64)
+        return Lines(
+            _centred(values, starts),
+            freedom,
+            total.ravel(),
+            (total**2 - square - 2.0 * along).ravel(),
+            covariance.ravel(),
+            np.repeat(heights, nx),
+        )
+
+
+def _centred(values: FloatArray, starts: IntArray) -> FloatArray:
+    """Return values (frame, line) less their mean over each block of frames."""
+    lengths = np.diff(np.append(starts, values.shape[0]))
+    means = np.add.reduceat(values, starts, axis=0) / lengths[:, None]
+    return np.asarray(values - np.repeat(means, lengths, axis=0))

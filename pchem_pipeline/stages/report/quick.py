@@ -1,0 +1,159 @@
+"""The quick look of a report: what it reads of the summaries and histograms of a run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
+from pchem_pipeline.discrepancy.quick.codes import CodeSample
+from pchem_pipeline.discrepancy.quick.quick_look import quick_look
+from pchem_pipeline.discrepancy.quick.sums import StackSums
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+if TYPE_CHECKING:
+    from pchem_pipeline.discrepancy.quick.checks import QuickLook
+    from pchem_pipeline.stages.report.stored import StoredRun
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["run_quick_look"]
+
+#: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
+_MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 23, 1 << 23
+#: Pixels whose codes are looked at, in so many pieces of the sensor, and the fewest that say anything.
+_PIXELS, _PIECES, _FEWEST = 1024, 8, 16
+
+
+def run_quick_look(store: RunStore, run: StoredRun) -> QuickLook | None:
+    """Return the quick look at a run; None where no pixel has parameters.
+
+    Raises:
+        StoreError: an array is missing or corrupt.
+    """
+    maps = _maps(run)
+    if maps is None:
+        return None
+    model = tuple(effect.tag for effect in run.model.effects)
+    missing: dict[str, str] = {}
+    sums = _sums(store, missing)
+    codes = None
+    if model:
+        missing["codes"] = "the model has effects; pchem discrepancy compares the codes with it"
+    elif maps.usable.sum() < _FEWEST:
+        missing["codes"] = f"fewer than {_FEWEST} pixels with a fit that can be relied upon"
+    else:
+        codes = _codes(store, maps)
+    command = f"pchem discrepancy {run.name}"
+    return quick_look(sums, maps, codes, model, missing, command)
+
+
+def _maps(run: StoredRun) -> PixelMaps | None:
+    status = run.fit.get("fit_status")
+    if status is None or not all(name in run.maps for name in PARAMETERS):
+        return None
+    values = [np.asarray(run.maps[name], np.float64) for name in PARAMETERS]
+    usable = ((status & int(UNTRUSTWORTHY)) == 0) & np.isfinite(values).all(axis=0)
+    return PixelMaps(values[0], values[1], values[2], values[3], usable) if usable.any() else None
+
+
+def _sums(store: RunStore, missing: dict[str, str]) -> StackSums | None:
+    """Read the summaries of some blocks of frames, evenly spread over the run."""
+    if not store.has("summary/frame_mean"):
+        why = store.attributes("summary").get("missing", "the stage histogram has none")
+        missing["rows, columns, frames, neighbours and lags"] = str(why)
+        return None
+    mean = store.read("summary/frame_mean")
+    starts = store.read("summary/block_start")
+    n_blocks, ny, nx = store.array("summary/block_sum").shape
+    lengths = np.diff(np.append(starts, mean.size))
+    if mean.size <= n_blocks:
+        return None  # a single frame in each block
+    frames = min(_MOST_LINE_SUMS // ny, mean.size)
+    most = min(_MOST_BLOCK_SUMS // (ny * nx), frames // int(lengths[0]) if frames < mean.size else n_blocks)
+    chosen = _spread(n_blocks, most)
+    groups = store.array("summary/column_sum").shape[1]
+    some = _spread(chosen.size, _MOST_LINE_SUMS // (groups * nx * int(lengths[0])))
+    blocks = (np.s_[:], np.s_[:])
+    return StackSums(
+        mean.size,
+        n_blocks,
+        lengths[chosen],
+        _read(store, "block_sum", chosen, chosen + 1, blocks),
+        _read(store, "block_sum_square", chosen, chosen + 1, blocks),
+        _read(store, "row_sum", starts[chosen], (starts + lengths)[chosen], np.s_[:]),
+        some,
+        _read(store, "column_sum", starts[chosen[some]], (starts + lengths)[chosen[some]], blocks),
+        mean,
+        _repeated(store, mean),
+        store.read("summary/lag1_covariance"),
+        store.read("summary/neighbour_covariance_x"),
+        store.read("summary/neighbour_covariance_y"),
+    )
+
+
+def _spread(n: int, most: int) -> NDArray[np.int64]:
+    """Return numbers below n, all of them or at most so many, evenly spread; at least one."""
+    return np.unique(np.linspace(0, n - 1, min(n, max(most, 1))).astype(np.int64))
+
+
+def _read(
+    store: RunStore,
+    name: str,
+    first: NDArray[np.int64],
+    end: NDArray[np.int64],
+    rest: slice | tuple[slice, ...],
+) -> NDArray[np.int64]:
+    """Read ranges along the first axis, those that follow each other at once."""
+    cuts = np.flatnonzero(first[1:] != end[:-1]) + 1
+    others = rest if isinstance(rest, tuple) else (rest,)
+    parts = [
+        store.read(f"summary/{name}", (slice(int(a[0]), int(b[-1])), *others))
+        for a, b in zip(np.split(first, cuts), np.split(end, cuts), strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+def _repeated(store: RunStore, mean: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the frames with the sums, and sums of squares, of the one before in all rows."""
+    variance = store.read("summary/frame_variance")
+    candidates = np.flatnonzero((mean[1:] == mean[:-1]) & (variance[1:] == variance[:-1])) + 1
+    step = store.array("summary/row_sum").chunks[0]
+    found: list[int] = []
+    for start in np.unique(candidates // step) * step:
+        here = candidates[(candidates >= start) & (candidates < start + step)]
+        first = max(int(start) - 1, 0)
+        part = (slice(first, int(here[-1]) + 1), slice(None))
+        sums, squares = (store.read(f"summary/{name}", part) for name in ("row_sum", "row_sum_square"))
+        found += [
+            int(t)
+            for t, i in zip(here, here - first, strict=True)
+            if (sums[i] == sums[i - 1]).all() and (squares[i] == squares[i - 1]).all()
+        ]
+    return np.array(found, np.int64)
+
+
+def _codes(store: RunStore, maps: PixelMaps) -> CodeSample | None:
+    """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor."""
+    chunks = store.array("histogram/counts").chunks
+    ny, nx = maps.usable.shape
+    tiles = [(y, x) for y in range(0, ny, chunks[0]) for x in range(0, nx, chunks[1])]
+    origin = store.read("histogram/origin")
+    counts, origins, parameters = [], [], []
+    pieces = _spread(len(tiles), _PIECES)
+    for y, x in (tiles[i] for i in pieces):
+        part = (slice(y, y + chunks[0]), slice(x, x + chunks[1]))
+        inside = np.flatnonzero(maps.usable[part].ravel())
+        if inside.size == 0:
+            continue
+        inside = inside[_spread(inside.size, -(-_PIXELS // pieces.size))]
+        block = store.read("histogram/counts", (*part, slice(None)))
+        counts.append(block.reshape(-1, block.shape[2])[inside])
+        origins.append(origin[part].ravel()[inside].astype(np.int64))
+        values = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+        parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
+    if sum(part.size for part in origins) < _FEWEST:
+        return None
+    return CodeSample(np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters))

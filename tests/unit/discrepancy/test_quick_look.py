@@ -1,0 +1,234 @@
+"""The quick look: nothing on clean stacks whatever their pixels are, and each disturbance with its size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, codes_of, maps_of, stack, sums_of
+
+from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook
+from pchem_pipeline.discrepancy.quick.quick_look import quick_look
+
+SHAPE = (800, 32, 32)
+SIGMA = READ_NOISE / GAIN  # DN
+VARIANCE = EXPOSURE / GAIN**2 + SIGMA**2 + 1 / 12
+
+
+def looked(frames: np.ndarray[Any, Any], model: tuple[str, ...] = ()) -> QuickLook:
+    return quick_look(sums_of(frames), maps_of(frames.shape[1:]), codes_of(frames), model)
+
+
+def by_name(look: QuickLook) -> dict[str, Check]:
+    return {check.name: check for check in look.checks}
+
+
+@pytest.fixture(scope="module")
+def clean() -> QuickLook:
+    return looked(stack(np.random.default_rng(1), SHAPE))
+
+
+def test_a_clean_stack_passes_all_checks(clean: QuickLook) -> None:
+    assert clean.found == ()
+    assert {check.level for check in clean.checks} == {"good"}
+    assert len(clean.checks) == 14
+    assert clean.samples == np.prod(SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("exposure", "read_noise", "shape"),
+    [(0.05, 0.15, (300, 16, 16)), (15.0, 0.8, (400, 16, 24)), (0.3, 0.5, (1200, 70, 17))],
+)
+def test_clean_stacks_of_other_sensors_pass(
+    exposure: float, read_noise: float, shape: tuple[int, int, int]
+) -> None:
+    for seed in range(3):
+        frames = stack(np.random.default_rng(seed), shape, exposure=exposure, read_noise=read_noise)
+        codes = codes_of(frames, exposure, read_noise)
+        look = quick_look(sums_of(frames), maps_of(shape[1:], exposure, read_noise), codes)
+        assert look.found == ()
+
+
+def test_the_covariance_of_pairs_has_the_error_that_theory_gives_it() -> None:
+    """Rows of 12 pixels of very different variance: their z are N(0, 1)."""
+    rng = np.random.default_rng(4)
+    exposure = np.exp(rng.normal(0.0, 1.5, (60, 12)))
+    z = []
+    for _ in range(8):
+        value, error = sums_of(stack(rng, (300, 60, 12), exposure=exposure)).rows.covariance
+        z.append(value / error)
+    z_all = np.concatenate(z)
+    assert abs(z_all.mean()) < 5.0 / np.sqrt(z_all.size)
+    # sums of squares of some 300 degrees of freedom, a little skewed: kurtosis below 4
+    assert abs(z_all.var() - 1.0) < 5.0 * np.sqrt(3.0 / z_all.size)
+
+
+def test_hot_and_blinking_pixels_and_tracks_of_particles_are_no_noise_of_rows_or_frames() -> None:
+    rng = np.random.default_rng(7)
+    exposure = np.full(SHAPE[1:], EXPOSURE)
+    exposure[rng.random(SHAPE[1:]) < 0.01] = 80.0
+    frames = stack(rng, SHAPE, exposure=exposure)
+    frames[300:450, 5, 7] += 40
+    for _ in range(6):
+        t, y, x = rng.integers(0, 800), rng.integers(0, 31), rng.integers(0, 28)
+        frames[t, y, x : x + 3] += 300
+    found = {check.name for check in looked(frames).found}
+    assert found <= {"single_frames", "wandering_pixels"}
+
+
+def row_noise(rng: np.random.Generator, size: float) -> Callable[..., Any]:
+    return lambda dn: dn + size * rng.standard_normal(dn.shape[:2])[:, :, None]
+
+
+def column_noise(rng: np.random.Generator, size: float) -> Callable[..., Any]:
+    return lambda dn: dn + size * rng.standard_normal((dn.shape[0], 1, dn.shape[2]))
+
+
+def frame_noise(rng: np.random.Generator, size: float) -> Callable[..., Any]:
+    return lambda dn: dn + size * rng.standard_normal(dn.shape[0])[:, None, None]
+
+
+@pytest.mark.parametrize(
+    ("name", "made", "size"),
+    [
+        ("row_noise", row_noise, SIGMA / 3),
+        ("row_noise", row_noise, SIGMA / 6),
+        ("column_noise", column_noise, SIGMA / 5),
+        ("frame_noise", frame_noise, SIGMA / 10),
+    ],
+)
+def test_what_pixels_share_is_found_alone_and_its_size_is_right(
+    name: str, made: Callable[..., Any], size: float
+) -> None:
+    rng = np.random.default_rng(11)
+    look = looked(stack(rng, SHAPE, made(rng, size)))
+    check = by_name(look)[name]
+    assert [each.name for each in look.found] == [name]
+    assert check.level == ("note" if size < 0.1 * SIGMA * 1.01 else "caution")
+    # standard error of the variance: that by chance, and that of a noise of so many independent values
+    n, ny, nx = SHAPE
+    values = n * {"row_noise": ny, "column_noise": nx, "frame_noise": 1}[name]
+    error = (check.limit**2 / 5.4) + size**2 * np.sqrt(2.0 / values)
+    assert abs(check.size**2 - size**2) < 5.0 * error
+    assert size**2 > 5.0 * check.limit**2 / 5.4
+    assert check.share == pytest.approx(check.size / np.hypot(SIGMA, 12**-0.5))
+    assert check.size_e == pytest.approx(check.size * GAIN)
+
+
+def test_a_single_noisy_row_is_told() -> None:
+    rng = np.random.default_rng(3)
+
+    def moved(dn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        dn[:, 21] += SIGMA * rng.standard_normal((dn.shape[0], 1))
+        return dn
+
+    check = by_name(looked(stack(rng, SHAPE, moved)))["row_noise"]
+    assert check.found
+    assert check.where == "most in row 21"
+
+
+def test_a_drift_is_found_with_its_rms_and_is_nothing_else() -> None:
+    rng = np.random.default_rng(5)
+    ramp = np.linspace(-0.5, 0.5, SHAPE[0])[:, None, None]
+    look = looked(stack(rng, SHAPE, lambda dn: dn + 0.6 * SIGMA * ramp))
+    check = by_name(look)["drift"]
+    assert look.found[0].name == "drift"
+    rms = 0.6 * SIGMA / np.sqrt(12)
+    assert check.size == pytest.approx(rms, abs=5 * np.sqrt(VARIANCE / np.prod(SHAPE)) * 4)
+
+
+def test_a_period_of_the_frames_and_even_and_odd_ones_are_told_apart() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(SHAPE[0])[:, None, None]
+    wave = by_name(looked(stack(rng, SHAPE, lambda dn: dn + 0.35 * np.sin(2 * np.pi * t / 7.3))))["period"]
+    assert wave.found
+    period = float(wave.where.split()[1])
+    assert abs(1.0 / period - 1.0 / 7.3) < 1.0 / SHAPE[0]
+    assert wave.size == pytest.approx(0.35 / np.sqrt(2), rel=0.2)
+    even = by_name(looked(stack(rng, SHAPE, lambda dn: dn + 0.3 * (-1.0) ** t)))["period"]
+    assert even.where == "even and odd frames differ"
+    assert even.size == pytest.approx(0.3, rel=0.2)
+
+
+def test_charge_of_the_frame_before_and_of_neighbours_is_found() -> None:
+    rng = np.random.default_rng(8)
+
+    def memory(electrons: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return electrons + 0.02 * np.roll(electrons, 1, axis=0)
+
+    look = looked(stack(rng, SHAPE, charge=memory))
+    assert [check.name for check in look.found] == ["lag"]
+    expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
+    assert look.found[0].size == pytest.approx(expected, abs=5 / np.sqrt(np.prod(SHAPE)))
+
+    def coupled(electrons: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return electrons + 0.01 * (np.roll(electrons, 1, axis=2) + np.roll(electrons, -1, axis=2))
+
+    look = looked(stack(rng, SHAPE, charge=coupled))
+    assert [check.name for check in look.found] == ["neighbours_x"]
+    expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
+    assert look.found[0].size == pytest.approx(expected, abs=6 / np.sqrt(np.prod(SHAPE)))
+
+
+def test_repeated_and_single_frames_are_told_by_their_numbers() -> None:
+    frames = stack(np.random.default_rng(9), SHAPE)
+    frames[400] = frames[399]
+    frames[77] += 3
+    found = by_name(looked(frames))
+    assert found["repeated_frames"].where == "frame 400"
+    assert found["single_frames"].where == "frame 77"
+    assert found["single_frames"].found
+    assert found["single_frames"].level == "note"
+    assert not found["frame_noise"].found
+
+
+@pytest.mark.parametrize("size", [0.05, 0.15])
+def test_widths_of_codes_are_found_with_their_size(size: float) -> None:
+    rng = np.random.default_rng(10)
+    edges = np.arange(400) - 0.5 + 0.5 * np.cumsum(size * rng.standard_normal(400)) * 0.0
+    edges += size / np.sqrt(2.0) * rng.standard_normal(400)  # differences of edges have the rms ``size``
+
+    def quantised(dn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return np.searchsorted(edges, dn) - 1.0
+
+    look = looked(stack(rng, SHAPE, quantised))
+    assert [check.name for check in look.found] == ["codes"]
+    # some 60 codes are occupied; widths that share an edge are anticorrelated, which the estimate
+    # (against the mean of both neighbours) takes for (1 + 2/3) of the variance
+    assert look.found[0].size == pytest.approx(size * np.sqrt(5 / 3), rel=0.4)
+
+
+def test_clipping_is_found() -> None:
+    rng = np.random.default_rng(12)
+    look = looked(stack(rng, SHAPE, lambda dn: np.minimum(dn, 222.0)))
+    assert "top_code" in {check.name for check in look.found}
+
+
+def test_what_the_model_has_is_a_remark() -> None:
+    rng = np.random.default_rng(13)
+    look = looked(stack(rng, SHAPE, row_noise(rng, SIGMA)), ("row_noise",))
+    assert (look.found[0].name, look.found[0].level, look.found[0].in_model) == ("row_noise", "note", True)
+
+
+def test_the_level_grows_with_the_size() -> None:
+    rng = np.random.default_rng(14)
+    sizes = [0.05 * SIGMA, 0.3 * SIGMA, 0.8 * SIGMA]
+    frames = [stack(rng, (3000, 24, 24), frame_noise(rng, size)) for size in sizes]
+    levels = [by_name(looked(each))["frame_noise"].level for each in frames]
+    assert levels == ["good", "caution", "serious"] or levels == ["note", "caution", "serious"]
+
+
+def test_probabilities_count_all_checks(clean: QuickLook) -> None:
+    n = len(clean.checks)
+    for check in clean.checks:
+        assert check.p_global == pytest.approx(1.0 - (1.0 - check.p) ** n, abs=1e-9)
+        assert check.found == (check.p_global < SIGNIFICANCE)
+
+
+def test_without_summaries_only_codes_are_looked_at() -> None:
+    frames = stack(np.random.default_rng(15), (400, 8, 8))
+    look = quick_look(None, maps_of((8, 8)), codes_of(frames), missing={"rows": "no order in time"})
+    assert [check.name for check in look.checks] == ["codes", "top_code"]
+    assert look.to_dict()["missing"] == {"rows": "no order in time"}

@@ -1,0 +1,76 @@
+"""The report rests on the quick look: its answer, its remarks, its table, its JSON."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.report_material import report_data
+
+from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.report_json import report_numbers
+from pchem_pipeline.report.pages.summary import answers, flags
+from pchem_pipeline.report.pages.tables import result_tables
+
+
+def looked(data: ReportData, p: float, size: float, model: tuple[str, ...] = ()) -> ReportData:
+    rows = Check("row_noise", "the pixels of a row move together", p, size, "DN", limit=0.12,
+                 effects=("row_noise",), where="most in row 3", advice="it does not average out")  # fmt: skip
+    lag = Check("lag", "samples resemble those of the frame before", 0.3, 0.001, "1", limit=0.004)
+    checks = graded([rows, lag], 0.1, 3.0, model)
+    look = QuickLook(checks, {"codes": "too few pixels"}, 1000, "pchem discrepancy run.zarr")
+    return replace(data, quick_look=look)
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return replace(report_data((40, 40), failed=0.0), fit={"fit_status": np.zeros((40, 40), np.uint16)})
+
+
+def test_nothing_found_is_a_check_that_passed_with_its_limit(data: ReportData) -> None:
+    belief = answers(looked(data, 0.4, 0.05))[1]
+    assert (belief.level, belief.word) == ("good", "Yes")
+    assert belief.text == (
+        "3 checks of the model against the data passed. That was a quick look; pchem discrepancy run.zarr "
+        "compares far more with simulations."
+    )
+    assert any(
+        "row noise of 0.12 DN would have been found" in flag.text for flag in flags(looked(data, 0.4, 0.0))
+    )
+
+
+@pytest.mark.parametrize(
+    ("size", "level", "word"), [(1.0, "caution", "With caution"), (2.0, "serious", "Not as they are")]
+)
+def test_row_noise_of_a_third_of_the_read_noise_is_not_believed(
+    data: ReportData, size: float, level: str, word: str
+) -> None:
+    found = looked(data, 1e-30, size)
+    belief = answers(found)[1]
+    assert (belief.level, belief.word) == (level, word)
+    share = round(100 * size / 3)
+    assert belief.text == (
+        f"The pixels of a row move together: {size:.1f} DN, {size / 10:.2f} e⁻, {share} % of the read noise "
+        "(most in row 3); it does not average out; to look closer: pchem discrepancy run.zarr."
+    )
+
+
+def test_what_is_small_or_in_the_model_is_a_remark(data: ReportData) -> None:
+    assert answers(looked(data, 1e-30, 0.1))[1].word == "Yes"
+    known = looked(data, 1e-30, 2.0, ("row_noise",))
+    assert answers(known)[1].word == "Yes"
+    assert any("the model has an effect like it" in flag.text for flag in flags(known))
+
+
+def test_table_and_json_hold_all_checks(data: ReportData) -> None:
+    found = looked(data, 1e-30, 1.0)
+    [table] = [each for each in result_tables(found) if each.id == "quick-look"]
+    assert [row[1] for row in table.rows] == ["yes", "no"]
+    assert "Not looked at: codes (too few pixels)." in table.caption
+    numbers = report_numbers(found)["quick_look"]
+    assert numbers["checks"][0]["share"] == pytest.approx(1 / 3)
+    assert numbers["checks"][0]["level"] == "caution"
+    assert numbers["checks"][1]["size_e"] is None
+    assert report_numbers(data)["quick_look"] is None
