@@ -1,4 +1,4 @@
-"""Every command in README is run, in order, in a folder with frames/."""
+"""Every command in README and in the documentation is run, in order, in a folder with frames/."""
 
 import os
 import re
@@ -8,13 +8,18 @@ from pathlib import Path
 
 from helpers.places import ROOT
 
+from pchem_pipeline.base.errors import ExitCode
 from pchem_pipeline.stages.table import pipeline
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+DOCS = "\n".join(
+    (ROOT / "docs" / name).read_text(encoding="utf-8")
+    for name in ("first_run.md", "howto/missing_effects.md", "howto/methods_and_plans.md", "howto/cron.md")
+)
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, re.S)
+def blocks(language, text=README):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
 # the search and the study take a minute each with what run.yaml has by default
@@ -22,8 +27,9 @@ QUICKER = r"sed -i -E 's/^( +replicates):.*/\1: 24/; s/^( +study_pixels):.*/\1: 
 
 
 def test_the_commands_in_readme_work(shell, frames):
-    first, *others = blocks("bash")
-    script = "\n".join(["set -e", first, QUICKER, *others])
+    first, *others = blocks("bash") + blocks("bash", DOCS)
+    [notebook] = blocks("python")
+    script = "\n".join(["set -e", first, QUICKER, *others, f"python - <<'END'\n{notebook}\nEND"])
     assert script.count("pchem ") >= 10
     environment = {**shell.environment, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     result = subprocess.run(
@@ -31,7 +37,7 @@ def test_the_commands_in_readme_work(shell, frames):
     )
     assert result.returncode == 0, result.stderr
     assert (shell.folder / "run.zarr" / "report.html").exists()
-    shown = re.search(r"<!-- output of: (pchem status .*?) -->\n```\n(.*?)```", README, re.S)
+    shown = re.search(r"<!-- output of: (pchem status .*?) -->\n```\n(.*?)```", DOCS, re.S)
     assert shown is not None
     assert shell.ok(*shown[1].split()[1:]).stdout == shown[2]
 
@@ -61,16 +67,24 @@ def test_ci_runs_the_test_command_of_readme():
     assert (ROOT / ".ci" / "run").read_text().strip().endswith("exec ./scripts/test")
 
 
-def test_readme_names_every_stage_and_exit_code():
+def test_readme_is_short_and_its_links_lead_somewhere():
+    assert len(README.splitlines()) <= 80
+    links = re.findall(r"\]\(([^)]+)\)", README)
+    assert len(links) >= 10
+    for link in links:
+        assert (ROOT / link).exists(), link
+
+
+def test_the_documentation_names_every_stage_and_exit_code():
     for stage in pipeline():
         assert stage in README
-    for code in ("0 ", "1 ", "2 ", "3 ", "4 ", "75 ", "130", "143"):
-        assert code in README
+    for code in ExitCode:
+        assert re.search(rf"^\|[ \d,]*\b{code.value}\b", DOCS, re.M), code
 
 
-def test_readme_names_the_shipped_configs():
+def test_the_documentation_names_the_shipped_configs():
     for path in (ROOT / "configs").iterdir():
-        assert f"`{path.name}`" in README
+        assert f"`{path.name}`" in DOCS
 
 
 def test_the_shipped_demo_config_runs(shell):

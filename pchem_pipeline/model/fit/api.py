@@ -72,8 +72,7 @@ def fit_histograms(
 
     Under another ``law``, and where the settings ask for the exact likelihood, a second fit starts from that
     one: the mass of every code is an integral over its cell, not a density at its middle, so that rounding,
-        code edges and
-    clipping are exact, and the likelihood is bounded at any read noise.
+    code edges and clipping are exact, and the likelihood is bounded at any read noise.
 
     Samples that the model does not expect at all are left out (setting ``tail_guard``): a few outliers move
     nothing, and a pixel without any has the very estimates that it would have without the guard.
@@ -92,10 +91,9 @@ def fit_histograms(
             likelihood counts what lies beyond there.
         start: a fit of the same histograms with the PCD, from which that under the law starts; or
             (H_1 ... H_J, g, mu, sigma) known to be near the answer, shape (n, J + 3), NaN where nothing is
-            known. In the
-            latter case the maximum next to it is taken where it fits well, without a look at its neighbours:
-                the bias
-            is not tested for ambiguity, and the likelihood gap is that to one Gaussian.
+            known. In the latter case the maximum next to it is taken where it fits well, without a look at
+            its neighbours: the bias is not tested for ambiguity, and the likelihood gap is that to one
+            Gaussian.
         excluding: intervals of e- on the comb of the fit with the PCD: codes there are set aside. The
             likelihood is conditional on the other codes (a truncated sample, Fisher 1931), so the number of
             samples in them does not matter either.

@@ -1,0 +1,258 @@
+"""The pages of reference, made from the code that they describe: commands, settings, store, effects."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from enum import Enum
+from itertools import groupby
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+
+def write_pages(folder: Path) -> None:
+    """Write ``commands.md``, ``settings.md``, ``store.md`` and ``effects.md`` where they changed."""
+    pages = {"commands": commands, "settings": settings, "store": store, "effects": effects}
+    for name, make in pages.items():
+        path, text = folder / f"{name}.md", make()
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+# -- commands ------------------------------------------------------------------------------------
+
+
+def commands() -> str:
+    """Return every command with its arguments and options, as ``pchem COMMAND --help`` shows them."""
+    import typer
+
+    from pchem_pipeline.cli.app import app
+
+    group = typer.main.get_command(app)
+    lines = ["# Commands", "", "As `pchem --help` and `pchem COMMAND --help` say it.", ""]
+    lines += ["| command | what it does |", "|---|---|"]
+    named = group.commands.items()  # type: ignore[attr-defined]
+    lines += [f"| [`{name}`](#pchem-{name}) | {_cell(c.get_short_help_str(200))} |" for name, c in named]
+    for name, command in named:
+        lines += ["", f"(pchem-{name})=", f"## pchem {name}", "", inspect.cleandoc(command.help or "")]
+        rows = list(_parameters(command.params))
+        if rows:
+            lines += ["", "| argument or option | meaning |", "|---|---|", *rows]
+    return "\n".join(lines) + "\n"
+
+
+def _parameters(parameters: Iterable[Any]) -> Iterator[str]:
+    for each in parameters:
+        words = getattr(each, "help", "") or ""
+        if each.param_type_name == "argument":
+            many = " ..." if each.nargs != 1 else ""
+            yield f"| `{each.name.upper()}{many}` | {_cell(words)} |"
+        elif not each.hidden and each.name != "help":
+            default = each.default if isinstance(each.default, str | int | float) else None
+            told = f" [{default}]" if default not in (None, "", False, True) else ""
+            yield f"| `{', '.join(each.opts)}` | {_cell(words + told)} |"
+
+
+# -- settings ------------------------------------------------------------------------------------
+
+
+def settings() -> str:
+    """Return every key of the YAML with its default, limits and meaning."""
+    from pchem_pipeline.config.tree import RunConfig
+
+    lines = [
+        "# Settings (YAML)",
+        "",
+        "A run is recorded in one YAML file; `pchem init` writes it with these explanations. Unknown keys",
+        "are refused, and what is not stated has its default. `null`: the program chooses.",
+    ]
+    for name, field in RunConfig.model_fields.items():
+        section = _section_of(field.annotation)
+        if section is None:
+            continue
+        lines += ["", f"## {name}", "", _sentence(field.description or "")]
+        lines += ["", "| key | default | meaning |", "|---|---|---|", *_keys(section)]
+    return "\n".join(lines) + "\n"
+
+
+def _keys(section: type[BaseModel], before: str = "") -> Iterator[str]:
+    for name, field in section.model_fields.items():
+        inner = _section_of(field.annotation)
+        described = f"{_cell(field.description or '')}{_limits(field)}"
+        if inner is not None and not _is_effect(inner):
+            yield f"| `{before}{name}` | | {described} |"
+            yield from _keys(inner, f"{before}{name}.")
+        else:
+            yield f"| `{before}{name}` | {_default(field)} | {described} |"
+
+
+def _section_of(annotation: Any) -> type[BaseModel] | None:
+    if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
+        return annotation
+    if get_origin(annotation) in (tuple, list, dict):
+        return None
+    found = [_section_of(each) for each in get_args(annotation)]
+    return next((each for each in found if each is not None), None)
+
+
+def _is_effect(section: type[BaseModel]) -> bool:
+    from pchem_pipeline.effects.framework.effect import Effect
+
+    return issubclass(section, Effect)
+
+
+def _default(field: Any) -> str:
+    if field.default_factory is not None:
+        value = field.default_factory()
+    elif field.default is PydanticUndefined:
+        return "needed"
+    else:
+        value = field.default
+    if isinstance(value, Enum):
+        value = value.value
+    words = {None: "null", True: "true", False: "false"}
+    if value is None or isinstance(value, bool):
+        return f"`{words[value]}`"
+    if isinstance(value, BaseModel):
+        return ""
+    if isinstance(value, tuple | list):
+        return f"`[{', '.join(map(str, value))}]`"
+    return f"`{value}`" if value != "" else '`""`'
+
+
+def _limits(field: Any) -> str:
+    choices = [a for a in get_args(field.annotation) if isinstance(a, str | int)]
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+    found = [
+        f"{text} {getattr(limit, name):g}"
+        for limit in field.metadata
+        for name, text in words.items()
+        if isinstance(getattr(limit, name, None), int | float)
+    ]
+    if choices:
+        found.append("one of " + ", ".join(f"`{c}`" for c in choices))
+    return f" ({', '.join(found)})" if found else ""
+
+
+# -- store ---------------------------------------------------------------------------------------
+
+
+def store() -> str:
+    """Return every array that a run may hold, with dimensions, type and unit."""
+    from pchem_pipeline.base.variables import VARIABLES
+
+    lines = [
+        "# The store",
+        "",
+        "`run.zarr` is a zarr group (format 3). Every array has dimension names, `units` and `long_name`:",
+        '`xarray.open_zarr("run.zarr", group="fit", consolidated=False)`; a type of `*` is that of the',
+        "data. What a run did not ask for is not there. `report.html`, `report.json` and `figures/` lie",
+        "beside the arrays, the versions of the model as `model/0001.json` and so on.",
+    ]
+    variables = sorted(VARIABLES.values(), key=lambda v: list(VARIABLES).index(v.path))
+    for group, members in groupby(variables, key=lambda v: v.group):
+        lines += ["", f"## {group}", "", "| array | dimensions | type | unit | what it is |"]
+        lines.append("|---|---|---|---|---|")
+        for each in members:
+            symbol = f" (${_latex(each.symbol)}$)" if each.symbol else ""
+            unit = "" if each.unit == "1" else each.unit
+            dims = ", ".join(each.dims)
+            lines.append(
+                f"| `{each.name}` | {dims} | {_cell(each.dtype)} | {unit} | {each.long_name}{symbol} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _latex(symbol: str) -> str:
+    named = re.sub(r"\b(mu|sigma|lambda|tau)\b", r"\\\1", symbol.replace("_e-", "_{e^-}"))
+    return named.replace("sigma_", "\\sigma_").replace("\\\\", "\\")
+
+
+# -- effects -------------------------------------------------------------------------------------
+
+
+def effects() -> str:
+    """Return every effect of this package in the order of the signal chain: what it is, settings, rivals."""
+    from pchem_pipeline.effects.framework.plane import Plane
+    from pchem_pipeline.effects.framework.registry import effect_classes
+
+    own = [c for c in effect_classes().values() if c.__module__.startswith("pchem_pipeline.")]
+    lines = [
+        "# Effects",
+        "",
+        "What the plain model lacks and real sensors have. Each may stand in `model.effects` (it is",
+        "fitted with) and in `simulate.effects` (it is simulated), and is a candidate of `pchem discrepancy`",
+        "unless its own text says that frames of one constant exposure cannot show it. Each is told by the",
+        "statistics that it moves first.",
+    ]
+    for plane in Plane:
+        members = [c for c in own if c.plane is plane]
+        if not members:
+            continue
+        lines += ["", f"## {plane.value.capitalize()}" if plane is not Plane.ADC else "## ADC"]
+        for each in members:
+            lines += ["", *_effect(each)]
+    return "\n".join(lines) + "\n"
+
+
+def _effect(effect: type[Any]) -> Iterator[str]:
+    tag = effect.model_fields["tag"].default
+    yield f"### {tag}"
+    yield ""
+    yield f"*{_escaped(effect.title)}*. {_prose(sys.modules[effect.__module__])}"
+    yield ""
+    yield _prose(effect)
+    yield ""
+    if effect.source:
+        yield f"Source: {_escaped(effect.source)}."
+        yield ""
+    if effect.untestable:
+        yield f"Not testable with one constant exposure: {_escaped(effect.untestable)}."
+        yield ""
+    if effect.signature:
+        yield "Moves first: " + ", ".join(f"`{s}`" for s in effect.signature) + "."
+        yield ""
+    yield "| setting | default | meaning |"
+    yield "|---|---|---|"
+    shown = {name: field for name, field in effect.model_fields.items() if name != "tag"}
+    for name, field in shown.items():
+        yield f"| `{name}` | {_default(field)} | {_cell(field.description or '')}{_limits(field)} |"
+    if effect.separate:
+        yield ""
+        yield "| rival | what tells them apart |"
+        yield "|---|---|"
+        for rival, words in effect.separate.items():
+            yield f"| `{rival}` | {_cell(words)} |"
+
+
+# -- words ---------------------------------------------------------------------------------------
+
+
+def _prose(described: Any) -> str:
+    """Return a docstring as Markdown: double backquotes are code, roles and sections are left out."""
+    text = inspect.cleandoc(described.__doc__ or "")
+    text = re.split(r"\n(?:Attributes|Args|Raises|Returns):\n", text)[0]
+    text = re.sub(r":\w+:`~?([^`]+)`", lambda m: f"`{m[1].rsplit('.', 1)[-1]}`", text)
+    parts = re.split(r"(``[^`]+``|`[^`]+`)", text)
+    return "".join(f"`{p.strip('`')}`" if p.startswith("`") else _escaped(p) for p in parts)
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([*_$<>|])", r"\\\1", text)
+
+
+def _cell(text: str) -> str:
+    return " ".join(_escaped(text).split())
+
+
+def _sentence(text: str) -> str:
+    return _escaped(text[:1].upper() + text[1:].rstrip(".") + ".") if text else ""
+
+
+if __name__ == "__main__":
+    write_pages(Path(__file__).parent / "reference")

@@ -1,0 +1,53 @@
+"""The documentation is built with warnings as errors, and names what there is."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from helpers.places import ROOT
+
+from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.cli.app import app
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.framework.registry import effect_classes
+
+PAGES = [p for p in (ROOT / "docs").rglob("*.md") if "build" not in p.parts]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", ROOT / "docs", folder]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return folder
+
+
+def text_of(page):
+    return re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8"))
+
+
+def test_every_command_setting_array_and_effect_is_there(site):
+    reference = {name: text_of(site / "reference" / f"{name}.html") for name in
+                 ("commands", "settings", "store", "effects")}  # fmt: skip
+    for command in app.registered_commands:
+        assert f"pchem {command.name or command.callback.__name__}" in reference["commands"]
+    for section in RunConfig.model_fields:
+        assert re.search(rf"^\s*{section}\b", reference["settings"], re.M), section
+    for variable in VARIABLES.values():
+        assert variable.long_name.split("$")[0][:40] in reference["store"].replace("&#39;", "'"), (
+            variable.path
+        )
+    own = [tag for tag, c in effect_classes().items() if c.__module__.startswith("pchem_pipeline.")]
+    for tag in own:
+        assert tag in reference["effects"]
+
+
+def test_pages_are_readable_as_they_are():
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert text.startswith("# "), page
+        for link in re.findall(r"\]\(([\w./]+\.md)\)", text):
+            generated = "reference/" in link
+            assert generated or (page.parent / link).exists(), f"{page}: {link}"
