@@ -27,7 +27,7 @@ QUICKER = r"sed -i -E 's/^( +replicates):.*/\1: 24/; s/^( +study_pixels):.*/\1: 
 
 
 def test_the_commands_in_readme_work(shell, frames):
-    first, *others = blocks("bash") + blocks("bash", DOCS)
+    first, *others = dict.fromkeys(blocks("bash") + blocks("bash", DOCS))
     [notebook] = blocks("python")
     script = "\n".join(["set -e", first, QUICKER, *others, f"python - <<'END'\n{notebook}\nEND"])
     assert script.count("pchem ") >= 10
