@@ -1,0 +1,1 @@
+"""What is done with a characterised sensor: calibrated frames, electron numbers, exposures."""

@@ -1,0 +1,107 @@
+"""What a characterisation says of some pixels, as those need it who use the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.model.maps.pixels import FloatArray, usable_pixels
+
+__all__ = ["PEAKS_OVERLAP_E", "Calibration", "covariance_of"]
+
+#: Read noise, e-, above which the peaks of neighbouring electron numbers overlap so far that the most probable
+#: number is often wrong, and the expectation says more.
+PEAKS_OVERLAP_E = 0.4
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Parameters of pixels with the covariance of their estimates, and the law of their samples.
+
+    Attributes:
+        quanta_exposure: H of the characterisation, e-, shape (y, x), as the other maps; NaN without a fit.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        read_noise_dn: sigma, quantisation included, DN.
+        covariance: of the estimates of (g, mu, sigma), shape (y, x, 3, 3).
+        fit_status: word of each pixel.
+        law: of the samples of all pixels in C order.
+        satellites: amplitude (e-) and weight of what free satellites the fit found, shape (y * x, 2).
+    """
+
+    quanta_exposure: FloatArray
+    conversion_gain: FloatArray
+    bias: FloatArray
+    read_noise_dn: FloatArray
+    covariance: FloatArray
+    fit_status: NDArray[np.uint16]
+    law: SampleLaw = field(default_factory=SampleLaw)
+    satellites: FloatArray | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        ny, nx = self.bias.shape
+        return ny, nx
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Pixels whose parameters define a calibration, shape (y, x)."""
+        known = usable_pixels(
+            np.nan_to_num(self.quanta_exposure), self.conversion_gain, self.bias, self.read_noise_dn
+        )
+        return known & ((self.fit_status & np.uint16(int(FAILED))) == 0)
+
+    @property
+    def columns(self) -> FloatArray:
+        """(H, g, mu, sigma) of the usable pixels, NaN elsewhere, shape (n, 4)."""
+        maps = (self.quanta_exposure, self.conversion_gain, self.bias, self.read_noise_dn)
+        table = np.stack([np.asarray(values, np.float64).ravel() for values in maps], axis=1)
+        table[:, 0] = np.where(table[:, 0] > 0.0, table[:, 0], 1.0)  # held fixed nowhere: any will do
+        table[~self.usable.ravel()] = np.nan
+        return table
+
+    @property
+    def own_satellites(self) -> FloatArray:
+        """Amplitude and weight of free satellites, 0 without any, shape (n, 2)."""
+        if self.satellites is None:
+            return np.zeros((self.bias.size, 2))
+        return np.nan_to_num(self.satellites)
+
+    @property
+    def noise_variance_dn2(self) -> FloatArray:
+        """Variance of a sample at a given electron number (at k = H), DN^2: all effects included."""
+        from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
+
+        sigma = nearest_pcd(list(self.columns.T), self.law)[3]
+        amplitude, weight = self.own_satellites.T
+        pattern = np.array(self.law.free_satellite_pattern).reshape(-1, 2)
+        mean, square = pattern.T[0] @ pattern[:, 1], pattern.T[0] ** 2 @ pattern[:, 1]
+        own = (weight * square - (weight * mean) ** 2) * (amplitude / self.columns[:, 1]) ** 2
+        return np.asarray((sigma**2 + own).reshape(self.shape))
+
+    def with_law(self, law: SampleLaw) -> Calibration:
+        """Return it with another law of the samples."""
+        return replace(self, law=law)
+
+
+def covariance_of(stderr: FloatArray, correlation: FloatArray) -> FloatArray:
+    """Return the covariance of (g, mu, sigma) from what the fit stores.
+
+    Args:
+        stderr: of (H, g, mu, sigma), shape (4, y, x).
+        correlation: of (H, g), (H, mu), (H, sigma), (g, mu), (g, sigma), (mu, sigma), shape (y, x, 6).
+
+    Returns:
+        Shape (y, x, 3, 3), in units of the parameters.
+    """
+    matrix = np.zeros((*stderr.shape[1:], 3, 3))
+    for place, (i, j) in {3: (0, 1), 4: (0, 2), 5: (1, 2)}.items():
+        matrix[..., i, j] = matrix[..., j, i] = correlation[..., place] * stderr[1 + i] * stderr[1 + j]
+    for i in range(3):
+        matrix[..., i, i] = stderr[1 + i] ** 2
+    return matrix

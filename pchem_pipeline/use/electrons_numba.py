@@ -1,0 +1,94 @@
+"""Loops over the samples of calibrated frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+
+__all__ = ["add_up", "subtract_and_scale", "whole_parts"]
+
+Float32Array = NDArray[np.float32]
+
+
+@kernel
+def subtract_and_scale(
+    frames: NDArray[Any],
+    gain: Float32Array,
+    bias: Float32Array,
+    rows: Float32Array,
+    columns: Float32Array,
+    out: Float32Array,
+) -> None:
+    """Fill ``g (x - mu - row - column)``.
+
+    Args:
+        frames: DN, shape (frame, y, x).
+        gain: e-/DN, shape (y, x).
+        bias: DN, shape (y, x).
+        rows: offset of each row of each frame, DN, shape (frame, y), or (0, 0): none.
+        columns: offset of each column of each frame, DN, shape (frame, x), or (0, 0): none.
+        out: out, e-.
+    """
+    offset = np.zeros(frames.shape[2], np.float32)
+    for t in range(frames.shape[0]):
+        for y in range(frames.shape[1]):
+            if rows.shape[0] > 0:
+                for x in range(frames.shape[2]):
+                    offset[x] = rows[t, y] + columns[t, x]
+            for x in range(frames.shape[2]):
+                out[t, y, x] = gain[y, x] * (np.float32(frames[t, y, x]) - bias[y, x] - offset[x])
+
+
+@kernel
+def add_up(
+    frames: NDArray[Any],
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Add x, x^2 and, where there are offsets, x - b and (x - b)^2 of each pixel to its sums.
+
+    Args:
+        frames: DN, shape (frame, y, x).
+        rows, columns: offsets, DN, as in `subtract_and_scale`.
+        sums: out, shape (4, y, x); the last two stay where there are no offsets.
+    """
+    for t in range(frames.shape[0]):
+        for y in range(frames.shape[1]):
+            for x in range(frames.shape[2]):
+                value = np.float64(frames[t, y, x])
+                sums[0, y, x] += value
+                sums[1, y, x] += value * value
+                if rows.shape[0] > 0:
+                    value -= rows[t, y] + columns[t, x]
+                    sums[2, y, x] += value
+                    sums[3, y, x] += value * value
+
+
+@kernel
+def whole_parts(
+    frames: NDArray[Any],
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+    parts: int,
+    lift: int,
+    out: NDArray[np.uint32],
+) -> None:
+    """Fill ``x - b`` in whole parts of a DN, ``lift`` DN higher so that none is negative.
+
+    Args:
+        frames: DN, shape (frame, y, x).
+        rows, columns: offsets, DN, shape (frame, y) and (frame, x).
+        parts: codes in a DN.
+        lift: DN.
+        out: out, shape of the frames.
+    """
+    for t in range(frames.shape[0]):
+        for y in range(frames.shape[1]):
+            for x in range(frames.shape[2]):
+                value = np.float64(frames[t, y, x]) + lift - rows[t, y] - columns[t, x]
+                out[t, y, x] = np.uint32(max(value * parts + 0.5, 0.0))
