@@ -162,6 +162,55 @@ def _discrepancy() -> list[Variable]:
     ]
 
 
+def _applied() -> list[Variable]:
+    """Return what `pchem apply` makes of other frames of the sensor."""
+    cube = ("frame", *_MAP)
+    found: list[tuple[str, tuple[str, ...], str, str, str]] = [
+        ("frame", ("frame",), "int64", "1", "number of the frame, over all files"),
+        ("y", ("y",), "int64", "pixel", "row of the run"),
+        ("x", ("x",), "int64", "pixel", "column of the run"),
+        ("electrons", cube, "float32", "e-", "signal after two-point correction, g (x - mu)"),
+        ("electrons_stderr_read", _MAP, "float32", "e-", "standard error of a sample from read noise"),
+        (
+            "electrons_stderr_calibration",
+            _MAP,
+            "float32",
+            "e-",
+            "standard error from the calibration at the mean signal, common to all frames",
+        ),
+        (
+            "calibration_variance",
+            ("power", *_MAP),
+            "float64",
+            "e-2",
+            "c_0, c_1, c_2 of the variance c_0 + c_1 E + c_2 E^2 from the calibration at a signal of E e-",
+        ),
+        ("mean_signal", _MAP, "float64", "e-", "mean signal of the frames"),
+        ("electron_number", cube, "*", "e-", "most probable electron number"),
+        ("number_probability", cube, "float32", "1", "probability that the electron number is right"),
+        ("expected_number", cube, "float32", "e-", "mean of the electron number given the sample"),
+        ("exposure", _MAP, "float64", "e-", "quanta exposure of these frames, by maximum likelihood"),
+        ("exposure_stderr", _MAP, "float64", "e-", "standard error of the exposure, both parts together"),
+        ("exposure_stderr_counting", _MAP, "float64", "e-", "its part from the samples"),
+        ("exposure_stderr_calibration", _MAP, "float64", "e-", "its part from the calibration"),
+        ("quality", _MAP, "uint32", "1", "why a pixel has no value, or deserves caution; 0 is fine"),
+        ("row_offset", ("frame", "y"), "float32", "DN", "offset of the row that was taken from the samples"),
+        ("column_offset", ("frame", "x"), "float32", "DN", "offset of the column, likewise"),
+        ("noise_before", _MAP, "float64", "e-", "standard deviation over the frames as they came"),
+        ("noise_after", _MAP, "float64", "e-", "standard deviation without the offsets"),
+    ]
+    # what is done so far, while it is being made
+    parts: list[tuple[str, tuple[str, ...], str, str, str]] = [
+        ("sums", ("segment", "sum", *_MAP), "float64", "1", "sums over a segment of the frames"),
+        ("range", ("end", *_MAP), "int64", "1", "smallest and largest code"),
+    ]
+    return [
+        Variable(f"{group}/{name}", dims, dtype, unit, words)
+        for group, variables in (("applied", found), ("applied_parts", parts))
+        for name, dims, dtype, unit, words in variables
+    ]
+
+
 _ALL: list[Variable] = [
     Variable("frames/dn", ("frame", "y", "x"), "*", "DN", "raw frames"),
     # counts per pixel; DN of bin b is origin + b
@@ -380,6 +429,7 @@ _ALL: list[Variable] = [
         "part of the frames at each added exposure",
     ),
     # other methods beside PCH-EM; the attribute `methods` of the estimates names the axis `method`
+    *_applied(),
     Variable("methods/pixel_y", ("pixel",), "int32", "1", "row of the compared pixel"),
     Variable("methods/pixel_x", ("pixel",), "int32", "1", "column of the compared pixel"),
     *[

@@ -14,6 +14,7 @@ import typer
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ExitCode, PchEmError
+from pchem_pipeline.cli.apply import apply
 from pchem_pipeline.cli.methods import methods
 from pchem_pipeline.cli.options import Progress, Quiet, Strict, Target, Workers, region_of, takes_command
 from pchem_pipeline.cli.plan import plan
@@ -190,6 +191,7 @@ def joint(
     run_joint(target, command, typer.echo, is_new=is_new, strict=strict)
 
 
+app.command()(apply)
 app.command()(methods)
 app.command()(plan)
 

@@ -127,7 +127,12 @@ def region_of(text: str | None) -> tuple[int, int, int, int] | None:
 
 
 def _command(
-    *, force: bool, dry_run: bool, tiles: str | None = None, roi: str | None = None, **rest: Any
+    *,
+    force: bool = False,
+    dry_run: bool = False,
+    tiles: str | None = None,
+    roi: str | None = None,
+    **rest: Any,
 ) -> Command:
     """Return what the common options ask for."""
     from pchem_pipeline.run.session import Command

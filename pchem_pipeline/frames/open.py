@@ -11,22 +11,25 @@ from pchem_pipeline.frames.settings import InputSettings
 __all__ = ["open_frames"]
 
 
-def open_frames(settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True) -> FrameSequence:
+def open_frames(
+    settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True, least: int = 2
+) -> FrameSequence:
     """Open all camera files as one stack, with bit shift, region of interest and frame range applied.
 
     Args:
         settings: the section ``input``.
         base_dir: folder to which relative paths refer.
         check_duplicates: also look for files with the same content (reads a little of each file).
+        least: frames that there must be.
 
     Returns:
         One reader, that can be shared by threads and pickled to other processes; its ``report`` says what
         was found and left out.
 
     Raises:
-        InputError: bad files (all in one message), fewer than two frames, or a region outside of the frames.
+        InputError: bad files (all in one message), too few frames, or a region outside of the frames.
         ConfigError: an unknown format, or an optional library is missing.
     """
     readers, report = survey(settings, base_dir, check_duplicates=check_duplicates)
     report.raise_if_refused(settings.on_bad_file)
-    return FrameSequence(readers, settings, report)
+    return FrameSequence(readers, settings, report, least)

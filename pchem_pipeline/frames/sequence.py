@@ -30,11 +30,13 @@ class FrameSequence(FrameReader):
 
     format_name = "sequence"
 
-    def __init__(self, readers: Sequence[FrameReader], settings: InputSettings, report: InputReport) -> None:
+    def __init__(
+        self, readers: Sequence[FrameReader], settings: InputSettings, report: InputReport, least: int = 2
+    ) -> None:
         """Join the readers; see `pchem_pipeline.frames.open.open_frames`, which makes them.
 
         Raises:
-            InputError: fewer than two frames, a region of interest or frame range outside of the stack, or
+            InputError: too few frames, a region of interest or frame range outside of the stack, or
                 files that contradict each other on bit depth, bit shift or integration time.
         """
         self.report = report
@@ -42,13 +44,13 @@ class FrameSequence(FrameReader):
         self.paths = tuple(path for reader in readers for path in reader.paths)
         self._ends = np.cumsum([reader.shape[0] for reader in readers]).tolist()
         total = self._ends[-1] if self._ends else 0
-        if total < 2:
+        if total < least:
             raise InputError(
-                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)} in all; at least 2 are needed, "
+                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)} in all; at least {least} needed, "
                 "and some "
                 "thousands for useful estimates; add frames to input.files"
             )
-        self._first, end = _frame_range(settings, total)
+        self._first, end = _frame_range(settings, total, least)
         rows, columns = readers[0].shape[1:]
         self._y0, y1, self._x0, self._x1 = _region(settings, rows, columns)
         self._columns = columns
@@ -186,12 +188,13 @@ def _first_of_each(values: dict[str, Any]) -> list[tuple[str, Any]]:
     return [(file, value) for value, file in seen.items()][:4]
 
 
-def _frame_range(settings: InputSettings, total: int) -> tuple[int, int]:
+def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, int]:
     first, end = settings.frame_range or (0, None)
     end = total if end is None else end
-    if end > total or end - first < 2:
+    if end > total or end - first < least:
         raise InputError(
-            f"input.frame_range [{first}, {end}] does not hold at least 2 of the {total} frames; correct it"
+            f"input.frame_range [{first}, {end}] does not hold at least {least} of the {total} frames; "
+            "correct it"
         )
     return first, end
 

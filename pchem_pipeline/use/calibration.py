@@ -13,8 +13,8 @@ from pchem_pipeline.model.maps.pixels import FloatArray, usable_pixels
 
 __all__ = ["PEAKS_OVERLAP_E", "Calibration", "covariance_of"]
 
-#: Read noise, e-, above which the peaks of neighbouring electron numbers overlap so far that the most probable
-#: number is often wrong, and the expectation says more.
+#: Read noise, e-, above which the peaks of neighbouring electron numbers overlap so far that the most
+#: probable number is often wrong, and the expectation says more.
 PEAKS_OVERLAP_E = 0.4
 
 
@@ -54,7 +54,7 @@ class Calibration:
         known = usable_pixels(
             np.nan_to_num(self.quanta_exposure), self.conversion_gain, self.bias, self.read_noise_dn
         )
-        return known & ((self.fit_status & np.uint16(int(FAILED))) == 0)
+        return np.asarray(known & ((self.fit_status & np.uint16(int(FAILED))) == 0))
 
     @property
     def columns(self) -> FloatArray:

@@ -50,12 +50,14 @@ def add_up(
     columns: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Add x, x^2 and, where there are offsets, x - b and (x - b)^2 of each pixel to its sums.
+    """Add x, x^2 and, where there are offsets, those of x - b of each pixel to its sums, and see its range.
 
     Args:
         frames: DN, shape (frame, y, x).
-        rows, columns: offsets, DN, as in `subtract_and_scale`.
-        sums: out, shape (4, y, x); the last two stay where there are no offsets.
+        rows: offsets, DN, as in `subtract_and_scale`.
+        columns: likewise.
+        sums: out, shape (6, y, x): x, x^2, the same without offsets (they stay where there are none), and
+            the smallest and largest x.
     """
     for t in range(frames.shape[0]):
         for y in range(frames.shape[1]):
@@ -63,6 +65,8 @@ def add_up(
                 value = np.float64(frames[t, y, x])
                 sums[0, y, x] += value
                 sums[1, y, x] += value * value
+                sums[4, y, x] = min(sums[4, y, x], value)
+                sums[5, y, x] = max(sums[5, y, x], value)
                 if rows.shape[0] > 0:
                     value -= rows[t, y] + columns[t, x]
                     sums[2, y, x] += value
@@ -82,7 +86,8 @@ def whole_parts(
 
     Args:
         frames: DN, shape (frame, y, x).
-        rows, columns: offsets, DN, shape (frame, y) and (frame, x).
+        rows: offsets, DN, shape (frame, y).
+        columns: offsets, DN, shape (frame, x).
         parts: codes in a DN.
         lift: DN.
         out: out, shape of the frames.

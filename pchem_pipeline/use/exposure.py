@@ -44,8 +44,8 @@ def estimate_exposure(
 ) -> ExposureMaps:
     """Return the exposure of largest likelihood, with g, mu and sigma held at their estimates.
 
-    ``sum_i c_i log sum_k P(k; H) P(x_i | k)``, the cells of the codes integrated exactly; effects of the model
-    are in the law. It uses what a sample says of its electron number, where the mean of rounded or of
+    ``sum_i c_i log sum_k P(k; H) P(x_i | k)``, the cells of the codes integrated exactly; effects of the
+    model are in the law. It uses what a sample says of its electron number, where the mean of rounded or of
     corrected frames adds the read noise to that of the numbers.
 
     Args:

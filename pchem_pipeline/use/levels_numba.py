@@ -93,7 +93,7 @@ def _tail_between(lower: float, upper: float, mean: float, sd: float, table: Flo
     # `normal_tail` takes infinity as no tail
     below, _ = normal_tail(z0, table)
     above, _ = normal_tail(z1, table)
-    inside = above - below
+    inside: float = above - below
     return inside + 1.0 if z0 <= 0.0 < z1 else inside
 
 
@@ -130,10 +130,14 @@ def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
             part = component(float(k), peak, theta, cells, _REACH)
             for i in range(low, high):
                 value = codes.first + i / codes.parts
-                whole = int(math.floor(value + 0.5))
+                whole = math.floor(value + 0.5)
                 aside = value - whole
                 share[place + i - low] += weight * _tail_between(
-                    cells.edges[whole] + aside, cells.edges[whole + 1] + aside, part.mean, part.sd, cells.table
+                    cells.edges[whole] + aside,
+                    cells.edges[whole + 1] + aside,
+                    part.mean,
+                    part.sd,
+                    cells.table,
                 )
         place += max(0, high - low)
     return Levels(number, lows, highs, start, share)
@@ -224,7 +228,8 @@ def _score_at(
     cells = cells_of(pixel, np.int64(0))
     levels = list_levels(theta, cells, codes)
     _, score, _ = _evaluate(exposure, cells, levels, counts, sums)
-    return score / exposure
+    slope: float = score / exposure
+    return slope
 
 
 @kernel
@@ -237,11 +242,11 @@ def _ready(
     satellites: FloatArray,
     pixel: Pixel,
 ) -> tuple[Pixel, Codes]:
-    """Fill what the law says of a pixel whose codes are ``(first + i) / parts`` DN; return it and the codes."""
+    """Fill what the law says of a pixel whose codes are ``(first + i) / parts`` DN; return both."""
     value = first / parts
-    whole = int(math.floor(value + 0.5))
+    whole = math.floor(value + 0.5)
     codes = Codes(value - whole, parts, n)
-    n_whole = int(math.floor(codes.first + (n - 1) / parts + 0.5)) + 1
+    n_whole = math.floor(codes.first + (n - 1) / parts + 0.5) + 1
     pixel.facts[0, N_BINS], pixel.facts[0, FIRST] = float(n_whole), 0.0
     found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.table, whole, 0.0)
     resolve(law, index, satellites[index, 0], found)
@@ -269,7 +274,8 @@ def estimate_exposures(
         covariance: of (g, mu, sigma), shape (n, 3, 3).
         satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
         law: of the samples.
-        out: out, H, its standard error by counting, and that from the calibration, shape (n, 3); comes as NaN.
+        out: out, H, its standard error by counting, and that from the calibration, shape (n, 3); comes as
+            NaN.
     """
     n_codes = counts.shape[1]
     room, scratch = _make_room(n_codes + 2, law)
@@ -366,7 +372,7 @@ def fill_tables(
         first: first code of each pixel, in parts of a DN, shape (n,).
         start: place of its first code in the tables; the last element is their length, shape (n + 1,).
         parts: codes in a DN.
-        prior: exposure that the samples are expected to have, e-; ``NO_PRIOR``: all numbers alike; shape (n,).
+        prior: exposure to expect, e-; ``NO_PRIOR``: all numbers alike; shape (n,).
         parameters: (H, g, mu, sigma), shape (n, 4).
         satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
         law: of the samples.
@@ -419,7 +425,7 @@ def fill_tables(
                 expected[at + i] = np.float32(sums[1, i] / sums[0, i])
             else:  # farther from all levels than any sample of the law: the nearest
                 value = (codes.first + i / parts - theta[2]) / theta[1]
-                number[at + i] = min(max(int(math.floor(value + 0.5)), 0), largest)
+                number[at + i] = min(max(math.floor(value + 0.5), 0), largest)
 
 
 @kernel
@@ -441,9 +447,13 @@ def convert_frames(
         frames: codes, shape (frame, n).
         first: first code of each pixel, shape (n,).
         start: place of its first code in the tables, shape (n + 1,).
-        number, probability, expected: the tables.
+        number: the table of the numbers.
+        probability: that of their probabilities.
+        expected: that of the means.
         wanted: whether the mean is wanted, too.
-        out_number, out_probability, out_expected: out, shape of the frames.
+        out_number: out, shape of the frames.
+        out_probability: out, likewise.
+        out_expected: out, likewise where it is wanted.
     """
     for t in range(frames.shape[0]):
         for p in range(frames.shape[1]):

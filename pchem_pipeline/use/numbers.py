@@ -54,21 +54,20 @@ class NumberTables:
     probability: NDArray[np.float32]
     expected: NDArray[np.float32]
 
-    def convert(self, frames: NDArray[np.unsignedinteger[Any]], *, expected: bool) -> Numbers:
+    def convert(self, frames: NDArray[np.unsignedinteger[Any]], *, expected: bool, lift: int = 0) -> Numbers:
         """Return the electron numbers of samples, which must lie within the codes of their pixels.
 
         Args:
             frames: codes, shape (frame, y, x).
             expected: whether the mean is wanted, too.
+            lift: by which the codes were raised.
         """
         n_frames, n = frames.shape[0], self.first.size
         number = np.empty((n_frames, n), self.number.dtype)
         probability = np.empty((n_frames, n), np.float32)
         mean = np.empty((n_frames, n) if expected else (0, 0), np.float32)
-        tables = (self.first, self.start, self.number, self.probability, self.expected)
-        levels_numba.convert_frames(
-            frames.reshape(n_frames, n), *tables, expected, number, probability, mean
-        )
+        tables = (self.first + lift, self.start, self.number, self.probability, self.expected)
+        levels_numba.convert_frames(frames.reshape(n_frames, n), *tables, expected, number, probability, mean)
         shape = (n_frames, *self.shape)
         return Numbers(
             number.reshape(shape), probability.reshape(shape), mean.reshape(shape) if expected else mean
@@ -91,8 +90,8 @@ def number_tables(
 ) -> NumberTables:
     """Return the electron number of each code that pixels have shown.
 
-    The most probable k has the largest ``P(k; H) P(x | k)``; that it is right has the probability of its share
-    in the sum over all k. Without a prior all k are alike beforehand.
+    The most probable k has the largest ``P(k; H) P(x | k)``; that it is right has the probability of its
+    share in the sum over all k. Without a prior all k are alike beforehand.
 
     Args:
         minimum: smallest code of each pixel, shape (y, x).

@@ -14,7 +14,13 @@ from pchem_pipeline.stages.table import pipeline
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DOCS = "\n".join(
     (ROOT / "docs" / name).read_text(encoding="utf-8")
-    for name in ("first_run.md", "howto/missing_effects.md", "howto/methods_and_plans.md", "howto/cron.md")
+    for name in (
+        "first_run.md",
+        "howto/missing_effects.md",
+        "howto/methods_and_plans.md",
+        "howto/cron.md",
+        "howto/use_the_sensor.md",
+    )
 )
 
 

@@ -1,4 +1,4 @@
-"""Files of parameter maps for other programs: FITS, TIFF and npz."""
+"""Files of parameter maps for other programs: FITS, TIFF and npz; and images that others made."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["MapImage", "write_fits", "write_npz", "write_tiff"]
+__all__ = ["MapImage", "read_image", "write_fits", "write_npz", "write_tiff"]
 
 
 @dataclass(frozen=True)
@@ -110,3 +111,48 @@ def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
     with whole_file(path) as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     return [path]
+
+
+def read_image(path: Path) -> NDArray[np.float64]:
+    """Return an image, or a stack of images, from npy, TIFF or FITS.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Shape (y, x) or (image, y, x).
+
+    Raises:
+        InputError: there is no such file, or it is no image.
+    """
+    kinds = {".npy": _read_npy, ".tif": _read_tiff, ".tiff": _read_tiff}
+    kinds |= dict.fromkeys((".fits", ".fit", ".fts"), _read_fits)
+    kind = kinds.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(f"{path}: an image is read from .npy, .tif or .fits")
+    try:
+        values = np.squeeze(np.asarray(kind(path), np.float64))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as an image ({error})") from error
+    if values.ndim not in (2, 3):
+        raise InputError(f"{path}: an array of {values.ndim} axes; an image has two, a sequence three")
+    return values
+
+
+def _read_npy(path: Path) -> Any:
+    return np.load(path, allow_pickle=False)
+
+
+def _read_tiff(path: Path) -> Any:
+    import tifffile
+
+    return tifffile.imread(path)
+
+
+def _read_fits(path: Path) -> Any:
+    require("astropy.io.fits", "fits", "FITS files")
+    from astropy.io import fits
+
+    return fits.getdata(path)

@@ -1,0 +1,1 @@
+"""``pchem apply``: other frames of a characterised sensor in physical units."""

@@ -1,0 +1,389 @@
+"""``pchem apply``: from frames and a run to calibrated frames, piece by piece."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pchem_pipeline import __version__
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, StoreError
+from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
+from pchem_pipeline.commands.apply.files import write_files
+from pchem_pipeline.commands.apply.finish import finish_maps
+from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
+from pchem_pipeline.commands.apply.source import check_level, open_like_run, top_code
+from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece
+from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.frames.formats.map_files import read_image
+from pchem_pipeline.model.histogram.count import choose_bins, pixels_by_range
+from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.session import Command, with_overrides
+from pchem_pipeline.run.signals import stop_on_signals
+from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.stages.histogram.memory import band_bytes
+from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.remote_path import place_of
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
+from pchem_pipeline.use.numbers import number_type
+
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.sequence import FrameSequence
+    from pchem_pipeline.run.target import Target
+
+__all__ = ["apply_to_frames"]
+
+#: Name of the work in the records of the output.
+STAGE = "apply"
+_VERSION = 1
+_PRODUCT = "calibrated frames"
+_CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
+_SEGMENT_SAMPLES = 1 << 27
+#: Bytes that a code of a pixel takes while numbers are looked up.
+_BYTES_OF_CODE = 12
+_MAPS = ("electrons_stderr_read", "electrons_stderr_calibration", "mean_signal")
+_EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
+
+
+def apply_to_frames(
+    target: Target, files: Sequence[str | Path], output: Path, wanted: ApplySettings, command: Command
+) -> list[Path]:
+    """Write other frames of the sensor of a run in physical units.
+
+    A command that was stopped goes on where it was, and gives the same.
+
+    Args:
+        target: the run.
+        files: camera files, globs, folders or URLs.
+        output: a zarr store, or a folder of TIFF or FITS files.
+        wanted: what to write.
+        command: of the command line; ``options.force`` replaces an output that is there.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: the frames do not fit the run.
+        StoreError: the run is not finished, or the output is something else.
+        ConfigError: the output exists with other settings.
+    """
+    target = with_overrides(target, command)
+    run = RunStore.open(target.store)
+    reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
+    with contextlib.ExitStack() as stack:
+        stack.callback(reporter.close)
+        made = _make_job(run, target, files, wanted)
+        output = place_of(output)
+        place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")
+        if wanted.format != "zarr" and _is_done(output, made.content, command):
+            reporter.info(f"apply: {output} is up to date")
+            return sorted(output.iterdir())
+        store, fresh = _output_store(place, made.content, force=command.options.force)
+        stack.enter_context(store.locked())
+        stop = stack.enter_context(stop_on_signals())
+        executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
+        stack.callback(executor.close)
+        context = StageContext(
+            target.config, target.base_dir, store, executor, reporter, stop, stage=STAGE, fresh=fresh
+        )
+        context.fingerprint = fingerprint_of(made.content)
+        for remark in made.remarks:
+            reporter.warning(remark)
+        _do(context, replace(made.job, output=store.path), made, wanted)
+        if wanted.format == "zarr":
+            return [output]
+        written = write_files(store, output, wanted.format, made.content)
+    shutil.rmtree(place, ignore_errors=True)
+    return written
+
+
+@dataclass(frozen=True)
+class _Made:
+    """All that is known before anything is written.
+
+    Attributes:
+        job: without the output.
+        content: what decides the result, as JSON data.
+        remarks: for the user.
+        calibration: of all pixels.
+        frames: to be calibrated.
+    """
+
+    job: Job
+    content: dict[str, Any]
+    remarks: list[str]
+    calibration: Calibration
+    frames: FrameSequence
+
+
+def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings) -> _Made:
+    digest = check_run(run)
+    sensor = SensorInfo.read(run)
+    frames = open_like_run(target, sensor, files)
+    top = top_code(frames, sensor)
+    calibration = read_calibration(run, top=top)
+    remarks = check_level(frames, calibration)
+    known = calibration.usable
+    noise = (calibration.conversion_gain * calibration.read_noise_dn)[known]
+    overlap = int((noise > PEAKS_OVERLAP_E).sum())
+    numbers = "numbers" in wanted.kinds
+    if numbers and overlap:
+        remarks.append(
+            f"{overlap} of {known.sum()} pixels have a read noise above {PEAKS_OVERLAP_E} e-: their most "
+            "probable electron number is often wrong, expected_number is the better answer"
+        )
+    prior_map = _prior_map(wanted.prior, sensor.shape) if numbers else None
+    job = Job(
+        target.store,
+        target.store,
+        frames,
+        wanted.kinds,
+        wanted.prior,
+        prior_map,
+        top,
+        depth=_chunks(frames.shape)[0],
+        expected=numbers and overlap > 0,
+    )
+    version = model_of(run, "fit")
+    content = {
+        "product": _PRODUCT,
+        "version": _VERSION,
+        "program": __version__,
+        "run": target.store.name,
+        "run_digest": digest,
+        "model": "PCD" if version is None else model_words(version.effects),
+        "frames": frames.quick_identity()["files"],
+        "settings": {
+            **asdict(wanted),
+            "kinds": list(wanted.kinds),
+            "prior": wanted.prior if prior_map is None else _digest(prior_map),
+        },
+    }
+    return _Made(job, content, remarks, calibration, frames)
+
+
+def _digest(values: Any) -> str:
+    import hashlib
+
+    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()[:16]
+
+
+def _prior_map(prior: str, shape: tuple[int, int]) -> Any:
+    """Return the map that a prior stands for; None where it is a word.
+
+    Raises:
+        ConfigError: it is none of what it can be.
+    """
+    if prior in ("frames", "flat", "run"):
+        return None
+    try:
+        value = float(prior)
+    except ValueError:
+        found = read_image(Path(prior))
+        if found.shape != shape:
+            raise ConfigError(f"--prior {prior}: a map of {found.shape}, the sensor is {shape}") from None
+    else:
+        found = np.full(shape, value)
+    if not (np.isnan(found) | (found >= 0.0)).all():
+        raise ConfigError(
+            f"--prior {prior}: an exposure is 0 or more e-; write frames, flat, run, H or a file"
+        )
+    return found
+
+
+# -- the output ------------------------------------------------------------------------------------
+
+
+def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
+    """Tell whether a folder of files is what is wanted.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if not output.exists():
+        return False
+    from pchem_pipeline.store.files import read_json
+
+    if output.is_dir() and not any(output.iterdir()):
+        return False
+    there = read_json(output / "provenance.json") if output.is_dir() else None
+    if there == content and not command.options.force:
+        return True
+    if not command.options.force or (there or {}).get("product") != _PRODUCT:
+        raise _exists(output, ours=(there or {}).get("product") == _PRODUCT)
+    return False
+
+
+def _exists(output: Path, *, ours: bool) -> ConfigError:
+    cure = ", or replace it with --force" if ours else ""
+    what = "was made of other frames or with other settings" if ours else "holds no calibrated frames"
+    return ConfigError(f"{output} exists and {what}; choose another --output{cure}")
+
+
+def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple[RunStore, bool]:
+    """Return the store that is written, and whether it is begun anew.
+
+    Raises:
+        ConfigError: it holds something else, or other frames.
+    """
+    if place.exists() and not (place / "zarr.json").exists() and (not place.is_dir() or any(place.iterdir())):
+        raise _exists(place, ours=False)
+    is_new = not (place / "zarr.json").exists()
+    if not is_new:
+        try:
+            there = RunStore.open(place).attributes("applied").get("provenance", {})
+        except StoreError:
+            raise _exists(place, ours=False) from None
+        if there.get("product") != _PRODUCT:
+            raise _exists(place, ours=False)
+        if there == content and not force:
+            return RunStore.open(place, writable=True), False
+        if not force:
+            raise _exists(place, ours=True)
+    store = RunStore.create(place)
+    for group in ("applied", "applied_parts"):
+        store.delete(group)
+    store.records.forget(STAGE)
+    record = StageRecord(STAGE, _VERSION, fingerprint_of(content), content)
+    store.set_attributes("applied", {"provenance": content, "title": _PRODUCT})
+    store.records.write(record)
+    return store, True
+
+
+def _chunks(shape: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return frames, rows and columns of a chunk."""
+    rows, columns = min(shape[1], _CHUNK_ROWS), min(shape[2], _CHUNK_COLUMNS)
+    depth = max(1, min(_CHUNK_SAMPLES // (rows * columns), _CHUNK_FRAMES, shape[0]))
+    return depth, rows, columns
+
+
+def _create(context: StageContext, job: Job, n_segments: int) -> None:
+    """Make the arrays."""
+    n, ny, nx = job.source.shape
+    depth, rows, columns = _chunks((n, ny, nx))
+    cubes = ["electrons"] if "electrons" in job.kinds else []
+    if "numbers" in job.kinds:
+        cubes += ["electron_number", "number_probability"]
+        cubes += ["expected_number"] if job.expected else []
+    for name in cubes:
+        facts: dict[str, Any] = {}
+        if name == "electron_number":
+            largest = int(np.iinfo(job.number_type).max)
+            # not missing_value: xarray would turn the integers into floats
+            facts = {"dtype": job.number_type, "no_number": largest, "largest_number": largest - 1}
+        context.create(f"applied/{name}", (n, ny, nx), chunks=(depth, rows, columns), **facts)
+    if job.converts:
+        context.create("applied_parts/sums", (n_segments, N_SUMS, ny, nx), chunks=(1, N_SUMS, rows, nx))
+
+
+def _create_counted(context: StageContext, job: Job) -> None:
+    _, ny, nx = job.source.shape
+    rows = _chunks(job.source.shape)[1]
+    context.create("applied_parts/range", (2, ny, nx), chunks=(2, rows, nx))
+    for name in _EXPOSURE if job.estimates else ():
+        context.create(f"applied/{name}", (ny, nx), chunks=(rows, nx))
+
+
+# -- the work --------------------------------------------------------------------------------------
+
+
+def _do(context: StageContext, job: Job, made: _Made, wanted: ApplySettings) -> None:
+    """Bring the output up to date.
+
+    Raises:
+        IncompleteRunError: pieces failed; the others are kept.
+    """
+    record = context.store.records.read(STAGE)
+    if record is not None and record.finished and not context.fresh:
+        context.reporter.info(f"apply: {context.store.path} is up to date")
+        return
+    if job.counts:
+        job = _counted(context, job, made)
+    if job.converts:
+        _converted(context, job)
+    if context.failed:
+        key, reason = next(iter(context.failed.items()))
+        raise IncompleteRunError(
+            f"{len(context.failed)} pieces failed, first {key}: {reason}; the rest is kept, run again to "
+            "retry"
+        )
+    finish_maps(context.store, job, made.calibration, context.reporter)
+    if record is not None:
+        context.store.records.write(replace(record, finished=True, keys=context.n_keys))
+    context.store.delete("applied_parts")
+
+
+def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
+    """Return the rows that a worker takes at a time: whole chunks."""
+    _, ny, nx = job.source.shape
+    rows = _chunks(job.source.shape)[1]
+    allowed = band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
+    fitting = max(1, allowed // (bytes_of_pixel * nx * rows))
+    shared = max(1, -(-ny // (rows * context.executor.workers)))  # one for each worker
+    return rows * min(fitting, shared)
+
+
+def _bands(ny: int, step: int) -> list[tuple[int, int]]:
+    return [(y, min(y + step, ny)) for y in range(0, ny, step)]
+
+
+def _counted(context: StageContext, job: Job, made: _Made) -> Job:
+    """Count the frames; return the job with the type of the electron numbers."""
+    n, ny, _ = job.source.shape
+    job = replace(job, bins=_bins(context, made.frames), window=min(job.window, n))
+    _create_counted(context, job)
+    bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
+    pieces = [Piece("count", *band, 0, n) for band in _bands(ny, _rows_of_band(context, job, bytes_of_pixel))]
+    context.run_units(pieces, functools.partial(count_piece, job=job), unit_name="band", by_tiles=False)
+    if context.failed or "numbers" not in job.kinds:
+        return job
+    top = context.store.read("applied_parts/range", (slice(1, 2), slice(None), slice(None)))[0]
+    known = made.calibration.usable
+    dn = top[known] / job.parts - job.lift
+    reach = (dn - made.calibration.bias[known]) * made.calibration.conversion_gain[known]
+    reach += 9.0 * (made.calibration.read_noise_dn * made.calibration.conversion_gain)[known]
+    return replace(job, number_type=number_type(float(reach.max(initial=0.0))))
+
+
+def _bins(context: StageContext, frames: FrameSequence) -> int:
+    """Return the bins that the histograms of these frames need."""
+    settings = context.config.histogram
+    head = min(frames.shape[0], 64)
+    wide = settings.max_bins
+    pixels = sum(
+        (pixels_by_range(frames.read(0, head, *band), wide) for band in _bands(frames.shape[1], _CHUNK_ROWS)),
+        start=np.zeros(wide + 2, np.int64),
+    )
+    return choose_bins(pixels, wide)
+
+
+def _converted(context: StageContext, job: Job) -> None:
+    """Write the frames."""
+    n, ny, nx = job.source.shape
+    codes = 0
+    if "numbers" in job.kinds:
+        ends = context.store.read("applied_parts/range")
+        codes = int(np.ceil((ends[1] - ends[0] + 1).mean()))
+    bytes_of_pixel = job.depth * 24 + _BYTES_OF_CODE * codes + 400
+    step = _rows_of_band(context, job, bytes_of_pixel)
+    # independent of the workers, so that the sums are, too
+    rows = _chunks(job.source.shape)[1]
+    length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (rows * nx * job.depth)))
+    starts = range(0, n, length)
+    _create(context, job, len(starts))
+    pieces = [
+        Piece("write", *band, t0, min(t0 + length, n), number)
+        for number, t0 in enumerate(starts)
+        for band in _bands(ny, step)
+    ]
+    context.run_units(pieces, functools.partial(convert_piece, job=job), unit_name="piece", by_tiles=False)

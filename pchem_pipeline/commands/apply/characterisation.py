@@ -1,0 +1,76 @@
+"""What a run says of its pixels, read from its store."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.base.errors import StoreError, quoted
+from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.stages.fit.fitted_model import fitted_added_exposure, fitted_effects
+from pchem_pipeline.use.calibration import Calibration, covariance_of
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["check_run", "read_calibration", "remaining_effects"]
+
+
+def check_run(store: RunStore) -> str:
+    """Return the digest of the fit of a run.
+
+    Raises:
+        StoreError: the run is not finished as far as its fit.
+    """
+    record = store.records.read("fit")
+    if (
+        record is None
+        or not record.finished
+        or len(store.records.done("fit", record.fingerprint)) < record.keys
+    ):
+        raise StoreError(f"{store.path} has no complete fit; run: pchem run {quoted(store.path)}")
+    return record.fingerprint
+
+
+def remaining_effects(store: RunStore, removed: Sequence[str]) -> tuple[Effect, ...]:
+    """Return the effects of the model of a run, without those whose offsets are taken from the frames."""
+    return tuple(effect for effect in fitted_effects(store) if effect.tag not in removed)
+
+
+def read_calibration(
+    store: RunStore,
+    rows: slice = slice(None),
+    *,
+    removed: Sequence[str] = (),
+    extra_variance: float = 0.0,
+    top: int | None = None,
+) -> Calibration:
+    """Return the calibration of some rows.
+
+    Args:
+        store: the run.
+        rows: of the sensor.
+        removed: tags of effects that the frames no longer have.
+        extra_variance: of what took them away, DN^2.
+        top: largest code of the ADC, DN: codes there and at 0 are limits; None: not known.
+    """
+    region = (rows, slice(None))
+    maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
+    stderr = np.stack([store.read(f"fit/{name}_stderr", region) for name in PARAMETERS])
+    covariance = covariance_of(stderr, store.read("fit/correlation", region))
+    added = fitted_added_exposure(store, region)
+    law = sample_law(remaining_effects(store, removed), pixel_maps(maps, np.ones(maps[0].shape, bool)), added)
+    if extra_variance > 0.0:
+        law = law.with_variance(dn2=extra_variance)
+    if top is not None:
+        law = law.with_clip(0, top)
+    satellites = None
+    if all(store.has(f"fit/{name}") for name in FREE_SATELLITES):
+        satellites = np.stack([store.read(f"fit/{name}", region).ravel() for name in FREE_SATELLITES], axis=1)
+    exposure, gain, bias, sigma = maps
+    words = store.read("fit/fit_status", region)
+    return Calibration(exposure, gain, bias, sigma, covariance, words, law, satellites)

@@ -1,0 +1,79 @@
+"""What ``pchem apply`` writes when all frames are done: maps, coordinates, quality."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.commands.apply.settings import Job
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
+from pchem_pipeline.use.electrons import calibration_variance, read_stderr, stderr_at
+from pchem_pipeline.use.quality import flag_attributes, flags
+
+__all__ = ["finish_maps"]
+
+_BELOW = 5.0  # standard errors of the mean
+
+
+def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: Reporter) -> None:
+    """Write maps, quality and coordinates; they are small, and written whole."""
+    n, ny, nx = job.source.shape
+    for name, length in (("frame", n), ("y", ny), ("x", nx)):
+        output.write_array(f"applied/{name}", np.arange(length, dtype=np.int64))
+    sums = _sums(output) if job.converts else None
+    raised = {"peaks_overlap": calibration.conversion_gain * calibration.read_noise_dn > PEAKS_OVERLAP_E}
+    if "electrons" in job.kinds:
+        assert sums is not None
+        _write_errors(output, calibration, sums, n)
+    if sums is not None:
+        raised |= _flags_of_sums(calibration, sums, n, job.top)
+    if job.counts:
+        ends = output.read("applied_parts/range")
+        raised["outside_histogram"] = (ends[1] - ends[0]) >= job.bins
+    quality = flags(calibration.fit_status, **raised)
+    output.write_array("applied/quality", quality, flag_attributes())
+    bad = int((~calibration.usable).sum())
+    reporter.info(
+        f"apply: {n} frames of {ny} x {nx} pixels"
+        + (f"; {bad} pixels without a calibration are NaN, see quality" if bad else "")
+    )
+
+
+def _sums(output: RunStore) -> NDArray[np.float64]:
+    """Return the sums over all frames, segment by segment in their order."""
+    array = output.array("applied_parts/sums")
+    total: NDArray[np.float64] = output.read("applied_parts/sums", (slice(0, 1), *[slice(None)] * 3))[0]
+    for number in range(1, array.shape[0]):
+        part = output.read("applied_parts/sums", (slice(number, number + 1), *[slice(None)] * 3))[0]
+        total[:4] += part[:4]
+        total[4] = np.minimum(total[4], part[4])
+        total[5] = np.maximum(total[5], part[5])
+    return total
+
+
+def _write_errors(output: RunStore, calibration: Calibration, sums: NDArray[np.float64], n: int) -> None:
+    """Write the two parts of the standard error of electrons, and the mean signal."""
+    signal = np.where(
+        calibration.usable, calibration.conversion_gain * (sums[0] / n - calibration.bias), np.nan
+    )
+    variance = calibration_variance(calibration)
+    output.write_array("applied/mean_signal", signal)
+    output.write_array("applied/electrons_stderr_read", read_stderr(calibration).astype(np.float32))
+    output.write_array("applied/calibration_variance", variance, {"power_of_signal": [0, 1, 2]})
+    output.write_array("applied/electrons_stderr_calibration", stderr_at(variance, signal).astype(np.float32))
+
+
+def _flags_of_sums(
+    calibration: Calibration, sums: NDArray[np.float64], n: int, top: int | None
+) -> dict[str, Any]:
+    mean = sums[0] / n
+    error = np.sqrt(calibration.noise_variance_dn2 / n + calibration.covariance[..., 1, 1])
+    with np.errstate(invalid="ignore"):
+        found = {"below_bias": mean - calibration.bias < -_BELOW * error}
+    if top is not None:
+        found["at_adc_limit"] = (sums[4] <= 0) | (sums[5] >= top)
+    return found

@@ -1,0 +1,133 @@
+"""What ``pchem apply`` is asked for, and what its workers are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.frames.stream import FrameSource
+
+__all__ = ["FORMATS", "KINDS", "ApplySettings", "Job", "Piece", "kinds_of"]
+
+#: What can be asked for.
+KINDS = ("electrons", "numbers", "exposure")
+#: Formats of the output.
+FORMATS = ("zarr", "tiff", "fits")
+
+
+@dataclass(frozen=True)
+class ApplySettings:
+    """What the command line asks for.
+
+    Attributes:
+        kinds: any of `KINDS`.
+        prior: exposure that the electron numbers are expected to have: ``frames`` (estimated from these
+            frames), ``flat`` (none), ``run`` (of the characterisation), a number (e-), or a file with a map.
+        remove: take the common modes that the model of the run names from the frames.
+        format: one of `FORMATS`.
+    """
+
+    kinds: tuple[str, ...] = KINDS
+    prior: str = "frames"
+    remove: bool = True
+    format: str = "zarr"
+
+
+def kinds_of(text: str) -> tuple[str, ...]:
+    """Return the kinds that ``--what`` names.
+
+    Raises:
+        ConfigError: it names something else.
+    """
+    asked = [part.strip() for part in text.split(",") if part.strip()]
+    unknown = [part for part in asked if part not in (*KINDS, "all")]
+    if unknown or not asked:
+        raise ConfigError(f"--what {text}: choose from {', '.join(KINDS)}, all; several separated by commas")
+    return KINDS if "all" in asked else tuple(kind for kind in KINDS if kind in asked)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rows ``y0:y1`` of frames ``t0:t1``.
+
+    Attributes:
+        name: of the work.
+        number: of the segment of frames.
+    """
+
+    name: str
+    y0: int
+    y1: int
+    t0: int
+    t1: int
+    number: int = 0
+
+    @property
+    def key(self) -> str:
+        """What messages and markers call it."""
+        return f"{self.name}-{self.y0}-{self.t0}"
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its only marker."""
+        return (self.key,)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the workers know.
+
+    Attributes:
+        run: store of the characterisation.
+        output: store that is written.
+        source: the frames.
+        kinds: what is wanted.
+        prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
+        prior_map: exposure of each pixel (y, x), e-.
+        top: largest code of the ADC, DN; None: not known.
+        removed: tags of the effects whose offsets are taken from the frames; none: the frames as they come.
+        offset_variance: variance of the offsets' estimates, DN^2.
+        parts: codes in a DN.
+        lift: DN by which codes are raised so that none is negative.
+        bins: of the histograms.
+        window: frames of a block while counting.
+        depth: frames of a chunk.
+        number_type: of the electron numbers.
+        expected: whether E[k | x] is written.
+    """
+
+    run: Path
+    output: Path
+    source: FrameSource
+    kinds: tuple[str, ...]
+    prior: str = "frames"
+    prior_map: Any = None
+    top: int | None = None
+    removed: tuple[str, ...] = ()
+    offset_variance: float = 0.0
+    parts: int = 1
+    lift: int = 0
+    bins: int = 0
+    window: int = 256
+    depth: int = 1
+    number_type: Any = np.uint16
+    expected: bool = False
+
+    @property
+    def counts(self) -> bool:
+        """Whether histograms are needed."""
+        return "numbers" in self.kinds or "exposure" in self.kinds
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the exposure of these frames is needed."""
+        return "exposure" in self.kinds or ("numbers" in self.kinds and self.prior == "frames")
+
+    @property
+    def converts(self) -> bool:
+        """Whether frames are written."""
+        return "numbers" in self.kinds or "electrons" in self.kinds

@@ -1,0 +1,132 @@
+"""The frames that are to be calibrated: opened as the run's own were, and checked against the run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.use.calibration import Calibration
+
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.sequence import FrameSequence
+    from pchem_pipeline.frames.settings import InputSettings
+    from pchem_pipeline.run.target import Target
+
+__all__ = ["check_level", "open_like_run", "top_code"]
+
+#: Frames that are looked at before anything is done.
+_SEEN = 16
+#: Standard deviations of a sample below the bias at which the bias is another.
+_FAR_BELOW = 3.0
+#: Times the exposure of the characterisation beyond which a gain is extrapolated.
+_FAR_ABOVE = 30.0
+
+
+def open_like_run(target: Target, sensor: SensorInfo, files: Sequence[str | Path]) -> FrameSequence:
+    """Open other frames with what the run says of its own: format, region, bits.
+
+    Args:
+        target: the run.
+        sensor: of the run.
+        files: camera files, globs, folders or URLs; relative to the present folder.
+
+    Raises:
+        InputError: the frames do not fit the pixels of the run.
+        ConfigError: no files are named, or the run has no frames.
+    """
+    if sensor.kind == "histograms":
+        raise ConfigError(f"{target.store} was made from ready-made histograms, whose channels are no frames")
+    settings = _settings(target).model_copy(
+        update={"files": tuple(str(each) for each in files), "frame_range": None, "samples": ()}
+    )
+    if settings.roi is not None and _shape(settings) == sensor.shape:
+        settings = settings.model_copy(update={"roi": None})  # the camera read that region alone
+    frames = open_frames(settings, Path.cwd(), check_duplicates=False, least=1)
+    name = frames.paths[0]
+    if frames.shape[1:] != sensor.shape:
+        raise InputError(
+            f"{name}: frames of {_by(frames.shape[1:])} pixels, the run {target.store.name} has "
+            f"{_by(sensor.shape)}; give frames of the same sensor and region"
+        )
+    depths = frames.bit_depth, sensor.bit_depth
+    if None not in depths and depths[0] != depths[1]:
+        raise InputError(
+            f"{name}: {depths[0]} bits, the run {target.store.name} has {depths[1]}; give frames of the same "
+            "read-out mode"
+        )
+    if None in depths and frames.dtype.itemsize < np.dtype(sensor.dtype).itemsize:
+        raise InputError(
+            f"{name}: samples of {frames.dtype}, the run {target.store.name} has {sensor.dtype}; give frames "
+            "of the same read-out mode"
+        )
+    return frames
+
+
+def _settings(target: Target) -> InputSettings:
+    """Return how the run reads its files; of several exposures how the first does."""
+    if target.config.input.samples:
+        return sample_targets(target.config, target.base_dir)[0].config.input
+    return target.config.input
+
+
+def _shape(settings: InputSettings) -> tuple[int, int] | None:
+    """Return the shape of whole frames."""
+    whole = open_frames(
+        settings.model_copy(update={"roi": None}), Path.cwd(), check_duplicates=False, least=1
+    )
+    return whole.shape[1], whole.shape[2]
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(each) for each in shape)
+
+
+def top_code(frames: FrameSequence, sensor: SensorInfo) -> int | None:
+    """Return the largest code of the ADC, DN; None where it is not known."""
+    depth = frames.bit_depth or sensor.bit_depth
+    return None if depth is None else 2**depth - 1
+
+
+def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
+    """Return remarks on a mean level that does not fit the characterisation; none where it does.
+
+    Args:
+        frames: to be calibrated.
+        calibration: of all pixels.
+
+    Raises:
+        InputError: the mean lies so far below the bias that the frames are no frames of these pixels.
+    """
+    chosen = np.unique(np.linspace(0, frames.shape[0] - 1, _SEEN).astype(int))
+    mean = np.mean([frames.read(int(t), int(t) + 1)[0] for t in chosen], axis=0, dtype=np.float64)
+    known = calibration.usable
+    if not known.any():
+        raise InputError("the run has no pixel with a good fit: nothing can be calibrated with it")
+    above = (mean - calibration.bias)[known]
+    sigma, gain = calibration.read_noise_dn[known], calibration.conversion_gain[known]
+    level = float(np.median(above / sigma))
+    if level < -_FAR_BELOW:
+        raise InputError(
+            f"{frames.paths[0]}: the mean is {-np.median(above):.1f} DN below the bias of the run; these are "
+            "frames of another sensor, region, offset or temperature"
+        )
+    signal, usual = float(np.median(above * gain)), float(np.median(calibration.quanta_exposure[known]))
+    remarks = []
+    if level < -0.5:
+        remarks.append(
+            f"the mean is {-np.median(above):.2f} DN below the bias of the run: the offset has moved, take a "
+            "characterisation at the same temperature"
+        )
+    if signal > _FAR_ABOVE * max(usual, 0.1):
+        remarks.append(
+            f"the mean signal is {signal:.3g} e-, the characterisation was made at {usual:.3g} e-: the gain "
+            "is taken to be the same there"
+        )
+    return remarks

@@ -1,0 +1,144 @@
+"""What the workers of ``pchem apply`` do with a piece of the frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.commands.apply.characterisation import read_calibration
+from pchem_pipeline.commands.apply.settings import Job, Piece
+from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
+from pchem_pipeline.run.stage import open_store
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.use.calibration import Calibration
+from pchem_pipeline.use.electrons import electrons
+from pchem_pipeline.use.electrons_numba import add_up, whole_parts
+from pchem_pipeline.use.exposure import estimate_exposure
+from pchem_pipeline.use.numbers import NumberTables, number_tables
+
+__all__ = ["N_SUMS", "convert_piece", "count_piece", "offsets_of"]
+
+#: Sums of a pixel over frames: x, x^2, the same without offsets, smallest and largest x.
+N_SUMS = 6
+
+_WHOLE = slice(None)
+
+
+def offsets_of(
+    output: RunStore, job: Job, t0: int, t1: int, rows: slice
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the offsets of rows (frame, y) and columns (frame, x) of some frames, DN; empty without any."""
+    if not job.removed:
+        return np.zeros((0, 0)), np.zeros((0, 0))
+    frames = slice(t0, t1)
+    found = (
+        output.read("applied/row_offset", (frames, rows)),
+        output.read("applied/column_offset", (frames, _WHOLE)),
+    )
+    return found[0].astype(np.float64), found[1].astype(np.float64)
+
+
+def _calibration(job: Job, rows: slice) -> Calibration:
+    run = RunStore.open(job.run)
+    return read_calibration(run, rows, removed=job.removed, extra_variance=job.offset_variance, top=job.top)
+
+
+def _codes(
+    frames: NDArray[Any], job: Job, offsets: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> NDArray[Any]:
+    """Return the codes of samples: DN, or parts of a DN without the offsets."""
+    if not job.removed:
+        return frames
+    out = np.empty(frames.shape, np.uint32)
+    whole_parts(frames, *offsets, job.parts, job.lift, out)
+    return out
+
+
+# -- histograms and exposure -----------------------------------------------------------------------
+
+
+def count_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
+    """Count the frames of some rows; write the range of their codes, and their exposure if wanted."""
+    output = open_store(job.output)
+    rows = slice(piece.y0, piece.y1)
+    shape = (piece.y1 - piece.y0, job.source.shape[2])
+    accumulator = HistogramAccumulator(shape, job.bins, piece.t1)
+    with FrameStream(job.source, [(piece.y0, piece.y1)], job.window) as stream:
+        for start, (frames,) in stream:
+            offsets = offsets_of(output, job, start, start + len(frames), rows)
+            accumulator.add(_codes(frames, job, offsets))
+    found = accumulator.finish()
+    ends = np.stack([found.minimum, found.maximum]).astype(np.int64)
+    output.write("applied_parts/range", (_WHOLE, rows, _WHOLE), ends)
+    if not job.estimates:
+        return {}
+    _write_exposure(output, found, _calibration(job, rows), job, rows)
+    return {"outside": int(((found.under > 0) | (found.over > 0)).sum())}
+
+
+def _write_exposure(
+    output: RunStore, found: RowHistograms, calibration: Calibration, job: Job, rows: slice
+) -> None:
+    """Write the exposure of some rows and its errors."""
+    origin = found.origin.astype(np.int64) - job.lift * job.parts
+    maps = estimate_exposure(found.counts, origin, calibration, job.parts)
+    values = {
+        "exposure": maps.exposure,
+        "exposure_stderr": maps.stderr,
+        "exposure_stderr_counting": maps.counting,
+        "exposure_stderr_calibration": maps.calibration,
+    }
+    for name, each in values.items():
+        output.write(f"applied/{name}", (rows, _WHOLE), each)
+
+
+# -- samples ---------------------------------------------------------------------------------------
+
+
+def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
+    """Write electrons and electron numbers of a piece, and the sums over its frames."""
+    output = open_store(job.output)
+    rows = slice(piece.y0, piece.y1)
+    calibration = _calibration(job, rows)
+    tables = _tables(output, job, calibration, rows) if "numbers" in job.kinds else None
+    sums = np.zeros((N_SUMS, *calibration.shape))
+    sums[4] = np.inf
+    with FrameStream(job.source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
+        for start, (frames,) in stream:
+            offsets = offsets_of(output, job, start, start + len(frames), rows)
+            region = (slice(start, start + len(frames)), rows, _WHOLE)
+            add_up(frames, *offsets, sums)
+            if "electrons" in job.kinds:
+                output.write("applied/electrons", region, electrons(frames, calibration, offsets))
+            if tables is not None:
+                _write_numbers(output, tables, _codes(frames, job, offsets), job, region)
+    output.write(
+        "applied_parts/sums", (slice(piece.number, piece.number + 1), _WHOLE, rows, _WHOLE), sums[None]
+    )
+    return {}
+
+
+def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -> NumberTables:
+    """Return the electron numbers of the codes of some rows."""
+    ends = output.read("applied_parts/range", (_WHOLE, rows, _WHOLE)) - job.lift * job.parts
+    prior = None
+    if job.prior_map is not None:
+        prior = job.prior_map[rows]
+    elif job.prior == "frames":
+        prior = output.read("applied/exposure", (rows, _WHOLE))
+    elif job.prior == "run":
+        prior = calibration.quanta_exposure
+    return number_tables(ends[0], ends[1], prior, calibration, dtype=job.number_type, parts=job.parts)
+
+
+def _write_numbers(
+    output: RunStore, tables: NumberTables, codes: NDArray[Any], job: Job, region: tuple[slice, ...]
+) -> None:
+    found = tables.convert(codes, lift=job.lift * job.parts, expected=job.expected)
+    output.write("applied/electron_number", region, found.number)
+    output.write("applied/number_probability", region, found.probability)
+    if job.expected:
+        output.write("applied/expected_number", region, found.expected)

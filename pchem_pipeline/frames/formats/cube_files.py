@@ -1,0 +1,102 @@
+"""Stacks of images of any type for other programs: TIFF that ImageJ reads, and FITS cubes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.frames.registry import require
+from pchem_pipeline.store.files import whole_file
+
+__all__ = ["Cube", "write_fits_cube", "write_tiff_cube"]
+
+#: Bytes above which a TIFF file needs offsets of 64 bits.
+_LARGEST_TIFF = 1 << 32
+_UNSIGNED_ZERO = {2: 1 << 15, 4: 1 << 31}
+_FITS_BLOCK = 2880
+
+
+@dataclass(frozen=True)
+class Cube:
+    """An array and what it is.
+
+    Attributes:
+        name: as in the store.
+        blocks: arrays (any number of images, rows, columns), in order.
+        shape: (images, rows, columns) of all together.
+        dtype: type of the samples.
+        unit: physical unit.
+        long_name: one sentence.
+        facts: provenance, as JSON data.
+    """
+
+    name: str
+    blocks: Iterable[NDArray[Any]]
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    unit: str
+    long_name: str
+    facts: Mapping[str, Any]
+
+
+def write_tiff_cube(path: Path, cube: Cube) -> None:
+    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
+
+    Raises:
+        StoreError: the folder cannot be written.
+    """
+    import tifffile
+
+    size = int(np.prod(cube.shape)) * cube.dtype.itemsize
+    about = {
+        "name": cube.name,
+        "unit": cube.unit,
+        "long_name": cube.long_name,
+        "provenance": dict(cube.facts),
+    }
+    images = (image for block in cube.blocks for image in np.ascontiguousarray(block, cube.dtype))
+    options: dict[str, Any] = {"shape": cube.shape, "dtype": cube.dtype, "photometric": "minisblack"}
+    with whole_file(path) as part:
+        if size + (1 << 25) < _LARGEST_TIFF and cube.dtype.str[1:] in ("u1", "u2", "f4"):
+            frames = {"axes": "TYX", "Info": json.dumps(about), "unit": "pixel"}
+            tifffile.imwrite(part, images, imagej=True, metadata=frames, **options)
+        else:
+            tifffile.imwrite(part, images, bigtiff=True, metadata=about, **options)
+
+
+def write_fits_cube(path: Path, cube: Cube) -> None:
+    """Write an image of three axes, the unit in ``BUNIT``, the provenance as ``HISTORY``.
+
+    Raises:
+        StoreError: the folder cannot be written.
+        MissingDependencyError: astropy is not installed.
+    """
+    require("astropy.io.fits", "fits", "FITS files")
+    from astropy.io import fits
+
+    header = fits.Header()
+    size, is_float = cube.dtype.itemsize, cube.dtype.kind == "f"
+    header["SIMPLE"], header["BITPIX"] = True, -8 * size if is_float else 8 * size
+    header["NAXIS"] = len(cube.shape)
+    for axis, length in enumerate(reversed(cube.shape), 1):
+        header[f"NAXIS{axis}"] = length
+    zero = 0 if is_float else _UNSIGNED_ZERO.get(size, 0)
+    if zero:
+        header["BSCALE"], header["BZERO"] = 1, zero
+    header["BUNIT"], header["OBJECT"] = cube.unit, cube.name
+    header["COMMENT"] = cube.long_name
+    header["CREATOR"] = "pchem-pipeline"
+    header["HISTORY"] = json.dumps(dict(cube.facts))
+    with whole_file(path) as part, part.open("wb") as stream:
+        stream.write(header.tostring().encode("ascii"))
+        for block in cube.blocks:
+            values = np.asarray(block, cube.dtype)
+            values = values ^ cube.dtype.type(zero) if zero else values
+            stream.write(np.ascontiguousarray(values, cube.dtype.newbyteorder(">")).data)
+        stream.write(bytes(-int(np.prod(cube.shape)) * size % _FITS_BLOCK))

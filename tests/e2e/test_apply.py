@@ -1,0 +1,222 @@
+"""pchem apply: frames of a characterised camera in electrons, as a user gets them."""
+
+import json
+import os
+import signal
+import subprocess
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+from helpers.commands import Result, Shell
+from helpers.known_camera import KnownCamera
+
+from pchem_pipeline.cli.app import main
+
+SHAPE, N_NIGHT = (16, 24), 500
+N = SHAPE[0] * SHAPE[1]
+
+
+def the_camera():
+    rng = np.random.default_rng(60)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.2, 0.3))
+    exposure = rng.uniform(0.3, 1.5, SHAPE)
+    return rng, camera, exposure
+
+
+@pytest.fixture(scope="module")
+def night(make_once, kernels):
+    """A run of 2000 frames at 2 e-, and 500 of a scene, ``night.tif``; one pixel is dead."""
+
+    def make(folder):
+        rng, camera, exposure = the_camera()
+        bright = np.full(SHAPE, 2.0)
+        _, dn = camera.frames(rng, bright, 2000)
+        dn[:, 3, 5] = 77
+        tifffile.imwrite(folder / "dark.tif", dn)
+        electrons, dn = camera.frames(rng, exposure, N_NIGHT)
+        tifffile.imwrite(folder / "night.tif", dn)
+        np.save(folder / "electrons.npy", electrons)
+        options = ["--store", "run.zarr", "--bit-depth", "14", "--integration-time", "1"]
+        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok(
+            "run", "dark.tif", *options, "--until", "maps"
+        )
+
+    return make_once("night", make)
+
+
+@dataclass
+class Lab(Shell):
+    """The command in this process: the same, but for seconds of start-up."""
+
+    capsys: pytest.CaptureFixture[str] | None = None
+
+    def __call__(self, *arguments):
+        code = 0
+        try:
+            main([str(each) for each in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        said = self.capsys.readouterr()
+        return Result(code, said.out, said.err)
+
+    def ok(self, *arguments):
+        result = self(*arguments)
+        assert result.code == 0, result.stderr
+        return result
+
+
+@pytest.fixture
+def lab(shell, night, monkeypatch, capsys):
+    """The folder of the shell with links to the run and its frames."""
+    for name in ("run.zarr", "night.tif"):
+        (shell.folder / name).symlink_to(night / name)
+    monkeypatch.chdir(shell.folder)
+    return Lab(shell.folder, shell.environment, capsys)
+
+
+def opened(path):
+    return xr.open_zarr(path, group="applied", consolidated=False)
+
+
+def test_calibrated_frames_have_the_truth_within_their_errors(lab, night):
+    result = lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr")
+    assert result.stdout.strip() == "out.zarr"
+    found = opened(lab.folder / "out.zarr").load()
+    _, camera, exposure = the_camera()
+    electrons = np.load(night / "electrons.npy")
+    good = found.quality.values == 0
+    assert good.sum() > 0.9 * N
+    z = ((found.exposure - exposure) / found.exposure_stderr).values[good]
+    assert abs(z.mean()) < 5 / np.sqrt(N) + 0.1  # few events: skewed
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * N) + 0.02
+    difference = (found.electrons.values - electrons)[:, good]
+    noise = found.electrons_stderr_read.values[good]
+    common = found.electrons_stderr_calibration.values[good]
+    pull = difference.mean(axis=0) / np.hypot(noise / np.sqrt(N_NIGHT), common)
+    assert abs(pull.std() - 1) < 5 / np.sqrt(2 * N)
+    assert abs((difference / noise).std() - 1) < 0.02
+    wrong = (found.electron_number.values != electrons)[:, good]
+    limit = camera.least_error(exposure)[good].mean()
+    assert abs(wrong.mean() - limit) < 5 * np.sqrt(limit / wrong.size) + 0.05 * limit
+    # the dead pixel has no value, says why, and nothing is invented
+    dead = found.isel(y=3, x=5)
+    assert int(dead.quality) != 0
+    assert np.isnan(dead.electrons).all()
+    assert np.isnan(dead.exposure)
+    assert (dead.electron_number == found.electron_number.attrs["no_number"]).all()
+    # units, names and what it was made of
+    assert found.electrons.attrs["units"] == found.exposure.attrs["units"] == "e-"
+    assert found.electrons.dims == ("frame", "y", "x")
+    made_of = found.attrs["provenance"]
+    assert made_of["run"] == "run.zarr"
+    assert len(made_of["run_digest"]) == 64
+    assert made_of["frames"][0]["name"] == "night.tif"
+    assert "too_few_bins" in found.quality.attrs["flag_meanings"]
+
+
+def test_nothing_is_overwritten_without_force(lab):
+    lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure")
+    again = lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure")
+    assert "up to date" in again.stderr
+    other = ["apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "electrons"]
+    refused = lab(*other)
+    assert refused.code == 2
+    assert "--force" in refused.stderr
+    lab.ok(*other, "--force")
+    found = opened(lab.folder / "out.zarr")
+    assert "electrons" in found
+    assert "exposure" not in found
+    run = lab("apply", "run.zarr", "night.tif", "--output", "run.zarr", "--force")
+    assert run.code == 2
+    assert "holds no calibrated frames" in run.stderr
+    (lab.folder / "mine").mkdir()
+    (lab.folder / "mine" / "notes.txt").write_text("keep")
+    for kind in ("zarr", "tiff"):
+        given = ["--output", "mine", "--format", kind, "--force"]
+        assert lab("apply", "run.zarr", "night.tif", *given).code == 2
+    assert (lab.folder / "mine" / "notes.txt").read_text() == "keep"
+
+
+def test_tiff_and_fits_hold_what_zarr_holds(lab):
+    from astropy.io import fits
+
+    given = ["apply", "run.zarr", "night.tif", "--workers", "1", "--output"]
+    lab.ok(*given, "out.zarr")
+    lab.ok(*given, "out_tiff", "--format", "tiff")
+    lab.ok(*given, "out_fits", "--format", "fits")
+    found = opened(lab.folder / "out.zarr").load()
+    for name in ("electrons", "electron_number", "exposure", "quality"):
+        values = found[name].values
+        with tifffile.TiffFile(lab.folder / "out_tiff" / f"{name}.tif") as file:
+            np.testing.assert_array_equal(np.squeeze(file.asarray()), values.astype(file.pages[0].dtype))
+            if name == "electrons":
+                assert file.is_imagej
+                assert file.imagej_metadata["frames"] == N_NIGHT
+                about = json.loads(file.imagej_metadata["Info"])
+                assert about["unit"] == "e-"
+                assert about["provenance"]["run"] == "run.zarr"
+        image = fits.getdata(lab.folder / "out_fits" / f"{name}.fits")
+        np.testing.assert_array_equal(np.squeeze(image), values)
+    header = fits.getheader(lab.folder / "out_fits" / "electrons.fits")
+    assert header["BUNIT"] == "e-"
+    assert "run_digest" in "".join(header["HISTORY"])
+    assert not list(lab.folder.glob(".*unfinished*"))
+
+
+def test_killed_it_goes_on_and_gives_the_same(lab):
+    lab.ok("apply", "run.zarr", "night.tif", "--output", "whole.zarr", "--workers", "1")
+    given = ["apply", "run.zarr", "night.tif", "--output", "killed.zarr", "--workers", "2"]
+    for seconds in (2.0, 3.0, 4.0):
+        with lab.start(*given) as process:
+            try:
+                process.wait(timeout=seconds)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGKILL)
+    lab.ok(*given)
+    whole, killed = (opened(lab.folder / f"{name}.zarr").load() for name in ("whole", "killed"))
+    assert set(whole) == set(killed)
+    for name in whole:
+        np.testing.assert_array_equal(whole[name].values, killed[name].values)
+
+
+def test_priors(lab):
+    given = ["apply", "run.zarr", "night.tif", "--what", "numbers", "--output"]
+    flat = lab.ok(*given, "flat.zarr", "--prior", "flat")
+    assert flat.code == 0
+    np.save(lab.folder / "map.npy", np.full(SHAPE, 0.9))
+    lab.ok(*given, "map.zarr", "--prior", "map.npy")
+    lab.ok(*given, "number.zarr", "--prior", "0.9")
+    one, other = (opened(lab.folder / f"{name}.zarr").load() for name in ("map", "number"))
+    np.testing.assert_array_equal(one.electron_number, other.electron_number)
+    np.save(lab.folder / "small.npy", np.ones((3, 3)))
+    for prior in ("small.npy", "-1", "nothing.npy", "night"):
+        refused = lab(*given, "no.zarr", f"--prior={prior}")
+        assert refused.code in (2, 4)
+        assert refused.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda dn: dn[:, :8], "frames of 8 x 24 pixels"),
+        (lambda dn: dn.astype(np.uint8), "a bit depth of 14"),
+        (lambda dn: dn - 40, "below the bias"),
+    ],
+)
+def test_wrong_frames_are_refused_in_one_line(lab, change, words):
+    tifffile.imwrite(lab.folder / "wrong.tif", change(tifffile.imread(lab.folder / "night.tif")))
+    refused = lab("apply", "run.zarr", "wrong.tif", "--output", "out.zarr")
+    assert refused.code == 4
+    assert words in refused.stderr
+    assert refused.stderr.count("\n") == 1
+    assert not (lab.folder / "out.zarr").exists()
+
+
+def test_a_moved_offset_is_told(lab):
+    dn = tifffile.imread(lab.folder / "night.tif")
+    tifffile.imwrite(lab.folder / "moved.tif", dn[:1] - 15)
+    result = lab.ok("apply", "run.zarr", "moved.tif", "--output", "out.zarr", "--what", "electrons")
+    assert "the offset has moved" in result.stderr

@@ -1,0 +1,60 @@
+"""A camera in plain numpy whose parameters are known: independent of the package's own simulator."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm, poisson
+
+from pchem_pipeline.use.calibration import Calibration
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """Maps (y, x) of a sensor; analog read noise in e-."""
+
+    gain: np.ndarray
+    bias: np.ndarray
+    read_noise_e: np.ndarray
+
+    @classmethod
+    def drawn(cls, rng, shape, read_noise=(0.15, 0.35), gain=(0.07, 0.12)):
+        """Return a camera with pixels that differ."""
+        return cls(rng.uniform(*gain, shape), rng.normal(100.0, 4.0, shape), rng.uniform(*read_noise, shape))
+
+    @property
+    def sigma(self):
+        """Read noise with rounding, DN."""
+        return np.sqrt((self.read_noise_e / self.gain) ** 2 + 1 / 12)
+
+    def frames(self, rng, exposure, n, offset=0.0):
+        """Return true electron numbers and DN of n frames; the offset is in DN."""
+        electrons = rng.poisson(exposure, (n, *self.bias.shape))
+        noise = self.read_noise_e * rng.standard_normal(electrons.shape)
+        dn = np.rint(self.bias + (electrons + noise) / self.gain + offset)
+        return electrons, np.clip(dn, 0, 65535).astype(np.uint16)
+
+    def calibration(self, rng=None, errors=(0.0, 0.0, 0.0), exposure=1.0):
+        """Return what a characterisation with these standard errors of (g, mu, sigma) finds."""
+        truth = np.stack([self.gain, self.bias, self.sigma])
+        wide = np.array(errors)[:, None, None]
+        found = truth if rng is None else truth + wide * rng.standard_normal(truth.shape)
+        covariance = np.zeros((*self.bias.shape, 3, 3))
+        for i, error in enumerate(errors):
+            covariance[..., i, i] = error**2
+        words = np.zeros(self.bias.shape, np.uint16)
+        return Calibration(np.full(self.bias.shape, exposure), *found, covariance, words)
+
+    def least_error(self, exposure):
+        """Return the least probability of a wrong electron number of each pixel (Bayes), by plain sums."""
+        out = np.empty(self.bias.shape)
+        for place in np.ndindex(*out.shape):
+            h, g, mu, s = (
+                float(np.broadcast_to(v, out.shape)[place])
+                for v in (exposure, self.gain, self.bias, self.read_noise_e)
+            )
+            k = np.arange(int(h + 12 * np.sqrt(h + 1) + 12))[:, None]
+            dn = np.arange(int(mu - 8 * s / g - 3), int(mu + (k[-1, 0] + 8 * s) / g + 3))
+            edges = (np.append(dn - 0.5, dn[-1] + 0.5) - mu - k / g) / (s / g)
+            joint = poisson.pmf(k, h) * np.diff(norm.cdf(edges), axis=1)
+            out[place] = 1.0 - joint.max(axis=0).sum()
+        return out

@@ -1,0 +1,116 @@
+"""Exposure of frames of known pixels: pulls N(0, 1), and as precise as the samples allow."""
+
+import numpy as np
+import pytest
+from helpers.known_camera import KnownCamera
+
+from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.use.exposure import estimate_exposure
+
+N_FRAMES, SHAPE = 400, (30, 40)
+N = SHAPE[0] * SHAPE[1]
+ERRORS = (2e-3, 0.8, 0.1)
+
+
+@pytest.fixture(scope="module")
+def night():
+    """Exposures of 0.8 to 3 e-, read noise 0.15 to 0.6 e-, and a calibration that has errors."""
+    rng = np.random.default_rng(20)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.6))
+    exposure = rng.uniform(0.8, 3.0, SHAPE)
+    _, frames = camera.frames(rng, exposure, N_FRAMES)
+    histograms = histogram_frames(frames)
+    found = estimate_exposure(histograms.counts, histograms.origin, camera.calibration(rng, ERRORS))
+    return camera, exposure, frames, histograms, found
+
+
+def pulls(found, exposure, stderr):
+    return ((found.exposure - exposure) / stderr).ravel()
+
+
+def test_pulls_are_normal_with_both_errors_and_not_with_one(night):
+    _, exposure, _, _, found = night
+    z = pulls(found, exposure, found.stderr)
+    # the estimate is skewed as a Poisson count is: by a part of the root of the events, some 400
+    assert abs(z.mean()) < 5 / np.sqrt(N) + 0.05
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * N)
+    for width, share in ((1, 0.6827), (2, 0.9545)):
+        assert abs((abs(z) < width).mean() - share) < 5 * np.sqrt(share * (1 - share) / N)
+    # half of an exposure's error is of the calibration: without that part the same limit is passed by far
+    alone = pulls(found, exposure, found.counting)
+    assert alone.std() - 1 > 6 / np.sqrt(2 * N)
+
+
+def test_a_perfect_calibration_leaves_counting_alone(night):
+    camera, exposure, _, histograms, _ = night
+    found = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    assert (found.calibration == 0).all()
+    z = pulls(found, exposure, found.stderr)
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * N)
+    # a bias that is wrong by a tenth of an electron, unknown to the calibration, is seen at once
+    off = estimate_exposure(histograms.counts, histograms.origin + 1, camera.calibration())
+    assert pulls(off, exposure, off.stderr).mean() > 0.5
+
+
+def test_it_is_nearer_to_the_truth_than_means_of_frames():
+    """At 0.02 e- and a read noise of 0.25 e-, the samples tell electrons from none: 4 times less variance."""
+    rng = np.random.default_rng(21)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.2, 0.25))
+    _, frames = camera.frames(rng, 0.02, N_FRAMES)
+    histograms = histogram_frames(frames)
+    found = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    corrected = (frames.mean(axis=0) - camera.bias) * camera.gain
+    rounded = np.maximum(np.rint((frames - camera.bias) * camera.gain), 0).mean(axis=0)
+    square = [float(((each - 0.02) ** 2).mean()) for each in (found.exposure, corrected, rounded)]
+    assert square[1] > 3 * square[0]
+    assert square[2] > 3 * square[0]
+    # and nearly what counting the electrons themselves would give
+    assert square[0] < 1.6 * 0.02 / N_FRAMES
+
+
+def test_an_effect_of_the_law_is_in_the_estimate():
+    """A fifth of the samples twice as bright: without it in the law errors would be too small."""
+    rng = np.random.default_rng(22)
+    camera = KnownCamera.drawn(rng, SHAPE)
+    flicker = np.where(rng.random((N_FRAMES, 1, 1)) < 0.2, 2.0, 0.75)
+    electrons = rng.poisson(1.5 * flicker * np.ones(SHAPE))
+    noise = camera.read_noise_e * rng.standard_normal(electrons.shape)
+    frames = np.rint(camera.bias + (electrons + noise) / camera.gain).astype(np.uint16)
+    histograms = histogram_frames(frames)
+    law = SampleLaw().with_exposures([0.2, 0.8], [2.0, 0.75])
+    own = camera.calibration().with_law(law)
+    found = estimate_exposure(histograms.counts, histograms.origin, own)
+    plain = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    assert np.median(found.counting) > 1.05 * np.median(plain.counting)
+    assert abs(np.median(found.exposure) - 1.5) < 0.1
+
+
+def test_dark_and_unknown_pixels():
+    rng = np.random.default_rng(23)
+    camera = KnownCamera.drawn(rng, (4, 5))
+    _, frames = camera.frames(rng, 0.0, 200)
+    histograms = histogram_frames(frames)
+    calibration = camera.calibration(rng, ERRORS)
+    calibration.bias[1, 2] = np.nan
+    found = estimate_exposure(histograms.counts, histograms.origin, calibration)
+    assert np.isnan(found.exposure[1, 2])
+    assert np.isnan(found.stderr[1, 2])
+    known = np.isfinite(calibration.bias)
+    assert (found.exposure[known] < 5 * found.stderr[known]).all()
+    assert (found.counting[known] > 0).all()
+
+
+def test_samples_at_the_top_of_the_adc_are_taken_as_a_limit():
+    rng = np.random.default_rng(24)
+    camera = KnownCamera(np.full(SHAPE, 0.1), np.full(SHAPE, 20.0), np.full(SHAPE, 0.25))
+    _, frames = camera.frames(rng, 4.0, N_FRAMES)
+    frames = np.minimum(frames, 63)  # 6 bits: more than 4.3 e- are cut
+    histograms = histogram_frames(frames)
+    censored = camera.calibration().with_law(SampleLaw().with_clip(0, 63))
+    found = estimate_exposure(histograms.counts, histograms.origin, censored)
+    z = pulls(found, 4.0, found.stderr)
+    assert abs(z.mean()) < 5 / np.sqrt(N) + 0.05
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * N)
+    naive = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    assert pulls(naive, 4.0, naive.stderr).mean() < -5

@@ -1,0 +1,130 @@
+"""Electron numbers under the pixel's own law: wrong as seldom as can be, and the probability is true."""
+
+import numpy as np
+import pytest
+from helpers.known_camera import KnownCamera
+
+from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.use.numbers import number_tables, number_type
+
+BYTE = np.dtype(np.uint8)
+
+
+def converted(frames, prior, calibration, dtype=BYTE):
+    ends = frames.min(axis=0), frames.max(axis=0)
+    return number_tables(*ends, prior, calibration, dtype=dtype).convert(frames, expected=True)
+
+
+@pytest.fixture(scope="module")
+def night():
+    rng = np.random.default_rng(30)
+    camera = KnownCamera.drawn(rng, (12, 14), read_noise=(0.15, 0.6))
+    exposure = rng.uniform(0.2, 4.0, camera.bias.shape)
+    electrons, frames = camera.frames(rng, exposure, 1500)
+    return camera, exposure, electrons, frames, converted(frames, exposure, camera.calibration())
+
+
+def test_errors_are_as_rare_as_they_can_be(night):
+    camera, exposure, electrons, frames, found = night
+    limit = camera.least_error(exposure)
+    wrong = (found.number != electrons).mean(axis=0)
+    error = np.sqrt((limit * (1 - limit)).sum() / len(electrons)) / limit.size
+    assert abs(wrong.mean() - limit.mean()) < 5 * error
+    # rounding, which knows neither noise nor exposure, errs clearly more often
+    rounded = np.rint((frames - camera.bias) * camera.gain).clip(0)
+    assert (rounded != electrons).mean() > limit.mean() + 10 * error
+
+
+def test_the_probability_is_how_often_they_are_right(night):
+    _, _, electrons, _, found = night
+    right = found.number == electrons
+    for low, high in ((0.0, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 0.999), (0.999, 1.01)):
+        chosen = (found.probability >= low) & (found.probability < high)
+        p, n = found.probability[chosen].mean(dtype=np.float64), chosen.sum()
+        assert n > 1000
+        assert abs(right[chosen].mean() - p) < 5 * np.sqrt(p * (1 - p) / n) + 1e-5
+
+
+def test_the_expectation_is_unbiased_and_nearer_than_the_number(night):
+    camera, _, electrons, _, found = night
+    difference = found.expected.astype(np.float64) - electrons
+    assert abs(difference.mean()) < 5 * difference.std() / np.sqrt(difference.size)
+    noisy = camera.read_noise_e > 0.4
+    square = (difference[:, noisy] ** 2).mean()
+    assert ((found.number[:, noisy].astype(int) - electrons[:, noisy]) ** 2).mean() > 1.15 * square
+
+
+def test_photon_number_statistics_are_the_truths(night):
+    """Where the peaks are apart, numbers have the mass of Poisson counts; pixel by pixel they vary as H."""
+    camera, exposure, electrons, _, found = night
+    quiet = camera.read_noise_e < 0.22
+    n = np.bincount(found.number[:, quiet].ravel(), minlength=12)[:12]
+    k = np.bincount(electrons[:, quiet].ravel(), minlength=12)[:12]
+    limit = camera.least_error(exposure)[quiet].mean()
+    # numbers and truth are the same samples: they differ by those that are wrong
+    assert (abs(n - k) <= 5 * np.sqrt(2 * limit * k.sum())).all()
+    fano = found.number[:, quiet].var(axis=0) / found.number[:, quiet].mean(axis=0)
+    assert abs(fano.mean() - 1) < 5 * np.sqrt(2 / len(electrons) / quiet.sum()) + 2 * limit
+
+
+def test_a_wrong_prior_errs_more_often(night):
+    camera, exposure, electrons, frames, found = night
+    calibration = camera.calibration()
+    noisy = camera.read_noise_e > 0.4
+    best = (found.number != electrons)[:, noisy].mean()
+    flat = converted(frames, None, calibration)
+    wrong = converted(frames, 20.0 * exposure, calibration)
+    assert (flat.number != electrons)[:, noisy].mean() > best
+    assert (wrong.number != electrons)[:, noisy].mean() > 1.2 * best
+
+
+def test_pixels_without_calibration_have_no_number():
+    rng = np.random.default_rng(31)
+    camera = KnownCamera.drawn(rng, (3, 4))
+    _, frames = camera.frames(rng, 1.0, 50)
+    calibration = camera.calibration()
+    calibration.conversion_gain[2, 1] = np.nan
+    found = converted(frames, np.ones((3, 4)), calibration)
+    assert (found.number[:, 2, 1] == 255).all()
+    assert np.isnan(found.probability[:, 2, 1]).all()
+    assert np.isnan(found.expected[:, 2, 1]).all()
+    assert (found.number[:, 0, 0] < 20).all()
+
+
+def test_large_numbers_need_two_bytes():
+    rng = np.random.default_rng(32)
+    camera = KnownCamera.drawn(rng, (3, 4), read_noise=(0.2, 0.3))
+    electrons, frames = camera.frames(rng, 300.0, 200)
+    dtype = number_type(float((frames.max() - 80) * 0.12))
+    assert dtype == np.uint16
+    found = converted(frames, np.full((3, 4), 300.0), camera.calibration(), dtype)
+    assert (found.number == electrons).mean() > 0.9
+    assert number_type(254.0) == np.uint8
+
+
+def test_parts_of_a_dn_give_the_same_as_whole_ones():
+    rng = np.random.default_rng(33)
+    camera = KnownCamera.drawn(rng, (5, 6))
+    _, frames = camera.frames(rng, 2.0, 100)
+    calibration, prior = camera.calibration(), np.full((5, 6), 2.0)
+    whole = converted(frames, prior, calibration)
+    fine = frames.astype(np.uint32) * 4
+    tables = number_tables(fine.min(axis=0), fine.max(axis=0), prior, calibration, dtype=BYTE, parts=4)
+    parts = tables.convert(fine, expected=True)
+    np.testing.assert_array_equal(parts.number, whole.number)
+    np.testing.assert_allclose(parts.probability, whole.probability, rtol=1e-6)
+
+
+def test_exposure_does_not_depend_on_the_unit_of_codes():
+    from pchem_pipeline.use.exposure import estimate_exposure
+
+    rng = np.random.default_rng(34)
+    camera = KnownCamera.drawn(rng, (4, 4))
+    _, frames = camera.frames(rng, 2.0, 300)
+    whole = histogram_frames(frames)
+    fine = histogram_frames(frames.astype(np.uint32) * 4, bins=1024)
+    found = [
+        estimate_exposure(h.counts, h.origin, camera.calibration(), parts).exposure
+        for h, parts in ((whole, 1), (fine, 4))
+    ]
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
