@@ -267,9 +267,8 @@ class StageContext:
         """
         self._know_total(sum(len(unit.keys) for unit in units) if total is None else total)
         todo = self._ready(self._pending_of(units, by_tiles, total), needs)
-        for unit in todo:
-            for key in unit.keys:
-                self.store.records.unmark(self.stage, self.fingerprint, key)
+        self.store.records.unmark(self.stage, self.fingerprint, (key for unit in todo for key in unit.keys))
+        self.store.sync()  # what was made for the units, by this process, lies below their markers
         marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
         fatal: list[BaseException] = []
         shown = len(self.selected(units) if by_tiles else units)

@@ -6,20 +6,23 @@ import contextlib
 import errno
 import json
 import math
-import os
-import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
 __all__ = [
     "canonical_json",
+    "is_blank",
     "read_json",
+    "remove_file",
+    "remove_folder",
     "storage_error",
+    "sync_folder",
     "whole_file",
     "without_nan",
     "write_atomic",
@@ -29,6 +32,8 @@ __all__ = [
 _CURES = {
     errno.ENOSPC: "the disk is full: free some space and run again, finished tiles are kept",
     errno.EDQUOT: "the disk quota is used up: free some space and run again, finished tiles are kept",
+    errno.EFBIG: "the file would be larger than is allowed there (see ulimit -f): raise that and run again",
+    errno.EIO: "the disk reports an error: check it, then run again, finished tiles are kept",
     errno.EROFS: "the file system is read-only: choose another place for the store",
     errno.EACCES: "no permission to write there: choose another place for the store",
     errno.EPERM: "no permission to write there: choose another place for the store",
@@ -48,7 +53,7 @@ def is_fatal(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _CURES
 
 
-def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
+def write_atomic(path: Path, data: bytes, *, sync: bool | Callable[[Path], None] = True) -> None:
     """Write a small file, so that whoever reads it finds the old or the new one, whole.
 
     A file that is there keeps its mode.
@@ -58,7 +63,9 @@ def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
     Args:
         path: the file; folders above it are made.
         data: its content.
-        sync: it is on the disk before it takes its place, so that a power cut cannot leave it empty.
+        sync: it is on the disk before it takes its place, so that a power cut cannot leave it empty, and the
+            place is on the disk on return. A function brings it there (and what else it has to) before it
+            takes its place.
 
     Raises:
         StoreError: the file system, or the object storage, refused.
@@ -66,9 +73,9 @@ def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
     if isinstance(path, RemotePath):
         path.write_bytes(data)
         return
-    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    with _put_in_place(path, aside, sync) as part:
-        part.write_bytes(data)
+    before, after = (disk.sync_file, disk.sync_folder) if sync is True else (sync or None, None)
+    with _put_in_place(path, disk.aside(path), before, after) as part:
+        disk.write(part, data)
 
 
 @contextlib.contextmanager
@@ -82,25 +89,31 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         StoreError: the file system refused.
     """
-    with _put_in_place(path, path.with_name(f".partial-{path.name}"), sync=False) as part:
+    with _put_in_place(path, path.with_name(f".partial-{path.name}")) as part:
         yield part
 
 
 @contextlib.contextmanager
-def _put_in_place(path: Path, aside: Path, sync: bool) -> Iterator[Path]:
+def _put_in_place(
+    path: Path,
+    aside: Path,
+    before: Callable[[Path], None] | None = None,
+    after: Callable[[Path], None] | None = None,
+) -> Iterator[Path]:
     """Yield ``aside`` to write to, then rename it to ``path``: the one place where files appear."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(path.parent)
         _remove(aside)
         yield aside
-        if sync:
-            with aside.open("rb") as file:
-                os.fsync(file.fileno())
+        if before is not None:
+            before(aside)
         if path.is_dir():
-            shutil.rmtree(path)
+            disk.remove_tree(path)
         elif path.is_file() and aside.is_file():
             shutil.copymode(path, aside)
-        aside.replace(path)
+        disk.replace(aside, path)
+        if after is not None:
+            after(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
     finally:
@@ -113,6 +126,57 @@ def _remove(aside: Path) -> None:
     else:
         with contextlib.suppress(OSError):
             aside.unlink()
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file or an object, if it is there.
+
+    Raises:
+        StoreError: the file system, or the object storage, refused.
+    """
+    if isinstance(path, RemotePath):
+        path.unlink(missing_ok=True)
+        return
+    try:
+        disk.remove(path)
+    except OSError as error:
+        raise storage_error(error, path) from error
+
+
+def remove_folder(path: Path) -> None:
+    """Remove a folder with all that is in it, if it is there.
+
+    Raises:
+        StoreError: the file system, or the object storage, refused.
+    """
+    if isinstance(path, RemotePath):
+        path.remove_folder()
+        return
+    try:
+        disk.remove_tree(path)
+    except OSError as error:
+        raise storage_error(error, path) from error
+
+
+def is_blank(path: Path) -> bool:
+    """Tell whether a file is empty or begins with a zero: its content was lost in a power cut."""
+    try:
+        with path.open("rb") as file:
+            return file.read(1) in (b"", b"\0")
+    except FileNotFoundError:
+        return False
+
+
+def sync_folder(path: Path) -> None:
+    """Wait until all that was done below a folder, and on its file system, is on the disk.
+
+    Raises:
+        StoreError: the disk could not take it.
+    """
+    try:
+        disk.sync_all(path)
+    except OSError as error:
+        raise storage_error(error, path) from error
 
 
 def canonical_json(value: Any) -> bytes:
@@ -136,9 +200,9 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON, atomically."""
-    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+def write_json(path: Path, value: Any, *, sync: bool | Callable[[Path], None] = True) -> None:
+    """Write a value as indented JSON, atomically; see `write_atomic`."""
+    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode(), sync=sync)
 
 
 def read_json(path: Path) -> Any | None:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.store.files import canonical_json, read_json, write_json
+from pchem_pipeline.store.files import (
+    canonical_json,
+    read_json,
+    remove_file,
+    remove_folder,
+    sync_folder,
+    write_json,
+)
 from pchem_pipeline.store.remote_path import RemotePath
 
 __all__ = ["Records", "StageRecord", "fingerprint_of"]
@@ -59,8 +66,10 @@ class StageRecord:
 class Records:
     """The stage records and unit markers below one folder."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, sync: Callable[[Path], None]) -> None:
+        """Take the folder, and what waits until a file, and the arrays written before it, are on the disk."""
         self._folder = folder
+        self._sync = sync
 
     def read(self, stage: str) -> StageRecord | None:
         """Return the record of a stage, or None if it never started."""
@@ -71,24 +80,30 @@ class Records:
 
     def write(self, record: StageRecord) -> None:
         """Store the record of a stage."""
-        write_json(self._folder / "stages" / f"{record.stage}.json", asdict(record))
+        write_json(self._folder / "stages" / f"{record.stage}.json", asdict(record), sync=self._sync)
 
     def forget(self, stage: str) -> None:
         """Drop the record and all markers of a stage."""
-        (self._folder / "stages" / f"{stage}.json").unlink(missing_ok=True)
-        markers = self._folder / "done" / stage
-        if isinstance(markers, RemotePath):
-            markers.remove_folder()
-        else:
-            shutil.rmtree(markers, ignore_errors=True)
+        remove_file(self._folder / "stages" / f"{stage}.json")
+        remove_folder(self._folder / "done" / stage)
+        self._forgotten()
 
     def mark(self, stage: str, fingerprint: str, key: str, summary: dict[str, Any]) -> None:
         """Say that a unit of a stage is whole in the store."""
-        write_json(self._marker(stage, fingerprint, key), summary)
+        write_json(self._marker(stage, fingerprint, key), summary, sync=self._sync)
 
-    def unmark(self, stage: str, fingerprint: str, key: str) -> None:
-        """Say that a unit has to be done again."""
-        self._marker(stage, fingerprint, key).unlink(missing_ok=True)
+    def unmark(self, stage: str, fingerprint: str, keys: Iterable[str]) -> None:
+        """Say that units have to be done again."""
+        marked = self.done(stage, fingerprint) & set(keys)
+        for key in sorted(marked):
+            remove_file(self._marker(stage, fingerprint, key))
+        if marked:
+            self._forgotten()
+
+    def _forgotten(self) -> None:
+        """Wait until markers are gone from the disk, before what they stood for is written anew."""
+        if not isinstance(self._folder, RemotePath) and self._folder.is_dir():
+            sync_folder(self._folder)
 
     def done(self, stage: str, fingerprint: str) -> set[str]:
         """Return the keys of the finished units of a stage in its present form."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
 
 from pchem_pipeline.base.errors import MissingDependencyError, StoreError
 
-__all__ = ["RemoteError", "RemotePath", "lock_folder", "place_of", "refused", "zarr_place"]
+__all__ = ["RemoteError", "RemotePath", "lock_folder", "place_of", "refused"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -180,16 +180,6 @@ def _storage(protocol: str) -> Any:
         raise MissingDependencyError(
             f'{protocol}://: a store there needs another library ({error}); pip install "pchem-pipeline[s3]"'
         ) from error
-
-
-def zarr_place(path: Path, *, writable: bool) -> Any:
-    """Return what zarr opens: a path of the disk, or its store on top of fsspec."""
-    if not isinstance(path, RemotePath):
-        return str(path)
-    from zarr.storage import FsspecStore
-
-    options = {"use_listings_cache": False}
-    return FsspecStore.from_url(str(path), storage_options=options, read_only=not writable)
 
 
 def lock_folder(path: Path, private: str) -> Path:

@@ -16,6 +16,7 @@ only.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -29,9 +30,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import LockedError, PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import variable_at
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store import disk
+from pchem_pipeline.store.files import is_blank, remove_file, remove_folder, storage_error, write_atomic
 from pchem_pipeline.store.records import Records
-from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused, zarr_place
+from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused
 
 if TYPE_CHECKING:
     import zarr
@@ -42,6 +44,7 @@ __all__ = ["SCHEMA_VERSION", "RunStore"]
 SCHEMA_VERSION = 1
 
 _PRIVATE = ".pchem"
+_DESCRIPTION = "zarr.json"
 _Region = tuple[slice | int, ...]
 
 
@@ -51,7 +54,7 @@ class RunStore:
     def __init__(self, path: Path, root: zarr.Group) -> None:
         self.path = path
         self._root = root
-        self.records = Records(path / _PRIVATE)
+        self.records = Records(path / _PRIVATE, self.sync)
 
     # -- opening ------------------------------------------------------------------------------
 
@@ -64,16 +67,21 @@ class RunStore:
         """
         import zarr
 
+        from pchem_pipeline.store.zarr_store import zarr_store
+
         path = place_of(path)
+        _remove_stillborn(path)
         if (path / "zarr.json").exists():
             return cls.open(path, writable=True)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise StoreError(f"{path} exists and is not a run; choose another --store or remove it")
         with _one_line(path, path):
-            path.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(path)
             attributes = {"pchem_schema": SCHEMA_VERSION}
-            root = zarr.create_group(zarr_place(path, writable=True), zarr_format=3, attributes=attributes)
-        return cls(path, root)
+            root = zarr.create_group(zarr_store(path, writable=True), zarr_format=3, attributes=attributes)
+        store = cls(path, root)
+        store.sync()
+        return store
 
     @classmethod
     def open(cls, path: Path, *, writable: bool = False) -> RunStore:
@@ -84,6 +92,8 @@ class RunStore:
         """
         import zarr
 
+        from pchem_pipeline.store.zarr_store import zarr_store
+
         path = place_of(path)
         if not (path / "zarr.json").exists():
             raise StoreError(
@@ -91,7 +101,7 @@ class RunStore:
             )
         try:
             with _one_line(path, path):
-                root = zarr.open_group(zarr_place(path, writable=writable), mode="r+" if writable else "r")
+                root = zarr.open_group(zarr_store(path, writable=writable), mode="r+" if writable else "r")
                 schema = root.attrs.get("pchem_schema")
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{path} is damaged ({error}); restore it or start the run again") from error
@@ -207,8 +217,11 @@ class RunStore:
             array.resize((length, *array.shape[1:]))
 
     def delete(self, name: str) -> None:
-        """Remove an array or a group, if it exists."""
-        if self.has(name):
+        """Remove an array or a group, if it exists, also one whose description a power cut has lost."""
+        if not isinstance(self.path, RemotePath):
+            remove_folder(self.path / name)
+            disk.unsynced(self.path).note()
+        elif self.has(name):
             with self._translated(name):
                 del self._root[name]
 
@@ -243,6 +256,25 @@ class RunStore:
         except FileNotFoundError:
             return None
 
+    def sync(self, part: Path | None = None) -> None:
+        """Wait until the arrays that this process wrote are on the disk, before a marker says that they are.
+
+        Args:
+            part: the marker, or another file that is to be on the disk with them before it takes its place.
+
+        Raises:
+            StoreError: the disk could not take them.
+        """
+        if isinstance(self.path, RemotePath):  # an object that was put is stored
+            return
+        try:
+            unsynced = disk.unsynced(self.path)
+            if part is not None:
+                unsynced.note()
+            unsynced.sync()
+        except OSError as error:
+            raise storage_error(error, self.path) from error
+
     # -- housekeeping -------------------------------------------------------------------------
 
     @contextmanager
@@ -265,17 +297,23 @@ class RunStore:
         except OSError as error:
             raise storage_error(error, private) from error
         try:
-            self._remove_partial_files()
+            self._remove_unfinished()
             yield
         finally:
             lock.release()
 
-    def _remove_partial_files(self) -> None:
-        """Remove what a killed process left: partial files never become part of the run."""
+    def _remove_unfinished(self) -> None:
+        """Remove what a killed process left, and descriptions of arrays that a power cut left empty.
+
+        Neither is part of the run: what a record or a marker stands for was on the disk before it.
+        """
         if isinstance(self.path, RemotePath):  # which has none
             return
-        for path in self.path.rglob("*.partial"):
-            path.unlink(missing_ok=True)
+        for folder, _, names in os.walk(self.path):
+            for name in names:
+                path = Path(folder) / name
+                if name.endswith(".partial") or (name == _DESCRIPTION and is_blank(path)):
+                    remove_file(path)
 
     def free_bytes(self) -> int:
         """Return the free space of the disk that holds the store; an object storage is never full."""
@@ -293,6 +331,17 @@ class RunStore:
             raise StoreError(
                 f"{where} cannot be read ({error}); redo that stage with --force, or those tiles with --tiles"
             ) from error
+
+
+def _remove_stillborn(path: Path) -> None:
+    """Remove the empty beginning of a store that a power cut may leave, before anything is in it."""
+    if isinstance(path, RemotePath) or not path.is_dir():
+        return
+    held = list(path.iterdir())
+    ours = [path / _DESCRIPTION, *path.glob(f".{_DESCRIPTION}.*.partial")]
+    if set(held) <= set(ours) and (path / _DESCRIPTION not in held or is_blank(path / _DESCRIPTION)):
+        for each in held:
+            remove_file(each)
 
 
 @contextmanager

@@ -136,7 +136,8 @@ class TiffReader(ContiguousReader):
             offsets[i, : len(page.dataoffsets)] = page.dataoffsets
             counts[i, : len(page.databytecounts)] = page.databytecounts
             model[i] = alike.setdefault(_coding(page), page.index)
-        broken = np.flatnonzero(((offsets + counts) > size).any(axis=1))
+        outside = (offsets < 0) | (counts < 0) | (offsets > size) | (counts > size - offsets)
+        broken = np.flatnonzero(outside.any(axis=1))
         if broken.size:
             raise InputError(
                 f"{path}: truncated: {broken.size} of {len(pages)} pages end behind the end of the file "

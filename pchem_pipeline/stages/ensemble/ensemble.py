@@ -243,8 +243,8 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     store = context.store
     content = asdict(axes)
     if store.attributes("ensemble_tiles").get("axes") != content:
-        for key in store.records.done(context.stage, context.fingerprint):
-            store.records.unmark(context.stage, context.fingerprint, key)
+        done = store.records.done(context.stage, context.fingerprint)
+        store.records.unmark(context.stage, context.fingerprint, done)
         store.delete("ensemble_tiles")
     for name in _SUMS:
         if not store.has(f"ensemble_tiles/{name}"):

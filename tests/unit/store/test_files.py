@@ -12,6 +12,7 @@ import pytest
 
 import pchem_pipeline
 from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import whole_file, without_nan, write_atomic
 
 
@@ -19,11 +20,11 @@ def _fail(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.parametrize("name", ["write_bytes", "replace"])
+@pytest.mark.parametrize("name", ["write", "replace"])
 def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, name):
     write_atomic(tmp_path / "a.json", b"old")
     with monkeypatch.context() as patch:
-        patch.setattr(Path, name, _fail)
+        patch.setattr(disk, name, _fail)
         with pytest.raises(StoreError, match=r"a\.json: No space left on device; the disk is full"):
             write_atomic(tmp_path / "a.json", b"new")
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"old")]
@@ -67,7 +68,8 @@ def test_no_other_module_puts_files_in_their_place():
         r"\.write_(text|bytes)\(|open\(\s*\"[wax]|\.rename\(|os\.replace|np\.savez?\w*\(|mkstemp"
     )
     allowed = {
-        "store/files.py": None,
+        "store/disk.py": None,
+        "store/files.py": 1,  # an object
         "store/remote_path.py": None,
         "run/progress.py": 1,
         "base/kernel_cache.py": None,  # compiled kernels, which may be lost

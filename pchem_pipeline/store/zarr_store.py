@@ -1,0 +1,60 @@
+"""Where zarr keeps the arrays of a run: files written by `disk`, or objects of an object storage."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+from zarr.abc.store import Store
+from zarr.core.buffer import Buffer
+from zarr.storage import FsspecStore, LocalStore
+
+from pchem_pipeline.store import disk
+from pchem_pipeline.store.remote_path import RemotePath
+
+__all__ = ["DiskStore", "zarr_store"]
+
+
+class DiskStore(LocalStore):
+    """zarr's store of files, which writes and removes as all of the run's files are written and removed."""
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Store a value."""
+        await asyncio.to_thread(self.set_sync, key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """Store a value, in a call of the caller's thread."""
+        self._check_writable()
+        path = self.root / key
+        # an older description must not be lost with the new one; a new array may be, before its first marker
+        disk.put(path, value.as_numpy_array().data, sync=path.name == "zarr.json" and path.exists())
+        disk.unsynced(self.root).note()
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Store a value where there is none; the run's lock lets only one process in."""
+        if not await self.exists(key):
+            await self.set(key, value)
+
+    async def delete(self, key: str) -> None:
+        """Remove a value."""
+        await asyncio.to_thread(self.delete_sync, key)
+
+    def delete_sync(self, key: str) -> None:
+        """Remove a value, in a call of the caller's thread."""
+        self._check_writable()
+        path = self.root / key
+        (disk.remove_tree if path.is_dir() else disk.remove)(path)
+        disk.unsynced(self.root).note()
+
+    async def delete_dir(self, prefix: str) -> None:
+        """Remove all values below a name."""
+        await self.delete(prefix)
+
+
+def zarr_store(path: Path, *, writable: bool) -> Store:
+    """Return what zarr opens for a run."""
+    if not isinstance(path, RemotePath):
+        return DiskStore(path, read_only=not writable)
+    options: dict[str, Any] = {"use_listings_cache": False}
+    return FsspecStore.from_url(str(path), storage_options=options, read_only=not writable)

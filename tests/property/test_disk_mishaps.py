@@ -1,0 +1,165 @@
+"""Every write fails once, and the power is cut at every moment: the same command goes on to the same bits."""
+
+import errno
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.disk_mishaps import FailingDisk, ForgetfulDisk, materialised
+
+from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.run import runner
+from pchem_pipeline.run.declaration import Stage
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.runner import execute
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.signals import StopRequest
+from pchem_pipeline.run.stage import WHOLE, StageContext, open_store
+from pchem_pipeline.store import disk
+from pchem_pipeline.store.files import write_json
+from pchem_pipeline.store.run_store import RunStore
+
+SENSOR = SensorInfo("frames", 10, 8, 16, "uint16", 14, 4.87, "copy", {})
+NUMBERS = [errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS]
+
+
+def fit_tile(path, value, tile):
+    open_store(path).write("fit/bias", tile.region, np.full(tile.shape, value + tile.ix))
+
+
+def maps_tile(path, tile):
+    store = open_store(path)
+    bias = store.read("fit/bias", tile.region)
+    assert np.isfinite(bias).all()  # a marker stands for what is in the store
+    store.write("maps/bias", tile.region, 2 * bias)
+
+
+def fit_run(context):
+    context.create_maps(["fit/bias"])
+    task = functools.partial(fit_tile, context.store.path, context.config.fit.gap_threshold)
+    context.run_units(context.tiles(), task)
+
+
+def maps_run(context):
+    context.create_maps(["maps/bias"])
+    context.run_units(context.tiles(), functools.partial(maps_tile, context.store.path), needs="fit")
+
+
+def page_run(context):
+    def page(unit):
+        context.store.write_file("report.html", b"<html>" + context.store.read("maps/bias").tobytes())
+
+    context.run_units([WHOLE], page)
+
+
+def stage(name, upstream, settings, writes, run):
+    return Stage(name, 1, upstream, settings, (), writes, f"{__name__}:{run.__name__}")
+
+
+STAGES = {
+    "fit": stage("fit", (), ("fit.gap_threshold",), ("fit",), fit_run),
+    "maps": stage("maps", ("fit",), (), ("maps",), maps_run),
+    "page": stage("page", ("maps",), (), (), page_run),
+}
+
+
+@pytest.fixture(autouse=True)
+def stages(monkeypatch):
+    monkeypatch.setattr(runner, "STAGES", STAGES)
+
+
+def run(path: Path, threshold: float = 0.5):
+    """Bring a run of two tiles and three stages up to date; return its results."""
+    open_store.cache_clear()
+    disk.unsynced.cache_clear()
+    with RunStore.create(path).locked():
+        return _run(RunStore.open(path, writable=True), threshold)
+
+
+def _run(store: RunStore, threshold: float):
+    path = store.path
+    if "sensor" not in store.attributes("frames"):
+        SENSOR.write(store)
+        store.sync()
+    write_json(path / "number.json", {"number": threshold})
+    config = parse_config(f"input: {{files: [a]}}\nrun: {{tile: 8}}\nfit: {{gap_threshold: {threshold}}}")
+    reporter = Reporter("off", quiet=True)
+    context = StageContext(config, path.parent, store, SerialExecutor(), reporter, StopRequest())
+    for name in STAGES:
+        state = execute(name, context)
+        if state.state == "failed":
+            raise StoreError(f"{name}: {state.why}; cure")
+    return store.read("fit/bias"), store.read("maps/bias"), (path / "report.html").read_bytes()
+
+
+def assert_same(found, expected):
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_array_equal(found[1], expected[1])
+    assert found[2] == expected[2]
+
+
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("before", [None, 0.25], ids=["new", "over older results"])
+def test_every_operation_fails_once(tmp_path, monkeypatch, before, step):
+    expected = run(tmp_path / "expected.zarr")
+    failing = FailingDisk(monkeypatch)
+    if before is not None:
+        run(tmp_path / "count.zarr", before)
+    failing.fail(None, 0)
+    run(tmp_path / "count.zarr")
+    total = failing.count
+    assert total > 70
+    refused = 0
+    for at in range(3, total, step):
+        path = tmp_path / f"{at}.zarr"
+        if before is not None:
+            failing.fail(None, 0)
+            run(path, before)
+        failing.fail(at, NUMBERS[at % len(NUMBERS)])
+        try:
+            run(path)
+        except StoreError as error:
+            refused += 1
+            words = str(error)
+            assert str(path) in words
+            assert ";" in words  # the cure
+        failing.fail(None, 0)
+        assert_same(run(path), expected)
+    assert refused > 0.9 * len(range(3, total, step))
+
+
+@pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("before", [None, 0.25], ids=["new", "over older results"])
+def test_a_power_cut_at_any_moment(tmp_path, monkeypatch, before, step):
+    expected = run(tmp_path / "expected.zarr")
+    old = tmp_path / "run.zarr"
+    with monkeypatch.context() as patch:
+        forgetful = ForgetfulDisk(patch)
+        if before is not None:
+            run(old, before)
+        start = len(forgetful.log)
+        run(old)
+    rng = np.random.default_rng(8)
+    for end in range(start, len(forgetful.log) + 1, step):
+        found = run(materialised(forgetful.after_power_cut(end, rng), old, tmp_path / "cut.zarr"))
+        assert_same(found, expected)
+
+
+def test_the_power_cut_would_be_seen(tmp_path, monkeypatch):
+    """With a disk that does not keep what it was told to keep, the same test fails."""
+    old = tmp_path / "run.zarr"
+    with monkeypatch.context() as patch:
+        forgetful = ForgetfulDisk(patch)
+        expected = run(old)
+    rng = np.random.default_rng(9)
+    wrong = 0
+    for end in range(60, len(forgetful.log), 5):
+        files = forgetful.after_power_cut(end, rng, honest=False)
+        try:
+            assert_same(run(materialised(files, old, tmp_path / "cut.zarr")), expected)
+        except (AssertionError, StoreError):
+            wrong += 1
+    assert wrong > 3
