@@ -43,8 +43,8 @@ PAGES = ("report.json", "discrepancy.json", "methods.json")
 #: Names that arrays got since the first net: old name, or its beginning, to what may stand in its place.
 RENAMED: Mapping[str, tuple[str, ...]] = {
     "joint/": ("samples/", "fit/", "maps/"),
-    "fit/satellite_": ("fit/satellite_",),
-    "discrepancy/code_extended": ("discrepancy/code_extended",),
+    "fit/lobe_": ("fit/satellite_",),
+    "discrepancy/code_grown": ("discrepancy/code_extended",),
 }
 #: Not compared: what a kill-safe run notes for itself, and how many steps a fit took.
 NO_RESULT = ("n_iterations", "ensemble_tiles/", "summary/open_")

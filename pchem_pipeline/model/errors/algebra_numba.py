@@ -31,7 +31,9 @@ from pchem_pipeline.model.law.pixel_numba import (
 
 FloatArray = NDArray[np.float64]
 
-_SINGULAR = 1e-12  # of the diagonal element: what is left of it after the other parameters are taken out
+# of the diagonal element: what must be left of it after the other parameters are taken out; a comb that
+# fits whole numbers, whose bias and gain can make up for each other, has less
+_SINGULAR = 1e-6
 _SMALLEST = 1e-10  # of the damping matrix: less is lost in rounding
 
 

@@ -33,6 +33,7 @@ from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
     add_scan_starts,
     fill_starts,
+    scaled_start,
     start_cumulants,
     start_peak,
     start_regression,
@@ -71,6 +72,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     Histogram,
     Pixel,
     copy,
+    histogram_of,
 )
 
 FloatArray = NDArray[np.float64]
@@ -87,6 +89,8 @@ _SUSPICIOUS = 2.3
 _UNRESOLVED = 0.45
 _LIMIT_EXPOSURES = (0.3, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)
 _LIMIT_NOISE_E = 0.28
+_SCALES = (1.2, 0.83, 1.4, 0.71, 1.1, 0.91)  # of 1/g, where a bias is ambiguous
+_SHARP_NOISE2 = 0.1225  # e-^2: maxima at other gains are found from resolved peaks
 _STEPS = 4  # biases per electron
 _AROUND = 6  # steps from the exposure to the median, at most
 _LEAST_MASS = 1e-9  # of a sample that must not decide between starts
@@ -256,6 +260,27 @@ def _climb_few(
     return heights[0], heights[1], used
 
 
+@kernel(inline=True)
+def _climb_scaled(
+    pixel: Pixel, tools: Tools, best: FloatArray, heights: tuple[float, float]
+) -> tuple[float, float, int]:
+    """Climb from the best of a single sample with other gains, mean and variance kept; see `_better`.
+
+    Where a bias is ambiguous, the density's likelihood and this one rank the maxima differently, and those at
+    other gains are as near as the neighbours.
+    """
+    trial, start, used = tools.scratch.small[HERE], tools.scratch.small[KEPT_STARTS], 0
+    histogram = histogram_of(pixel, np.int64(0))
+    for scale in _SCALES:
+        start[1 + SATELLITE] = 0.0
+        if scaled_start(histogram, best, scale, _SHARP_NOISE2, start):
+            _from_density(pixel, np.bool_(False), start, trial)
+            first, second, count = _better(pixel, tools, trial, best, heights)
+            heights = first, second
+            used += count
+    return heights[0], heights[1], used
+
+
 def search_cells(
     pixel: Pixel,
     tools: Tools,
@@ -298,11 +323,13 @@ def search_cells(
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
     if known:
-        _from_density(pixel, limits.warm, near, trial)
-        outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
-        if outcome == CONVERGED:
-            copy(trial, best)
-        else:
+        for as_it_is in (limits.warm, np.bool_(True)):
+            _from_density(pixel, as_it_is, near, trial)
+            outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
+            used += count
+            if outcome == CONVERGED:
+                copy(trial, best)
+                break
             loglik = -math.inf
     if best[place] > 0.0:
         if gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
@@ -324,6 +351,9 @@ def search_cells(
         used += count
     if not best[place] > 0.0:
         return FIT_NOT_CONVERGED, used, 0
+    if n == 1 and not limits.warm and min(gap, loglik - runner_up) < limits.gap:
+        loglik, runner_up, count = _climb_scaled(pixel, tools, best, (loglik, runner_up))
+        used += count
     if loglik > before:
         _, freedom, score = examine(pixel, tools, best, out)
         used += 1

@@ -135,6 +135,14 @@ def min_log_variance(a: float, cells: bool) -> float:
     return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
 
 
+@kernel(inline=True)
+def floor_in_electrons(a: float, cells: bool) -> bool:
+    """Tell whether the lower bound of v is that in e-, which moves with the step a."""
+    if cells:
+        return LEAST_NOISE_E * a > LEAST_NOISE_DN
+    return 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
+
+
 @kernel
 def keep_inside(theta: FloatArray, limits: Limits) -> None:
     """Move ``theta`` to the nearest allowed values."""
@@ -256,8 +264,11 @@ def newton_step(
 
 
 @kernel
-def _take_step(theta: FloatArray, step: FloatArray, goal: Goal, limits: Limits, out: FloatArray) -> float:
-    """Take a Newton step, shortened to stay where the quadratic can be trusted; return the factor."""
+def _take_step(theta: FloatArray, step: FloatArray, tied: float, limits: Limits, out: FloatArray) -> float:
+    """Take a Newton step, shortened to stay where the quadratic can be trusted; return the factor.
+
+    With ``tied`` not negative the read noise in e- stays, that variance of rounding (DN^2) included.
+    """
     n = theta.size - N_BLOCK + 1
     a = theta[n + STEP]
     longest = max(abs(step[n + STEP]) / (0.1 * a), abs(step[n + BIAS]) / (0.4 * a))
@@ -267,24 +278,23 @@ def _take_step(theta: FloatArray, step: FloatArray, goal: Goal, limits: Limits, 
     factor = 1.0 if longest <= 1.0 else 1.0 / longest
     for i in range(theta.size):
         out[i] = theta[i] + factor * step[i]
-    if goal.tied:
-        _tie(theta, limits, out)
+    if tied >= 0.0:
+        _tie(theta, tied, out)
     keep_inside(out, limits)
     return factor
 
 
 @kernel(inline=True)
-def _tie(theta: FloatArray, limits: Limits, out: FloatArray) -> None:
-    """Set v so that the read noise in e-, quantisation included, is that of ``theta``."""
+def _tie(theta: FloatArray, rounding: float, out: FloatArray) -> None:
+    """Set v so that the read noise in e-, that variance of rounding included, is that of ``theta``."""
     n = theta.size - N_BLOCK + 1
-    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
     ratio = out[n + STEP] / theta[n + STEP]
     variance = (math.exp(theta[n + LOG_VARIANCE]) + rounding) * ratio * ratio - rounding
     out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
 
 
 @kernel(inline=True)
-def tie_noise(theta: FloatArray, at: FloatArray, limits: Limits) -> None:
+def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
     """Turn score and information in 1/g at known sigma into those at known ``sigma g``, in place.
 
     With ``v = log(a^2 w - r)``, r the variance of rounding where v leaves it out: ``dv/da = 2 k / a`` and
@@ -292,7 +302,7 @@ def tie_noise(theta: FloatArray, at: FloatArray, limits: Limits) -> None:
     """
     n = theta.size - N_BLOCK + 1
     a, step, noise = theta[n + STEP], 1 + STEP, 1 + LOG_VARIANCE
-    k = 1.0 + (QUANTISATION_VARIANCE if limits.cells else 0.0) * math.exp(-theta[n + LOG_VARIANCE])
+    k = 1.0 + rounding * math.exp(-theta[n + LOG_VARIANCE])
     slope, bend = 2.0 * k / a, (2.0 * k - 4.0 * k * k) / (a * a)
     for j in range(n):
         block = at[j]
@@ -333,7 +343,8 @@ def climb(
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
         that is trusted), number of evaluations.
     """
-    trial, step = scratch.small[TRIAL], scratch.small[STEPS]
+    trial, step, noise = scratch.small[TRIAL], scratch.small[STEPS], theta.size - N_BLOCK + 1 + LOG_VARIANCE
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
     at, ahead, held = scratch.evaluations[AT], scratch.evaluations[AHEAD], scratch.flags[HELD]
     keep_inside(theta, limits)
     if not sensible(theta, pixel.longest_step, limits.cells):
@@ -345,8 +356,11 @@ def climb(
     least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
     while used < limits.most:
         find_held(theta, at, scratch.flags[FIXED], limits, held)
-        if goal.tied and fresh:
-            tie_noise(theta, at, limits)
+        tied = rounding if goal.tied else -1.0
+        if held[noise] and not scratch.flags[FIXED, noise]:  # at its floor, which moves with 1/g
+            tied = 0.0 if floor_in_electrons(theta[noise - LOG_VARIANCE + STEP], limits.cells) else -1.0
+        if tied >= 0.0 and fresh:
+            tie_noise(theta, at, tied)
         fresh = False
         rise, share = newton_step(at, damping, least, scratch, step)
         if not rise >= 0.0:
@@ -357,7 +371,7 @@ def climb(
         if share == 0.0 and rise < limits.tolerance:
             if not only_em:
                 copy(theta, trial)
-                _take_step(trial, step, goal, limits, theta)
+                _take_step(trial, step, tied, limits, theta)
                 loglik += rise
             return CONVERGED, loglik, used
         if share == 0.0 and loglik + 2.0 * rise + 1.0 < goal.to_beat:
@@ -367,7 +381,7 @@ def climb(
         newton = limits.cells or goal.tied or (not only_em and used > warm_up and share <= _LARGEST_SHARE)
         factor = 1.0
         if newton:
-            factor = _take_step(theta, step, goal, limits, trial)
+            factor = _take_step(theta, step, tied, limits, trial)
         elif not em_step(pixel, theta, at, limits, trial):
             return NOT_CONVERGED, loglik, used
         risen = -math.inf

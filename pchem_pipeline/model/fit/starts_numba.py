@@ -391,6 +391,29 @@ def _scan_gains(pixel: Pixel, evaluate: Any, scratch: Scratch, theta: NDArray[np
     return best > -math.inf
 
 
+@kernel
+def scaled_start(
+    histogram: Histogram,
+    best: NDArray[np.float64],
+    scale: float,
+    most_noise2: float,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Fill ``theta`` with ``best``, 1/g scaled; tell whether that makes sense.
+
+    The read noise in e- is kept, up to ``most_noise2`` (e-^2); the exposure takes up the rest of the
+    variance.
+    """
+    a = best[1] * scale
+    noise2 = min(math.exp(best[3]) / (best[1] * best[1]), most_noise2)
+    exposure = histogram.variance / (a * a) - noise2
+    if exposure < 0.03 or a < MIN_STEP:
+        return False
+    assemble(histogram, a, exposure, theta)
+    theta[3] = math.log(max(noise2 * a * a, QUANTISATION_VARIANCE))
+    return True
+
+
 @kernel(inline=True)
 def _other_start(
     which: int,
@@ -424,15 +447,8 @@ def _other_start(
         return found
     if not best[1] > 0.0:
         return False
-    # the read noise in e- is kept, the exposure takes up the rest of the variance
-    a = best[1] * _GAIN_SCALES[which - 3]
-    noise2 = min(math.exp(best[3]) / (best[1] * best[1]), 0.25)
-    exposure = histogram.variance / (a * a) - noise2
-    if exposure < 0.03 or a < MIN_STEP:
-        return False
-    assemble(histogram, a, exposure, theta)
-    theta[3] = math.log(max(noise2 * a * a, QUANTISATION_VARIANCE))
-    return True
+    found = scaled_start(histogram, best, _GAIN_SCALES[which - 3], 0.25, theta)
+    return found
 
 
 @kernel

@@ -1,0 +1,100 @@
+"""The search ends at the highest maximum that has an answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.law.sample_law import SampleLaw
+
+#: 3,000 frames of H = 3.6 e-, 1/g = 2.01 DN, mu = 95.8 DN and a read noise of 0.53 DN, from 95 DN on.
+COMB = [
+    19,
+    58,
+    81,
+    192,
+    127,
+    371,
+    190,
+    481,
+    159,
+    432,
+    118,
+    307,
+    94,
+    159,
+    34,
+    78,
+    25,
+    35,
+    4,
+    22,
+    5,
+    4,
+    1,
+    2,
+    1,
+    1,
+]
+
+
+def drawn(
+    rng: np.random.Generator, truth: NDArray[np.float64], n_frames: int, per_electron: float = 0.0
+) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+    """Return histograms of pixels with (H, g, mu, analog read noise in DN), and DN of bin 0."""
+    h, g, mu, sigma = (column[:, None] for column in truth.T)
+    k = rng.poisson(h, (truth.shape[0], n_frames))
+    signal = k + np.sqrt(per_electron * k) * rng.standard_normal(k.shape)
+    values = np.rint(mu + signal / g + sigma * rng.standard_normal(k.shape)).astype(np.int64)
+    origin = values.min(axis=1) - 1
+    width = int((values.max(axis=1) - origin).max()) + 2
+    counts = [np.bincount(each - first, minlength=width) for each, first in zip(values, origin, strict=True)]
+    return np.array(counts, np.uint16), origin
+
+
+def test_a_comb_that_fits_whole_numbers_is_no_answer() -> None:
+    # 2 DN per electron: peaks as narrow as a DN, at whole numbers, are 0.14 nats likelier than the truth, but
+    # their width says nothing of the read noise
+    counts = np.array([COMB], np.uint16)
+    found = fit_histograms(counts, np.array([95]), settings=FitSettings(likelihood="exact"))
+    assert not found.fit_status[0] & int(FAILED)
+    assert found.read_noise_dn[0] == pytest.approx(0.530, abs=0.005)
+    assert np.isfinite(found.covariance[0]).all()
+
+
+def test_read_noise_at_its_floor_converges() -> None:
+    # the law has more noise than the pixels: nothing is left for their own, and its floor is in e-, so it
+    # moves with the gain
+    rng = np.random.default_rng(1)
+    counts, origin = drawn(rng, np.array([[40.0, 1 / 11, 100.0, 3.3]] * 24), 2500)
+    law = SampleLaw(variance_per_electron=0.0081, curvature=0.004, extra_variance_dn2=np.array([1.44]))
+    found = fit_histograms(counts, origin, law=law)
+    assert np.count_nonzero(found.fit_status & int(FitStatus.NOT_CONVERGED)) <= 1
+
+
+def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law() -> None:
+    # where the peaks are not resolved, the density and the law rank the maxima differently
+    rng = np.random.default_rng(2)
+    n, extra = 150, 0.09**2
+    step, noise = rng.uniform(8, 14, n), rng.uniform(0.38, 0.5, n)
+    truth = np.stack([rng.uniform(3, 9, n), 1 / step, rng.uniform(95, 105, n), noise * step], 1)
+    counts, origin = drawn(rng, truth, 2500, extra)
+    law = SampleLaw(variance_per_electron=extra)
+    found = fit_histograms(counts, origin, law=law)
+    near = truth.copy()
+    near[:, 3] = np.hypot(near[:, 3], np.sqrt(1 / 12))
+    from_truth = fit_histograms(counts, origin, law=law, start=near)
+    both = (
+        np.isfinite(found.bias)
+        & np.isfinite(from_truth.bias)
+        & (found.outlier_share == from_truth.outlier_share)
+    )
+    lower = found.log_likelihood < from_truth.log_likelihood - 1e-6
+    ambiguous = (found.fit_status & int(FitStatus.BIAS_AMBIGUOUS)) != 0
+    assert (both & ambiguous).sum() > 40
+    assert not (both & lower & ~ambiguous).any()
+    assert (both & lower).sum() <= 8  # 14 by the maxima of the density alone, one by 17 nats
