@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.region import Region, When
 
 __all__ = [
     "SCHEMA_VERSION",
@@ -149,6 +150,12 @@ class Place(_Part):
         frames: frame numbers, where it is a matter of few frames.
         seen, expected: samples in these codes, where they were counted.
         share_of_gap: share of the gap that is left, where it was measured.
+        region: where on the sensor its map stands out from the rest, as ``model.effects`` takes a region;
+            None: everywhere alike, or it has no map.
+        region_p: probability of such a place by chance, anywhere.
+        region_share: share of the region's pixels that deviate, at least (at 95 %).
+        when: frames in which its series stands out, as ``model.effects`` takes them; None: always alike.
+        when_p: probability of such frames by chance.
     """
 
     statistic: str
@@ -163,6 +170,11 @@ class Place(_Part):
     seen: Number = _NAN
     expected: Number = _NAN
     share_of_gap: Number = _NAN
+    region: dict[str, Any] | None = None
+    region_p: Number = _NAN
+    region_share: Number = _NAN
+    when: dict[str, Any] | None = None
+    when_p: Number = _NAN
 
     @classmethod
     def of(cls, statistic: str, z: float, **more: Any) -> Place:
@@ -170,6 +182,21 @@ class Place(_Part):
         known = STATISTICS[statistic]
         words = {"sentence": known.sentence, "channel": known.channel, "direction": "+" if z > 0 else "-"}
         return cls(statistic=statistic, z=z, **{**words, **more})
+
+    def spot(self) -> str:
+        """Return region and frames in words; empty where it is everywhere and always alike."""
+        parts = [] if self.region is None else [Region.model_validate(self.region).words()]
+        parts += [] if self.when is None else [When.model_validate(self.when).words()]
+        return ", ".join(parts)
+
+    def shifted(self, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Place:
+        """Return it with its region counted from the corner of a sensor of some shape."""
+        if self.region is None or (rows, columns) == ((0, shape[0]), (0, shape[1])):
+            return self
+        mask = np.zeros(shape, np.bool_)
+        inside = mask[slice(*rows), slice(*columns)]
+        inside[...] = Region.model_validate(self.region).mask(inside.shape)
+        return self.model_copy(update={"region": Region.of_mask(mask).numbers()})
 
 
 class Families(_Part):
@@ -345,11 +372,16 @@ class Verdict(_Part):
         return f"nearest: {rivals[0]}" if self.verdict == "unexplained" else " or ".join(rivals)
 
     def on_sensor(
-        self, rows: tuple[int, int], columns: tuple[int, int], pixel: Callable[[int, int], tuple[int, int]]
+        self,
+        shape: tuple[int, int],
+        rows: tuple[int, int],
+        columns: tuple[int, int],
+        pixel: Callable[[int, int], tuple[int, int]],
     ) -> Verdict:
         """Return it with pixels counted from the corner of the sensor.
 
         Args:
+            shape: of the sensor.
             rows: that were looked at, first and end.
             columns: likewise.
             pixel: from the place (y, x) of a pixel among those looked at to that on the sensor.
@@ -357,7 +389,7 @@ class Verdict(_Part):
 
         def moved(place: Place) -> Place:
             pixels = tuple(dict.fromkeys(pixel(y, x) for y, x in place.pixels))
-            return place.model_copy(update={"pixels": pixels})
+            return place.shifted(shape, rows, columns).model_copy(update={"pixels": pixels})
 
         examined = self.examined.model_copy(update={"rows": rows, "columns": columns})
         where = tuple(moved(place) for place in self.where)

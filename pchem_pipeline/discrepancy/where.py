@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.observe.laws import chi_square
+from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
-__all__ = ["locate"]
+__all__ = [
+    "frame_series",
+    "locate",
+    "map_of",
+    "pixel_maps",
+    "series_of",
+    "suspected_frames",
+    "suspected_regions",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -18,6 +31,184 @@ _FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
 _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
+
+
+def suspected_regions(
+    evidence: Evidence, significance: float = 1e-3, names: Collection[str] | None = None
+) -> dict[str, list[Suspect]]:
+    """Return where on the sensor each map of the evidence stands out from the rest of the sensor.
+
+    For whoever proposes effects with a place: ``suspect.region`` is one in the grammar of the YAML, the most
+    significant first, and what is everywhere alike has none. The probability counts all places and all maps.
+    Where ``suspect.only_there`` is false the rest of the sensor deviates as well, and the place may be but
+    where pixels differ in exposure or gain.
+
+    Args:
+        evidence: of frames or histograms; maps of (1, n) give ranges of columns.
+        significance: largest probability of a chance, in any place of any map.
+        names: the maps wanted (of :func:`pixel_maps`); None: all.
+
+    Returns:
+        By the name of the map; maps without a place are absent.
+    """
+    maps = {name: m for name, m in pixel_maps(evidence).items() if names is None or name in names}
+    found = {
+        name: scan_map(
+            values,
+            evidence.maps.usable,
+            significance=significance / len(maps),
+            single=name.startswith(("goodness", "spread")),
+            next_along={"x": 1, "y": 0}.get(name.partition(".")[0]),
+        )
+        for name, values in maps.items()
+    }
+    return {name: places for name, places in found.items() if places}
+
+
+def suspected_frames(
+    evidence: Evidence, significance: float = 1e-3, names: Collection[str] | None = None
+) -> dict[str, list[Stretch]]:
+    """Return in which frames each series of the evidence stands out, as :func:`suspected_regions` does."""
+    series = {name: s for name, s in frame_series(evidence).items() if names is None or name in names}
+    if evidence.time is None or not series:
+        return {}
+    numbers = evidence.time.frames
+    found = {
+        name: scan_series(values, numbers, significance=significance / len(series))
+        for name, values in series.items()
+    }
+    return {name: frames for name, frames in found.items() if frames}
+
+
+def pixel_maps(evidence: Evidence) -> dict[str, FloatArray]:
+    """Return the maps behind the statistics, each about N(0, 1) where nothing is wrong, (y, x).
+
+    ``score.C2`` and so on, ``goodness``; of frames also ``lag.charge``, ``lag.readout`` and ``lag.cross``
+    (the frame before), ``spread.*`` (block means scatter), ``trend.*`` (they rise along the run), and
+    ``x.kk``, ``x.rr``, ``x.rk``, ``y.kk``, ... (the next pixel along x or y): noise of rows raises ``x.rr``
+    where it is, noise of columns ``y.rr``, noise of frames both.
+    """
+    found = {f"score.{name}": np.asarray(m, np.float64) for name, m in evidence.scores.items()}
+    found["goodness"] = np.asarray(evidence.goodness, np.float64)
+    time = evidence.time
+    if time is None:
+        return found
+    root = np.sqrt(time.n_pairs)
+    found |= {
+        "lag.charge": time.lag_charge[0] * root,
+        "lag.readout": time.lag_readout[0] * root,
+        "lag.cross": time.lag_readout_charge * root,
+    }
+    for channel, blocks, std in (
+        ("charge", time.block_charge, evidence.charge_std),
+        ("readout", time.block_readout, evidence.readout_std),
+    ):
+        found[f"spread.{channel}"], found[f"trend.{channel}"] = _block_maps(time, blocks, std)
+    found |= {name: np.asarray(m, np.float64) for name, m in time.neighbour_maps.items()}
+    return found
+
+
+def _block_maps(
+    time: TimeSeries, blocks: NDArray[np.floating], std: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how much the block means of each pixel scatter, and how they rise along the run."""
+    length = np.diff(np.append(np.searchsorted(time.frames, time.block_start), time.frames.size))
+    weight = length.astype(np.float64)[:, None, None]
+    dof = max(length.size - 1, 1)
+    middle = time.block_start.astype(np.float64)
+    lever = (middle - np.average(middle, weights=length))[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        centred = blocks - (weight * blocks).sum(axis=0) / weight.sum()
+        chi2 = (weight * centred**2).sum(axis=0) / std**2
+        trend = (weight * lever * centred).sum(axis=0) / (std * np.sqrt((weight * lever**2).sum()))
+    return np.asarray(chi_square(chi2, dof)), np.asarray(trend)
+
+
+def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
+    """Return the series behind the statistics, each about N(0, 1) where nothing is wrong, (n,).
+
+    ``frame.charge`` and ``frame.readout`` (means of the frames), ``row.readout`` and so on: how much the
+    means of the rows (columns) of a frame scatter.
+    """
+    time, usable = evidence.time, evidence.maps.usable
+    if time is None:
+        return {}
+    charge, readout = (np.where(usable, std, 0.0) ** 2 for std in (evidence.charge_std, evidence.readout_std))
+    exposure = float(np.where(usable, evidence.maps.quanta_exposure, 0.0).sum())
+    found = {
+        "frame.charge": time.frame_charge * exposure / np.sqrt(charge.sum()),
+        "frame.readout": time.frame_readout * usable.sum() / np.sqrt(readout.sum()),
+    }
+    for line, axis, channel, values, variance in (
+        ("row", 1, "charge", time.row_charge, charge),
+        ("row", 1, "readout", time.row_readout, readout),
+        ("column", 0, "charge", time.column_charge, charge),
+        ("column", 0, "readout", time.column_readout, readout),
+    ):
+        total = variance.sum(axis=axis)
+        some = total > 0
+        if some.sum() > 2:
+            u = values[:, some] * usable.sum(axis=axis)[some] / np.sqrt(total[some])
+            u = u - u.mean(axis=1, keepdims=True)
+            found[f"{line}.{channel}"] = np.asarray(chi_square((u**2).sum(axis=1), some.sum() - 1.0))
+    return found
+
+
+#: The map in which a statistic would show where it is, by the beginning of its name; likewise the series.
+_MAP_OF = {
+    "shape.goodness": "goodness",
+    "time.lag1.charge": "lag.charge",
+    "time.lag2.charge": "lag.charge",
+    "time.lag1.readout": "lag.readout",
+    "time.lag2.readout": "lag.readout",
+    "time.cross.readout_charge": "lag.cross",
+    "time.block.charge": "spread.charge",
+    "time.block.readout": "spread.readout",
+    "frame.charge.quadrants": "trend.charge",
+    "frame.readout.quadrants": "trend.readout",
+    "frame.charge.trend": "trend.charge",
+    "frame.readout.trend": "trend.readout",
+    "frame.charge.slow": "spread.charge",
+    "frame.readout.slow": "spread.readout",
+    "frame.charge.variance": "x.kk",
+    "frame.readout.variance": "x.rr",
+    "space.row.charge": "x.kk",
+    "space.row.readout": "x.rr",
+    "space.column.charge": "y.kk",
+    "space.column.readout": "y.rr",
+}
+_SERIES_OF = {
+    "frame.charge": "frame.charge",
+    "frame.readout": "frame.readout",
+    "space.row.charge": "row.charge",
+    "space.row.readout": "row.readout",
+    "space.x.rr": "row.readout",
+    "space.x.kk": "row.charge",
+    "space.column.charge": "column.charge",
+    "space.column.readout": "column.readout",
+    "space.y.rr": "column.readout",
+    "space.y.kk": "column.charge",
+}
+
+
+def map_of(statistic: str) -> str | None:
+    """Return the map (of :func:`pixel_maps`) in which a statistic shows its place; None without any."""
+    parts = statistic.split(".")
+    if parts[0] == "shape" and parts[1] != "goodness":
+        return f"score.{parts[1]}"
+    if parts[0] == "space" and parts[1] in ("x", "y"):
+        return statistic.removeprefix("space.")
+    return _longest(_MAP_OF, statistic)
+
+
+def series_of(statistic: str) -> str | None:
+    """Return the series (of :func:`frame_series`) in which a statistic shows its frames, or None."""
+    return _longest(_SERIES_OF, statistic)
+
+
+def _longest(table: Mapping[str, str], name: str) -> str | None:
+    found = [start for start in table if name.startswith(start)]
+    return table[max(found, key=len)] if found else None
 
 
 def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: float) -> list[Place]:
@@ -30,12 +221,25 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
         significance: largest probability of a chance.
     """
     pulls, p_values = null.pulls(z, splits=2), null.p_values(z, splits=2)
+    chance = {
+        int(index): look_elsewhere(float(p_values[index]), null.effective_tests)
+        for index in np.argsort(-np.abs(pulls))[:_MOST_PLACES]
+    }
+    found = {index: p for index, p in chance.items() if p <= significance}
+    names = [null.names[index] for index in found]
+    # histograms alone are in no order
+    wanted = {m for n in names if (m := map_of(n)) is not None and evidence.time is not None}
+    regions = suspected_regions(evidence, significance, wanted)
+    frames = suspected_frames(evidence, significance, {s for n in names if (s := series_of(n)) is not None})
     places = []
-    for index in np.argsort(-np.abs(pulls))[:_MOST_PLACES]:
-        p = look_elsewhere(float(p_values[index]), null.effective_tests)
-        if p > significance:
-            break
+    for index, p in found.items():
         name = null.names[index]
+        spots: dict[str, Any] = {}
+        for suspect in regions.get(map_of(name) or "", ())[:1]:
+            spots |= {"region": suspect.region.numbers(), "region_p": suspect.p}
+            spots["region_share"] = suspect.share
+        for stretch in frames.get(series_of(name) or "", ())[:1]:
+            spots |= {"when": stretch.when.numbers(), "when_p": stretch.p}
         places.append(
             Place.of(
                 name,
@@ -44,6 +248,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
                 pixels=_pixels(name, evidence),
                 dn=_codes(name, evidence),
                 frames=_frames(name, evidence),
+                **spots,
             )
         )
     return places

@@ -97,7 +97,8 @@ def find_in_histograms(
     found = search(HistogramExplainer(tuple(samples), settings or DiscrepancySettings(), tuple(model)))
     n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n
-    verdict = found.verdict.on_sensor((0, n // row), (0, row), lambda _, x: divmod(x // n_lit, row))
+    shape = n // row, row
+    verdict = found.verdict.on_sensor(shape, (0, shape[0]), (0, row), lambda _, x: divmod(x // n_lit, row))
     return replace(found, verdict=verdict)
 
 

@@ -301,9 +301,7 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
     k, r = sums.rows[:2].sum(axis=0), sums.rows[2:].sum(axis=0)
     length = np.diff(view.edges)[:, None, None]
     found = {
-        f"{axis}.{kind}": (correlation, pairs)
-        for axis in ("x", "y")
-        for kind, (correlation, pairs, _) in neighbour_sums(view, axis).items()
+        f"{axis}.{kind}": seen for axis in ("x", "y") for kind, seen in neighbour_sums(view, axis).items()
     }
     return TimeSeries(
         frames=view.numbers,
@@ -326,8 +324,9 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
         lag_readout_charge=mapped(lags[6]),
         lag_charge_readout=mapped(lags[7]),
         n_pairs=sums.n_pairs[0],
-        neighbours={name: value[0] for name, value in found.items()},
-        neighbour_pairs={name: value[1] for name, value in found.items()},
+        neighbours={name: seen.correlation for name, seen in found.items()},
+        neighbour_pairs={name: seen.products for name, seen in found.items()},
+        neighbour_maps={name: seen.deviation.astype(np.float32) for name, seen in found.items()},
         repeated=view.numbers[sums.repeated],
         repeated_rows=sums.repeated_rows,
         hits=np.column_stack([view.numbers[sums.hits[:, 0]], sums.hits[:, 1:]]).astype(np.int64),

@@ -269,9 +269,9 @@ def space_statistics(view: FrameView) -> dict[str, float]:
                 for what, z in _line_statistics(view, values, variance, mode, name).items()
             }
     for along in ("x", "y"):
-        for pair, (correlation, pairs, z) in neighbour_sums(view, along).items():
-            if pairs and np.isfinite(correlation):
-                found[f"space.{along}.{pair}"] = z
+        for pair, seen in neighbour_sums(view, along).items():
+            if seen.products and np.isfinite(seen.correlation):
+                found[f"space.{along}.{pair}"] = seen.z
     return found
 
 
@@ -316,8 +316,25 @@ def _line_over_lines(view: FrameView, rest: FloatArray, used: int) -> float | No
     return laws.best(laws.largest_power(coherent, count), laws.largest_power(single, count * length))
 
 
-def neighbour_sums(view: FrameView, axis: str) -> dict[str, tuple[float, int, float]]:
-    """Return mean correlation, number of products and statistic of neighbours along x or y, by kind."""
+@dataclass(frozen=True)
+class Neighbours:
+    """The correlation of neighbours along an axis.
+
+    Attributes:
+        correlation: mean over all pairs.
+        products: number of them.
+        z: statistic of all pairs.
+        deviation: of each pixel and the next one, N(0, 1) by chance; NaN where one is not usable, (y, x).
+    """
+
+    correlation: float
+    products: int
+    z: float
+    deviation: FloatArray
+
+
+def neighbour_sums(view: FrameView, axis: str) -> dict[str, Neighbours]:
+    """Return the correlation of neighbours along x or y, by kind."""
     pixels, n = view.pixels, view.n
     products = view.sums.next_column if axis == "x" else view.sums.next_row
     every, front, back = slice(None), slice(None, -1), slice(1, None)
@@ -336,8 +353,14 @@ def neighbour_sums(view: FrameView, axis: str) -> dict[str, tuple[float, int, fl
             size = size + np.sqrt(va[two] * vb[one])
             variance = variance + va[two] * vb[one] + 2.0 * pixels.cross[one] * pixels.cross[two]
         excess = (products[index][: both.shape[0], : both.shape[1]] - expected)[both]
-        z = float(np.sum(excess / np.sqrt(variance[both])) * np.sqrt(n / pairs))
-        found[kind] = (float(np.mean(excess / size[both])), n * pairs * (2 if kind == "rk" else 1), z)
+        deviation = np.full(pixels.usable.shape, np.nan)
+        deviation[one][both] = excess * np.sqrt(n / variance[both])
+        found[kind] = Neighbours(
+            float(np.mean(excess / size[both])),
+            n * pairs * (2 if kind == "rk" else 1),
+            float(np.sum(deviation[one][both]) / np.sqrt(pairs)),
+            deviation,
+        )
     return found
 
 

@@ -97,6 +97,8 @@ class TimeSeries:
             pixels: "x.kk", "x.rr", "x.rk" (readout of one with charge of the other, both ways) and the same
             for "y", with the mean taken after the frame's common mode was removed.
         neighbour_pairs: number of products behind each of them.
+        neighbour_maps: by the same names the correlation of each pixel with the next one along the axis, over
+            its standard error by chance, shape (y, x); NaN without one.
         repeated: frame numbers that are, sample by sample, the frame before, shape (n_repeated,).
         repeated_rows: number of rows (of frames not in ``repeated``) that are the same row of the frame
             before.
@@ -129,6 +131,7 @@ class TimeSeries:
     repeated: NDArray[np.int64]
     repeated_rows: int
     hits: NDArray[np.int64]
+    neighbour_maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

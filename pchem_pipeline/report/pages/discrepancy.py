@@ -321,7 +321,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
 
 def place_text(place: Place) -> str:
     """Return where a statistic points to: pixels, DN, frames; empty for the whole sensor and run."""
-    words = []
+    words = [place.spot()] if place.spot() else []
     if place.pixels:
         shown = ", ".join(f"({y}, {x})" for y, x in place.pixels[:4])
         more = f" … {count(len(place.pixels), 'pixel')}" if len(place.pixels) > 4 else ""

@@ -122,7 +122,8 @@ def run(context: StageContext) -> None:
         model=before,
         mapper=_Mapper(context),
     )
-    found = replace(found, verdict=found.verdict.on_sensor(window.rows, window.columns, window.pixel))
+    verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
+    found = replace(found, verdict=verdict)
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 

@@ -62,7 +62,7 @@ def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
 
 
 def _spots(place: Place) -> str:
-    words = []
+    words = [place.spot()] if place.spot() else []
     if place.pixels:
         words.append(f"{len(place.pixels)} pixels, first (y, x) = {place.pixels[0]}")
     if place.dn is not None:

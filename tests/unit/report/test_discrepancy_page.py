@@ -342,7 +342,7 @@ def test_a_placebo_that_closes_the_gap_is_a_caution() -> None:
 
 def test_places_of_a_window_are_places_of_the_sensor() -> None:
     found = verdict_of("named")
-    moved = found.on_sensor((100, 164), (200, 264), lambda y, x: (y + 100, x + 200))
+    moved = found.on_sensor((512, 512), (100, 164), (200, 264), lambda y, x: (y + 100, x + 200))
     assert moved.examined.origin == (100, 200)
     assert moved.examined.frames == found.examined.frames
     assert moved.where[2].pixels == ((103, 204), (110, 220), (130, 239))

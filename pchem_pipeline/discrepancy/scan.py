@@ -1,0 +1,458 @@
+"""Scan statistics: the place on a map, or the stretch of a series, whose values stand out most.
+
+Each value is about N(0, 1) and independent of the others where nothing is wrong. Of every place of some
+family (bands of rows or columns, rectangles, discs, lines at a period, single pixels; ranges of frames, a
+period, single frames) the mean inside is compared with the mean outside, so that something everywhere alike
+has no place. The probability is that of the largest deviation among all places of the family (the union
+bound), of all families: it counts every place that was looked at.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.effects.framework.region import Region, When
+
+__all__ = ["Stretch", "Suspect", "affected_share", "scan_map", "scan_series"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+#: Values count as no more than this many standard deviations, so that a few pixels are no band of columns.
+_CLIP = 6.0
+#: Cells along an edge of the map (or the series) on which all rectangles (ranges) are tried.
+_CELLS, _STRETCHES = 32, 400
+_RADII = (1.5, 2.5, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0)
+_FINER = (0.72, 0.8, 0.9, 1.12, 1.25, 1.4)
+_PERIODS = (2, 4, 8, 16, 32)
+_FRAME_PERIODS = tuple(range(2, 33))
+#: Sweeps of the edges of a rectangle over the pixels.
+_SWEEPS = 3
+_FEWEST = 3  # pixels of a place
+_LEAST = -690.0  # logarithm of the smallest probability that is written
+_SURE = 0.05
+#: Nats by which a place of a further family must be less probable than a simpler one.
+_BETTER = 3.0
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A place on the sensor where a map stands out.
+
+    Attributes:
+        region: the place.
+        family: rows, columns, rectangle, disc, period or pixels.
+        z: deviation of its mean from that of the rest, standard errors.
+        log_p: logarithm of the probability of such a deviation by chance in any place.
+        inside, outside: mean of the map there and elsewhere.
+        share: of its pixels that deviate, at least (at 95 %, for all places at once).
+    """
+
+    region: Region
+    family: str
+    z: float
+    log_p: float
+    inside: float
+    outside: float
+    share: float = 0.0
+
+    @property
+    def p(self) -> float:
+        """Probability of such a deviation by chance, at least 1e-300."""
+        return math.exp(max(self.log_p, _LEAST))
+
+    @property
+    def only_there(self) -> bool:
+        """Whether little of it is elsewhere."""
+        return abs(self.outside) < 0.25 * abs(self.inside)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Frames in which a series stands out; as :class:`Suspect`, of a series."""
+
+    when: When
+    family: str
+    z: float
+    log_p: float
+    inside: float
+    outside: float
+
+    @property
+    def p(self) -> float:
+        """Probability of such a deviation by chance, at least 1e-300."""
+        return math.exp(max(self.log_p, _LEAST))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The best place of a family, its deviation, and the logarithm of its probability."""
+
+    family: str
+    mask: BoolArray
+    z: float
+    log_p: float
+
+
+# -- maps ---------------------------------------------------------------------------------------
+
+
+def scan_map(
+    values: FloatArray,
+    usable: BoolArray,
+    *,
+    significance: float = 1e-3,
+    most: int = 3,
+    single: bool = True,
+    next_along: int | None = None,
+) -> list[Suspect]:
+    """Return the places that stand out of a map, the most significant first, each without those before it.
+
+    Args:
+        values: N(0, 1) where nothing is wrong, (y, x).
+        usable: pixels that count, (y, x).
+        significance: largest probability of a chance.
+        most: places at most.
+        single: look for single pixels, too; not where far tails are heavier than normal.
+        next_along: axis along which each value is of a pixel and the next one: places reach one further.
+    """
+    some = usable & np.isfinite(values)
+    found: list[Suspect] = []
+    left = some.copy()
+    while len(found) < most and left.sum() > 2 * _FEWEST:
+        best = _best(values, left, single)
+        if best is not None:
+            best = _checked(_odd_side(best, values, left), values, left)
+        if best is None or best.log_p > math.log(significance):
+            break
+        mask = best.mask & left
+        inside, outside = float(values[mask].mean()), float(values[left & ~mask].mean())
+        share = affected_share(np.where(some, math.copysign(1.0, best.z) * values, -np.inf)[some], mask[some])
+        region = Region.of_mask(_reaching(best.mask, next_along))
+        found.append(Suspect(region, best.family, best.z, best.log_p, inside, outside, share))
+        left &= ~best.mask
+    return found
+
+
+def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
+    """Return a mask of pixels whose pairs with the next pixel along an axis are in the place."""
+    if axis is None:
+        return mask
+    grown = mask.copy()
+    after, before = (np.s_[1:], np.s_[:-1]) if axis == 0 else (np.s_[:, 1:], np.s_[:, :-1])
+    grown[after] |= mask[before]
+    return grown
+
+
+def _checked(found: _Found, values: FloatArray, some: BoolArray) -> _Found:
+    """Return a place with its deviation in terms of the scatter inside and outside (Welch).
+
+    Where values scatter more, a mean that is off says less.
+    """
+    if found.family == "pixels":
+        return found
+    inside, outside = values[some & found.mask], values[some & ~found.mask]
+    variance = max(inside.var(), 1.0) / inside.size + max(outside.var(), 1.0) / outside.size
+    z = float((inside.mean() - outside.mean()) / np.sqrt(variance))
+    if abs(z) >= abs(found.z):
+        return found
+    places = found.log_p - float(special.log_ndtr(-abs(found.z)))
+    return _Found(found.family, found.mask, z, min(0.0, float(special.log_ndtr(-abs(z))) + places))
+
+
+def _best(values: FloatArray, some: BoolArray, single: bool) -> _Found | None:
+    """Return the place of the smallest probability, a simpler one where that is nearly as small."""
+    kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
+    contrast = _Contrast.of(kept, some)
+    if contrast is None:
+        return None
+    families = [
+        _bands(contrast, 0),
+        _bands(contrast, 1),
+        _periodic(contrast, 0),
+        _periodic(contrast, 1),
+        _rectangle(contrast),
+        _disc(contrast),
+        _single(values, some) if single else None,
+    ]
+    there = [each for each in families if each is not None]
+    best = there[0]
+    for each in there[1:]:
+        if each.log_p < best.log_p - _BETTER:
+            best = each
+    return _Found(best.family, best.mask, best.z, best.log_p + math.log(len(families)))
+
+
+def _odd_side(found: _Found, values: FloatArray, some: BoolArray) -> _Found:
+    """Return the place, or all outside of it where that is what deviates from 0."""
+    inside, outside = values[some & found.mask].mean(), values[some & ~found.mask].mean()
+    if abs(inside) >= abs(outside):
+        return found
+    return _Found(found.family, ~found.mask, -found.z, found.log_p)
+
+
+@dataclass(frozen=True)
+class _Contrast:
+    """Values about the mean of all, 0 where they do not count, with what a mean over places needs."""
+
+    values: FloatArray
+    some: FloatArray
+    spread: float
+
+    @classmethod
+    def of(cls, values: FloatArray, some: BoolArray) -> _Contrast | None:
+        """Centre a map; None where it has no pixels."""
+        inside = values[some]
+        if inside.size <= 2 * _FEWEST:
+            return None
+        # what stands out widens the spread of the whole: take it from the middle
+        spread = max(1.0, float(np.subtract(*np.quantile(inside, [0.75, 0.25]))) / 1.349)
+        return cls(np.where(some, values - inside.mean(), 0.0), some.astype(np.float64), spread)
+
+    @property
+    def n(self) -> float:
+        """Pixels in all."""
+        return float(self.some.sum())
+
+    def z(self, sums: NDArray[Any], counts: NDArray[Any]) -> FloatArray:
+        """Return the deviation of mean inside from mean outside, for places of such sums and counts."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = sums / (self.spread * np.sqrt(counts * (1.0 - counts / self.n)))
+        return np.where((counts >= _FEWEST) & (counts <= self.n - _FEWEST), z, 0.0)
+
+
+def _log_p(z: float, places: float) -> float:
+    """Return the logarithm of the union bound over places, both signs, at most 0."""
+    return min(0.0, float(special.log_ndtr(-abs(z))) + math.log(2.0 * places))
+
+
+def _intervals(contrast: _Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
+    """Return the deviation and the ends of the best range of lines."""
+    total, number = (np.concatenate([[0.0], np.cumsum(values)]) for values in (sums, counts))
+    z = contrast.z(total[None, :] - total[:, None], number[None, :] - number[:, None])
+    z = np.where(np.arange(total.size)[None, :] > np.arange(total.size)[:, None], z, 0.0)
+    a, b = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
+    return float(z[a, b]), int(a), int(b)
+
+
+def _bands(contrast: _Contrast, axis: int) -> _Found:
+    """Return the best band of rows (axis 0) or columns (axis 1)."""
+    across = 1 - axis
+    sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
+    z, a, b = _intervals(contrast, sums, counts)
+    lines = np.zeros(sums.size, np.bool_)
+    lines[a:b] = True
+    return _Found(
+        "columns" if axis else "rows", _lines(lines, axis, contrast), z, _log_p(z, sums.size**2 / 2)
+    )
+
+
+def _lines(lines: BoolArray, axis: int, contrast: _Contrast) -> BoolArray:
+    return np.broadcast_to(lines if axis else lines[:, None], contrast.values.shape).copy()
+
+
+def _periodic(contrast: _Contrast, axis: int) -> _Found:
+    """Return the best set of every n-th row or column."""
+    across = 1 - axis
+    sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
+    best, lines, tried = 0.0, np.zeros(sums.size, np.bool_), 0
+    number = np.arange(sums.size)
+    for period in (p for p in _PERIODS if 2 * p <= sums.size):
+        phase = number % period
+        z = contrast.z(np.bincount(phase, sums), np.bincount(phase, counts))
+        tried += period
+        at = int(np.argmax(np.abs(z)))
+        if abs(z[at]) > abs(best):
+            best, lines = float(z[at]), phase == at
+    return _Found("period", _lines(lines, axis, contrast), best, _log_p(best, max(tried, 1)))
+
+
+def _rectangle(contrast: _Contrast) -> _Found:
+    """Return the best rectangle: of all made of coarse cells, its edges moved to where they fit best."""
+    ny, nx = contrast.values.shape
+    tops, lefts = (np.unique(np.linspace(0, size, min(_CELLS, size) + 1).astype(int)) for size in (ny, nx))
+    sums, counts = (_integral(values)[np.ix_(tops, lefts)] for values in (contrast.values, contrast.some))
+    best, rows, columns = 0.0, (0, ny), (0, nx)
+    for height in range(1, tops.size):
+        band, number = sums[height:] - sums[:-height], counts[height:] - counts[:-height]
+        z = contrast.z(band[:, None, :] - band[:, :, None], number[:, None, :] - number[:, :, None])
+        z = np.triu(np.abs(z), 1)
+        at, a, b = np.unravel_index(int(np.argmax(z)), z.shape)
+        if z[at, a, b] > best:
+            best, rows = float(z[at, a, b]), (int(tops[at]), int(tops[at + height]))
+            columns = (int(lefts[a]), int(lefts[b]))
+    z_best = best
+    for _ in range(_SWEEPS):
+        inside = slice(*rows)
+        z_best, *ends = _intervals(contrast, contrast.values[inside].sum(0), contrast.some[inside].sum(0))
+        columns = (ends[0], ends[1])
+        within = np.s_[:, slice(*columns)]
+        z_best, *ends = _intervals(contrast, contrast.values[within].sum(1), contrast.some[within].sum(1))
+        rows = (ends[0], ends[1])
+    mask = np.zeros((ny, nx), np.bool_)
+    mask[slice(*rows), slice(*columns)] = True
+    return _Found("rectangle", mask, z_best, _log_p(z_best, (ny * nx) ** 2 / 4.0))
+
+
+def _integral(values: FloatArray) -> FloatArray:
+    return np.pad(np.cumsum(np.cumsum(values, axis=0), axis=1), ((1, 0), (1, 0)))
+
+
+def _disc(contrast: _Contrast) -> _Found | None:
+    """Return the best disc, its middle anywhere; one that an edge of the sensor cuts counts as well."""
+    ny, nx = contrast.values.shape
+    radii = [radius for radius in _RADII if radius <= max(ny, nx) / 2]
+    tried = [_disc_of(contrast, radius) for radius in radii]
+    if not tried:
+        return None
+    best = max(tried, key=lambda each: abs(each[0]))
+    tried += [_disc_of(contrast, best[2] * factor) for factor in _FINER]
+    z, (row, column), radius = max(tried, key=lambda each: abs(each[0]))
+    y, x = np.ogrid[:ny, :nx]
+    mask = np.asarray((y - row) ** 2 + (x - column) ** 2 <= radius**2)
+    return _Found("disc", mask, z, _log_p(z, float(ny * nx * len(tried))))
+
+
+def _disc_of(contrast: _Contrast, radius: float) -> tuple[float, tuple[int, int], float]:
+    """Return deviation and middle of the best disc of a radius."""
+    from scipy.signal import fftconvolve
+
+    reach = int(radius)
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    disc = (y * y + x * x <= radius * radius).astype(np.float64)
+    sums, counts = (fftconvolve(values, disc, "same") for values in (contrast.values, contrast.some))
+    z = contrast.z(sums, np.rint(counts))
+    row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
+    return float(z[row, column]), (int(row), int(column)), radius
+
+
+def _single(values: FloatArray, some: BoolArray) -> _Found | None:
+    """Return the pixels that stand out each by itself (with the sign of the largest)."""
+    magnitude = np.where(some, np.abs(values), 0.0)
+    at = np.unravel_index(int(np.argmax(magnitude)), values.shape)
+    n = float(some.sum())
+    log_p = _log_p(float(magnitude[at]), n)
+    limit = float(-special.ndtri_exp(math.log(_SURE / n)))
+    mask = some & (np.sign(values[at]) * values > limit)
+    # many next to each other are a place, and found as such
+    if mask.sum() > 0.02 * n:
+        return None
+    mask[at] = True
+    return _Found("pixels", mask, float(values[at]), log_p)
+
+
+def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> float:
+    """Return a lower bound of the share of the values inside a place that are larger than by chance.
+
+    All-resolutions inference (Rosenblatt et al. 2018; Goeman and Solari 2011): closed testing with Simes'
+    test bounds the number of true deviations of all sets at once, so that the place may have been chosen
+    after looking: ``max_u (1 - u + #{i inside: m p_i <= u level})`` with all m values (Hommel's smaller
+    number would do, and give a little more).
+
+    Args:
+        z: one-sided deviations of all values, N(0, 1) by chance, (m,).
+        inside: the place, (m,).
+        level: probability that any of these bounds is too large.
+    """
+    n = int(inside.sum())
+    if n == 0:
+        return 0.0
+    p = np.sort(special.ndtr(-z[inside]))
+    # the smallest u for which the i-th value counts
+    u = np.maximum(np.ceil(z.size * p / level), 1.0)
+    bound = 1.0 - u + np.arange(1, n + 1)
+    return float(max(bound.max(), 0.0) / n)
+
+
+# -- series -------------------------------------------------------------------------------------
+
+
+def scan_series(
+    values: FloatArray, numbers: NDArray[np.int64], *, significance: float = 1e-3, most: int = 2
+) -> list[Stretch]:
+    """Return the frames that stand out of a series, the most significant first.
+
+    Args:
+        values: N(0, 1) and independent where nothing is wrong, (n,).
+        numbers: frame numbers, increasing, (n,).
+        significance: largest probability of a chance.
+        most: stretches at most.
+    """
+    left = np.isfinite(values)
+    found: list[Stretch] = []
+    while len(found) < most and left.sum() > 2 * _FEWEST:
+        best = _best_frames(values, numbers, left)
+        if best is None:
+            break
+        when, place = best[0], _checked(best[1], values, left)
+        if place.log_p > math.log(significance):
+            break
+        mask = place.mask & left
+        inside, outside = float(values[mask].mean()), float(values[left & ~mask].mean())
+        family = "frames" if place.family == "pixels" else place.family
+        found.append(Stretch(when, family, place.z, place.log_p, inside, outside))
+        left &= ~place.mask
+    return found
+
+
+def _best_frames(
+    values: FloatArray, numbers: NDArray[np.int64], some: BoolArray
+) -> tuple[When, _Found] | None:
+    kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
+    contrast = _Contrast.of(kept, some)
+    if contrast is None:
+        return None
+    families = [_frame_range(contrast), _frame_period(contrast, numbers), _single(values, some)]
+    there = [each for each in families if each is not None]
+    best = min(there, key=lambda each: each.log_p)
+    log_p = best.log_p + math.log(len(families))
+    at = np.flatnonzero(best.mask)
+    if best.family == "range":
+        when = When(range=((int(numbers[at[0]]), int(numbers[at[-1]]) + 1),))
+    elif best.family == "period":
+        period = int(np.gcd.reduce(np.diff(numbers[at])))
+        when = When(every=period, phase=int(numbers[at[0]]) % period)
+    else:
+        when = When(single=tuple(int(i) for i in numbers[at][:1000]))
+    return when, _Found(best.family, best.mask, best.z, log_p)
+
+
+def _frame_range(contrast: _Contrast) -> _Found:
+    """Return the best range of frames: of whole cells, then its ends moved by frames."""
+    n = contrast.values.size
+    total, number = (np.concatenate([[0.0], np.cumsum(v)]) for v in (contrast.values, contrast.some))
+    edges = np.unique(np.linspace(0, n, min(_STRETCHES, n) + 1).astype(int))
+    z, a, b = _intervals(contrast, np.diff(total[edges]), np.diff(number[edges]))
+    first, last = int(edges[a]), int(edges[b])
+    near = int(np.ceil(n / _STRETCHES)) + 1
+    for _ in range(2):
+        starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)
+        scores = contrast.z(total[last] - total[starts], number[last] - number[starts])
+        first = int(starts[np.argmax(np.abs(scores))])
+        ends = np.arange(max(last - near, first + 1), min(last + near, n) + 1)
+        scores = contrast.z(total[ends] - total[first], number[ends] - number[first])
+        last = int(ends[np.argmax(np.abs(scores))])
+        z = float(scores[np.argmax(np.abs(scores))])
+    mask = np.zeros(n, np.bool_)
+    mask[first:last] = True
+    return _Found("range", mask, z, _log_p(z, n**2 / 2))
+
+
+def _frame_period(contrast: _Contrast, numbers: NDArray[np.int64]) -> _Found | None:
+    """Return the best phase of a period of frames."""
+    best, mask, tried = 0.0, np.zeros(numbers.size, np.bool_), 0
+    for period in (p for p in _FRAME_PERIODS if 4 * p <= numbers.size):
+        phase = numbers % period
+        sums, counts = (np.bincount(phase, v, period) for v in (contrast.values, contrast.some))
+        z = contrast.z(sums, counts)
+        tried += period
+        at = int(np.argmax(np.abs(z)))
+        if abs(z[at]) > abs(best) * 1.02:  # a multiple of a period is no better than it
+            best, mask = float(z[at]), np.asarray(phase == at)
+    return _Found("period", mask, best, _log_p(best, max(tried, 1))) if tried else None

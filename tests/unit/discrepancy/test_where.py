@@ -1,0 +1,124 @@
+"""Disagreements are located: on frames from plain numpy, by the maps and series of their evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.quick_stacks import stack
+
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.verdict import Place
+from pchem_pipeline.discrepancy.where import (
+    frame_series,
+    map_of,
+    pixel_maps,
+    series_of,
+    suspected_frames,
+    suspected_regions,
+)
+from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.framework.region import Region
+
+SHAPE = (500, 48, 80)  # a third of 1,500 frames
+PIXELS = SHAPE[1:]
+Array = np.ndarray[Any, Any]
+
+
+def seen(moved: Callable[[Array, np.random.Generator], Array] | None = None, seed: int = 1) -> Evidence:
+    rng = np.random.default_rng(seed)
+    frames = stack(rng, SHAPE, (lambda dn: dn) if moved is None else (lambda dn: moved(dn, rng)))
+    return observe(frames, np.arange(SHAPE[0]), n_run=SHAPE[0], block_frames=50)
+
+
+def row_noise_of_a_tap(dn: Array, rng: np.random.Generator) -> Array:
+    dn[:, :, 60:] += 1.2 * rng.standard_normal(dn.shape[:2])[:, :, None]
+    return dn
+
+
+def column_noise_of_a_quadrant(dn: Array, rng: np.random.Generator) -> Array:
+    dn[:, :24, 40:] += rng.standard_normal((dn.shape[0], 1, 40))
+    return dn
+
+
+def one_noisy_row(dn: Array, rng: np.random.Generator) -> Array:
+    dn[:, 17] += 1.5 * rng.standard_normal((dn.shape[0], 1))
+    return dn
+
+
+def blob() -> Array:
+    y, x = np.ogrid[: PIXELS[0], : PIXELS[1]]
+    return np.asarray((y - 20) ** 2 + (x - 50) ** 2 <= 64)
+
+
+def drift_of_a_blob(dn: Array, rng: np.random.Generator) -> Array:
+    dn[:, blob()] += 1.5 * np.linspace(-0.5, 0.5, dn.shape[0])[:, None]
+    return dn
+
+
+@pytest.mark.parametrize(
+    ("moved", "name", "region"),
+    [
+        (row_noise_of_a_tap, "x.rr", Region(columns=((60, 80),))),
+        (column_noise_of_a_quadrant, "y.rr", Region(rows=((0, 24),), columns=((40, 80),))),
+        (one_noisy_row, "x.rr", Region(rows=((17, 18),))),
+        (drift_of_a_blob, "trend.readout", Region.of_mask(blob())),
+    ],
+)
+def test_the_place_overlaps_the_truth_by_80_per_cent(
+    moved: Callable[..., Array], name: str, region: Region
+) -> None:
+    found = suspected_regions(seen(moved))
+    best = min(found, key=lambda each: found[each][0].log_p)
+    assert best == name
+    first = found[name][0]
+    assert first.region.overlap(region, PIXELS) >= 0.8
+    assert first.only_there
+    assert first.log_p < -30
+
+
+def test_row_noise_of_some_frames_is_told_by_its_frames() -> None:
+    def moved(dn: Array, rng: np.random.Generator) -> Array:
+        dn[200:260] += 1.2 * rng.standard_normal((60, dn.shape[1]))[:, :, None]
+        return dn
+
+    found = suspected_frames(seen(moved))
+    assert found["row.readout"][0].when.numbers() == {"range": [[200, 260]]}
+
+
+def test_clean_frames_have_no_place_and_no_time() -> None:
+    for seed in range(2):
+        evidence = seen(None, seed)
+        assert suspected_regions(evidence) == {}
+        assert suspected_frames(evidence) == {}
+
+
+def test_maps_and_series_are_standard_normal_by_chance() -> None:
+    evidence = seen()
+    maps, series = pixel_maps(evidence), frame_series(evidence)
+    assert len(maps) == 8 + 1 + 3 + 4 + 6
+    for name, values in (maps | series).items():
+        z = values[np.isfinite(values)]
+        assert abs(z.mean()) < 5.0 / np.sqrt(z.size) + 0.05, name
+        assert 0.8 < z.std() < 1.2, name
+
+
+def test_every_statistic_is_asked_of_a_map_or_series_that_exists() -> None:
+    evidence = seen()
+    maps, series = pixel_maps(evidence), frame_series(evidence)
+    named = {map_of(name) for name in STATISTICS} - {None}
+    assert named <= set(maps)
+    assert {series_of(name) for name in STATISTICS} - {None} <= set(series)
+    assert (map_of("space.x.rk"), map_of("code.rough")) == ("x.rk", None)
+    assert series_of("space.row.readout.lag1") == "row.readout"
+
+
+def test_a_place_counts_from_the_corner_of_the_sensor() -> None:
+    inside = Place.of("space.x.rr", 9.0, region={"columns": [[2, 6]]}, when={"range": [[3, 9]]})
+    moved = inside.shifted((100, 200), (10, 30), (40, 60))
+    assert moved.region == {"rows": [[10, 30]], "columns": [[42, 46]]}
+    assert inside.shifted((20, 20), (0, 20), (0, 20)) == inside
+    assert moved.spot() == "rows 10 to 29, columns 42 to 45, frames 3 to 8"
