@@ -32,6 +32,13 @@ def apply(
         ),
     ] = "frames",
     format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
+    keep_modes: Annotated[
+        bool,
+        typer.Option(
+            "--keep-modes",
+            help="leave row, column and frame noise, drift and pickup of the model in the frames",
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="replace calibrated frames that are there")] = False,
     *,
     command: Command,
@@ -45,6 +52,6 @@ def apply(
     from pchem_pipeline.run.target import find_run
 
     command = replace(command, options=replace(command.options, force=force))
-    wanted = ApplySettings(kinds_of(what), prior, format=format)
+    wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format)
     for path in apply_to_frames(find_run(target), frames, output, wanted, command):
         typer.echo(path)

@@ -220,3 +220,52 @@ def test_a_moved_offset_is_told(lab):
     tifffile.imwrite(lab.folder / "moved.tif", dn[:1] - 15)
     result = lab.ok("apply", "run.zarr", "moved.tif", "--output", "out.zarr", "--what", "electrons")
     assert "the offset has moved" in result.stderr
+
+
+ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
+
+
+@pytest.fixture(scope="module")
+def striped(make_once, kernels):
+    """A run whose model has row noise, and frames of a scene with it: ``night.tif``."""
+
+    def make(folder):
+        rng = np.random.default_rng(61)
+        camera = KnownCamera.drawn(rng, (12, 40), read_noise=(0.2, 0.25))
+        for name, n, exposure in (("dark.tif", 2500, 2.0), ("night.tif", 400, 0.7)):
+            rows = ROW_NOISE * rng.standard_normal((n, 12, 1))
+            electrons, dn = camera.frames(rng, exposure, n, rows)
+            tifffile.imwrite(folder / name, dn)
+        np.save(folder / "electrons.npy", electrons)
+        (folder / "run.yaml").write_text(
+            "run: {store: run.zarr}\ninput: {files: [dark.tif], bit_depth: 14}\n"
+            f"model: {{effects: [{{tag: row_noise, row_noise_dn: {ROW_NOISE}}}]}}\n"
+        )
+        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml", "--until", "fit")
+
+    return make_once("striped", make)
+
+
+def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    lab = Lab(tmp_path, {}, capsys)
+    given = ["apply", striped / "run.zarr", striped / "night.tif", "--output"]
+    said = lab.ok(*given, "out.zarr").stderr
+    assert "row_noise taken from the frames" in said
+    lab.ok(*given, "kept.zarr", "--keep-modes")
+    found, kept = (opened(tmp_path / name).load() for name in ("out.zarr", "kept.zarr"))
+    electrons = np.load(striped / "electrons.npy")
+    good = found.quality.values == 0
+    errors = [(each.electrons.values - electrons)[:, good] for each in (found, kept)]
+    scatter = [(each - each.mean(axis=0)).std() for each in errors]
+    assert scatter[0] < 0.8 * scatter[1]
+    # the error says what is left, in either
+    for each, spread in zip((found, kept), scatter, strict=True):
+        assert abs(spread / np.sqrt((each.electrons_stderr_read.values[good] ** 2).mean()) - 1) < 0.08
+    wrong = [(each.electron_number.values != electrons)[:, good].mean() for each in (found, kept)]
+    assert wrong[0] < 0.5 * wrong[1]
+    claimed = 1 - found.number_probability.values[:, good].mean()
+    assert abs(wrong[0] / claimed - 1) < 0.2
+    assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
+    assert "row_offset" in found
+    assert "row_offset" not in kept

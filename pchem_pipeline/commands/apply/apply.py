@@ -14,12 +14,13 @@ import numpy as np
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, StoreError
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
 from pchem_pipeline.commands.apply.files import write_files
 from pchem_pipeline.commands.apply.finish import finish_maps
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
 from pchem_pipeline.commands.apply.source import check_level, open_like_run, top_code
-from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece
+from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece, offsets_piece
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.formats.map_files import read_image
@@ -35,6 +36,7 @@ from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
+from pchem_pipeline.use.common_modes import CommonModes, scene_of
 from pchem_pipeline.use.numbers import number_type
 
 if TYPE_CHECKING:
@@ -49,6 +51,8 @@ _VERSION = 1
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
+#: Frames that tell the scene while offsets are found, and codes in a DN once they are taken away.
+_SCENE_FRAMES, _PARTS = 256, 4
 #: Bytes that a code of a pixel takes while numbers are looked up.
 _BYTES_OF_CODE = 12
 _MAPS = ("electrons_stderr_read", "electrons_stderr_calibration", "mean_signal")
@@ -131,8 +135,13 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files)
     top = top_code(frames, sensor)
-    calibration = read_calibration(run, top=top)
+    modes = _modes(run, wanted)
+    calibration = read_calibration(run, top=top, removed=modes.removed)
     remarks = check_level(frames, calibration)
+    if modes.left and wanted.remove:
+        remarks.append(
+            f"{', '.join(modes.left)}: no offset of frames, rows or columns, so it stays in the frames"
+        )
     known = calibration.usable
     noise = (calibration.conversion_gain * calibration.read_noise_dn)[known]
     overlap = int((noise > PEAKS_OVERLAP_E).sum())
@@ -151,6 +160,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         wanted.prior,
         prior_map,
         top,
+        modes,
         depth=_chunks(frames.shape)[0],
         expected=numbers and overlap > 0,
     )
@@ -170,6 +180,12 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         },
     }
     return _Made(job, content, remarks, calibration, frames)
+
+
+def _modes(run: RunStore, wanted: ApplySettings) -> CommonModes:
+    """Return the offsets that the model of the run names, where they are to be removed."""
+    version = model_of(run, "fit")
+    return CommonModes() if version is None or not wanted.remove else CommonModes.of_model(version.effects)
 
 
 def _digest(values: Any) -> str:
@@ -307,9 +323,11 @@ def _do(context: StageContext, job: Job, made: _Made, wanted: ApplySettings) -> 
     if record is not None and record.finished and not context.fresh:
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
-    if job.counts:
+    if job.removed:
+        job = _with_offsets(context, job, made)
+    if job.counts and not context.failed:
         job = _counted(context, job, made)
-    if job.converts:
+    if job.converts and not context.failed:
         _converted(context, job)
     if context.failed:
         key, reason = next(iter(context.failed.items()))
@@ -337,10 +355,30 @@ def _bands(ny: int, step: int) -> list[tuple[int, int]]:
     return [(y, min(y + step, ny)) for y in range(0, ny, step)]
 
 
+def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
+    """Find the offsets of frames, rows and columns; return the job that takes them away."""
+    n, ny, nx = job.source.shape
+    chosen = np.unique(np.linspace(0, n - 1, _SCENE_FRAMES).astype(int)).tolist()
+    mean = sum(made.frames.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
+    job = replace(job, scene=scene_of(np.asarray(mean), made.calibration))
+    for name, length in (("row_offset", ny), ("column_offset", nx)):
+        context.create(f"applied/{name}", (n, length), chunks=(job.depth, length), removed=list(job.removed))
+    length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (8 * ny * nx * job.depth)))
+    pieces = [Piece("offsets", 0, ny, t0, min(t0 + length, n)) for t0 in range(0, n, length)]
+    done = context.run_units(
+        pieces, functools.partial(offsets_piece, job=job), unit_name="piece", by_tiles=False
+    )
+    found = [summary for key, summary in done.items() if key.startswith("offsets-")]
+    left = sum(float(each["left"]) for each in found) / n
+    lift = int(np.ceil(max(float(each["largest"]) for each in found))) + 1 if found else 0
+    # codes are cut to parts of a DN: their own rounding is part of what is not known
+    return replace(job, parts=_PARTS, lift=lift, offset_variance=left + QUANTISATION_VARIANCE / _PARTS**2)
+
+
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     """Count the frames; return the job with the type of the electron numbers."""
     n, ny, _ = job.source.shape
-    job = replace(job, bins=_bins(context, made.frames), window=min(job.window, n))
+    job = replace(job, bins=_bins(context, made.frames, job.parts), window=min(job.window, n))
     _create_counted(context, job)
     bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
     pieces = [Piece("count", *band, 0, n) for band in _bands(ny, _rows_of_band(context, job, bytes_of_pixel))]
@@ -355,16 +393,16 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     return replace(job, number_type=number_type(float(reach.max(initial=0.0))))
 
 
-def _bins(context: StageContext, frames: FrameSequence) -> int:
+def _bins(context: StageContext, frames: FrameSequence, parts: int) -> int:
     """Return the bins that the histograms of these frames need."""
     settings = context.config.histogram
     head = min(frames.shape[0], 64)
-    wide = settings.max_bins
+    wide = settings.max_bins // parts
     pixels = sum(
         (pixels_by_range(frames.read(0, head, *band), wide) for band in _bands(frames.shape[1], _CHUNK_ROWS)),
         start=np.zeros(wide + 2, np.int64),
     )
-    return choose_bins(pixels, wide)
+    return min(settings.max_bins, parts * choose_bins(pixels, wide))
 
 
 def _converted(context: StageContext, job: Job) -> None:

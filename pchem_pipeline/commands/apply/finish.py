@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.commands.apply.settings import Job
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
@@ -25,6 +27,9 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     for name, length in (("frame", n), ("y", ny), ("x", nx)):
         output.write_array(f"applied/{name}", np.arange(length, dtype=np.int64))
     sums = _sums(output) if job.converts else None
+    calibration = replace(calibration, law=_law(calibration, job))
+    if sums is not None and job.removed:
+        _write_noise(output, calibration, sums, n, job, reporter)
     raised = {"peaks_overlap": calibration.conversion_gain * calibration.read_noise_dn > PEAKS_OVERLAP_E}
     if "electrons" in job.kinds:
         assert sums is not None
@@ -65,6 +70,33 @@ def _write_errors(output: RunStore, calibration: Calibration, sums: NDArray[np.f
     output.write_array("applied/electrons_stderr_read", read_stderr(calibration).astype(np.float32))
     output.write_array("applied/calibration_variance", variance, {"power_of_signal": [0, 1, 2]})
     output.write_array("applied/electrons_stderr_calibration", stderr_at(variance, signal).astype(np.float32))
+
+
+def _law(calibration: Calibration, job: Job) -> SampleLaw:
+    """Return the law of the samples without the offsets, with what stays unknown of them."""
+    return calibration.law.with_variance(dn2=job.offset_variance) if job.offset_variance else calibration.law
+
+
+def _write_noise(
+    output: RunStore,
+    calibration: Calibration,
+    sums: NDArray[np.float64],
+    n: int,
+    job: Job,
+    reporter: Reporter,
+) -> None:
+    """Write what the pixels scatter by with the offsets and without, and say what that gains."""
+    gain = np.where(calibration.usable, calibration.conversion_gain, np.nan)
+    variances = [gain**2 * (sums[i + 1] / n - (sums[i] / n) ** 2) * n / max(n - 1, 1) for i in (0, 2)]
+    for name, variance in zip(("noise_before", "noise_after"), variances, strict=True):
+        output.write_array(f"applied/{name}", np.sqrt(np.maximum(variance, 0.0)))
+    # what is not of the electrons' own number, whose variance is its mean
+    signal = gain * (sums[0] / n - calibration.bias)
+    noise = [float(np.nanmedian(np.sqrt(np.maximum(each - signal, 0.0)))) for each in variances]
+    reporter.info(
+        f"apply: {', '.join(job.removed)} taken from the frames: noise beyond that of the electrons' number "
+        f"{noise[0]:.3f} e- before, {noise[1]:.3f} e- after (median)"
+    )
 
 
 def _flags_of_sums(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.stream import FrameSource
+from pchem_pipeline.use.common_modes import CommonModes
 
 __all__ = ["FORMATS", "KINDS", "ApplySettings", "Job", "Piece", "kinds_of"]
 
@@ -89,7 +90,8 @@ class Job:
         prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
         prior_map: exposure of each pixel (y, x), e-.
         top: largest code of the ADC, DN; None: not known.
-        removed: tags of the effects whose offsets are taken from the frames; none: the frames as they come.
+        modes: offsets that are taken from the frames; none: the frames as they come.
+        scene: exposure to expect while the offsets are found (y, x), e-.
         offset_variance: variance of the offsets' estimates, DN^2.
         parts: codes in a DN.
         lift: DN by which codes are raised so that none is negative.
@@ -107,7 +109,8 @@ class Job:
     prior: str = "frames"
     prior_map: Any = None
     top: int | None = None
-    removed: tuple[str, ...] = ()
+    modes: CommonModes = field(default_factory=CommonModes)
+    scene: Any = None
     offset_variance: float = 0.0
     parts: int = 1
     lift: int = 0
@@ -116,6 +119,11 @@ class Job:
     depth: int = 1
     number_type: Any = np.uint16
     expected: bool = False
+
+    @property
+    def removed(self) -> tuple[str, ...]:
+        """Tags of the effects whose offsets are taken from the frames."""
+        return self.modes.removed
 
     @property
     def counts(self) -> bool:

@@ -14,12 +14,13 @@ from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistog
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
+from pchem_pipeline.use.common_modes import estimate_offsets
 from pchem_pipeline.use.electrons import electrons
 from pchem_pipeline.use.electrons_numba import add_up, whole_parts
 from pchem_pipeline.use.exposure import estimate_exposure
 from pchem_pipeline.use.numbers import NumberTables, number_tables
 
-__all__ = ["N_SUMS", "convert_piece", "count_piece", "offsets_of"]
+__all__ = ["N_SUMS", "convert_piece", "count_piece", "offsets_of", "offsets_piece"]
 
 #: Sums of a pixel over frames: x, x^2, the same without offsets, smallest and largest x.
 N_SUMS = 6
@@ -55,6 +56,26 @@ def _codes(
     out = np.empty(frames.shape, np.uint32)
     whole_parts(frames, *offsets, job.parts, job.lift, out)
     return out
+
+
+# -- offsets of frames, rows and columns -----------------------------------------------------------
+
+
+def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
+    """Find and write the offsets of some frames; the summary tells how well they are known."""
+    output = open_store(job.output)
+    calibration = _calibration(job, _WHOLE)
+    left, largest = 0.0, 0.0
+    with FrameStream(job.source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
+        for start, (frames,) in stream:
+            found = estimate_offsets(frames, job.scene, calibration, job.modes)
+            region = (slice(start, start + len(frames)), _WHOLE)
+            output.write("applied/row_offset", region, found.rows.astype(np.float32))
+            output.write("applied/column_offset", region, found.columns.astype(np.float32))
+            left += float(found.left.sum())
+            widest = abs(found.rows).max(axis=1) + abs(found.columns).max(axis=1)
+            largest = max(largest, float(widest.max()))
+    return {"left": left, "largest": largest}
 
 
 # -- histograms and exposure -----------------------------------------------------------------------

@@ -1,0 +1,84 @@
+"""Offsets of frames, rows and columns: found as well as the pixels allow, with their noise."""
+
+import numpy as np
+import pytest
+from helpers.known_camera import KnownCamera
+
+from pchem_pipeline.effects.analog.bias_drift import BiasDrift
+from pchem_pipeline.effects.analog.column_noise import ColumnNoise
+from pchem_pipeline.effects.analog.frame_noise import FrameNoise
+from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
+from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.use.common_modes import CommonModes, estimate_offsets, scene_of
+from pchem_pipeline.use.electrons import electrons
+
+SHAPE, N_FRAMES = (24, 40), 60
+SPREAD = {"frame": 1.0, "row": 1.5, "column": 1.2}
+
+
+def taken(seed, read_noise, spread, exposure=1.0):
+    rng = np.random.default_rng(seed)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=read_noise)
+    frame = spread["frame"] * rng.standard_normal((N_FRAMES, 1))
+    rows = spread["row"] * rng.standard_normal((N_FRAMES, SHAPE[0]))
+    columns = spread["column"] * rng.standard_normal((N_FRAMES, SHAPE[1]))
+    offset = (frame + rows)[:, :, None] + columns[:, None, :]
+    true, frames = camera.frames(rng, exposure, N_FRAMES, offset)
+    modes = CommonModes(("row_noise",), tuple(spread[name] ** 2 for name in ("frame", "row", "column")))
+    calibration = camera.calibration()
+    scene = scene_of(frames.mean(axis=0), calibration)
+    return camera, true, frames, offset, estimate_offsets(frames, scene, calibration, modes)
+
+
+@pytest.mark.parametrize(("read_noise", "share"), [((0.15, 0.25), 0.1), ((0.3, 0.45), 0.5)])
+def test_offsets_are_as_near_as_they_say(read_noise, share):
+    camera, true, frames, offset, found = taken(50, read_noise, SPREAD)
+    total = found.rows[:, :, None] + found.columns[:, None, :]
+    variance = ((total - offset) ** 2).mean()
+    # where peaks overlap, a sample says less of an offset than its read noise allows
+    assert variance < share * (offset**2).mean()
+    assert 0.6 < variance / found.left.mean() < 1.6
+    calibration = camera.calibration()
+    before, after = (
+        (electrons(frames, calibration, each) - true).var() for each in (None, (found.rows, found.columns))
+    )
+    own = (camera.read_noise_e**2 + camera.gain**2 / 12).mean()
+    square = (camera.gain**2).mean()
+    assert before > own + 0.9 * square * (offset**2).mean()
+    assert after < own + 1.1 * square * variance
+
+
+def test_frames_without_offsets_lose_nothing():
+    *_, found = taken(51, (0.15, 0.25), dict.fromkeys(SPREAD, 0.0))
+    assert (found.rows == 0).all()
+    assert (found.columns == 0).all()
+    assert (found.left == 0).all()
+
+
+def test_a_model_names_its_offsets():
+    effects = (
+        RowNoise(row_noise_dn=0.5),
+        ColumnNoise(column_noise_dn=0.4),
+        FrameNoise(frame_noise_dn=0.3),
+        BiasDrift(drift_dn=0.2),
+        PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.1),
+        NoiseSkew.typical()[0],
+    )
+    modes = CommonModes.of_model(effects)
+    assert modes.removed == ("row_noise", "column_noise", "frame_noise", "bias_drift", "periodic_pickup")
+    np.testing.assert_allclose(modes.variances, (0.09 + 0.04, 0.25 + 0.5, 0.16))
+    slanted = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.1, cycles_per_column=0.2)
+    assert CommonModes.of_model([slanted]).left == ("periodic_pickup",)
+
+
+def test_pixels_without_calibration_tell_nothing():
+    rng = np.random.default_rng(52)
+    camera = KnownCamera.drawn(rng, SHAPE)
+    _, frames = camera.frames(rng, 1.0, 5)
+    calibration = camera.calibration()
+    calibration.bias[0] = np.nan
+    modes = CommonModes(("row_noise",), (0.0, 1.0, 0.0))
+    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    assert (found.rows[:, 0] == 0).all()
+    assert np.isfinite(found.rows).all()
