@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
-    Choice,
     Contender,
     Hypothesis,
     Noise,
@@ -36,20 +36,27 @@ class Round:
     """One round of naming and adding.
 
     Attributes:
-        choice: what the comparison of the sets came to.
-        added: the chosen set at refined strengths.
+        compared: the sets at their best fit.
+        added: the new effects of the chosen one.
         hypotheses: all candidates of the round.
         null: of the model before it.
         extended: of the model after it.
         moved: change of the parameter maps by their refit with the effects.
     """
 
-    choice: Choice
+    compared: Comparison
     added: SetFit
     hypotheses: tuple[Hypothesis, ...]
     null: NullModel
     extended: NullModel
     moved: Mapping[str, Mapping[str, Any]]
+
+    def updated(self, now: Mapping[str, Hypothesis], errors: Mapping[str, float]) -> Round:
+        """Return it with its effects as a later round has fitted them anew, and relative standard errors."""
+        new = tuple(now.get(h.tag, h) for h in self.added.hypotheses)
+        old = zip(self.added.hypotheses, self.added.stderr, strict=True)
+        stderr = np.array([errors.get(h.tag, error) for h, error in old])
+        return replace(self, added=replace(self.added, hypotheses=new, stderr=stderr))
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ class AddedRounds:
 
     def _addition(self, this: Round, member: int, gaps: tuple[Gap, Gap], stands: bool) -> Addition:
         added, parts = this.added.hypotheses[member], this.added.parts
-        rivals = this.choice.rivals_of(added.tag)
+        rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.settings.certainty)
         allowed = tolerance(parts, self.settings.model_error)
         fits = stands and not misfits(
@@ -138,6 +145,10 @@ class AddedRounds:
         """Return a rival fitted in the place of a member of the chosen set, with the gap that it leaves."""
         if rival is None:
             return None
+        refitted = this.compared.with_rival(this.added.hypotheses[member].tag, rival.tag)
+        if refitted is not None:
+            gap = self.gaps.gap(self.z.final, refitted.mean, this.null.replicates)
+            return Rival(effect=rival.tag, gap_after=gap.value)
         others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
         noise = Noise(this.null.covariance / 2.0, self.settings.model_error)
         fit = fit_set([*others, rival], self.z.both - this.null.mean, noise)
@@ -181,7 +192,7 @@ def _comparisons(
     relatives = set(type(added.effect).separate)
     pool = [h for h in this.hypotheses if h.tag not in in_set]
     if runner_up is None:
-        runner_up = next((h for s in this.choice.tried for h in s.hypotheses if h.tag not in in_set), None)
+        runner_up = next((h for s in this.compared.tried for h in s.hypotheses if h.tag not in in_set), None)
     placebo = next(
         (h for h in pool if h.tag not in relatives and added.tag not in type(h.effect).separate), None
     )

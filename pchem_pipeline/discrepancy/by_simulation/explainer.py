@@ -18,24 +18,24 @@ from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, Round
 from pchem_pipeline.discrepancy.by_simulation.candidates import (
-    REPEATS,
     Mapper,
     ReplicateSimulator,
     candidate_classes,
     placebo_for,
     serial,
 )
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
     Noise,
     SetFit,
     choose,
-    correction,
     fit_set,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import Refit, equivalent_sensor, expected_codes, refit_maps
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, suspicious
@@ -56,19 +56,13 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FEWEST_PIXELS = 32
-_REFINEMENTS = 4
-_CLOSE = 0.02  # relative: strengths known so well are not simulated again
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
-# standard deviations by which a statistic must move to show how well a simulation predicted it
-_MOVED = 4.0
-_WORTH = 6.0  # nats by which an effect must better the fit of the others
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
 # standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 # than a single one would by chance
 _ESTABLISHED = 4.5
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
 _MISTAKEN = 0.003  # share of pixels with an ambiguous bias from which replicates are fitted from nothing
-_FINE_ERROR = 0.02  # model error while strengths are refined: the names are settled, the numbers count
 
 
 def find_discrepancies(
@@ -208,12 +202,12 @@ class FrameExplainer:
             )
         parts = splits.train, splits.test, splits.final
         self.evidence = tuple(self.frames.observe(part, self.plain.maps) for part in parts)
-        self.fit, self.maps = self._mapped()
+        self.fit, self.maps = self._mapped(self.model)
         return self.evidence[0], splits.examined(self.frames.stack.shape)
 
     def null(self) -> tuple[NullModel, Measured]:
         """Simulate and observe the fitted model, refit included."""
-        vectors = self._replicates(self.maps, "r0", self.settings.replicates)
+        vectors = self._replicates(self.model, self.maps, "r0", self.settings.replicates)
         common = set(STATISTICS).intersection(*vectors, *(e.z for e in self.evidence))
         names = tuple(name for name in STATISTICS if name in common)
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
@@ -254,31 +248,22 @@ class FrameExplainer:
         return _Explanation(simulator, tuple(hypotheses), choice)
 
     def add(self, explanation: _Explanation, null: NullModel, z: Measured) -> NullModel | None:
-        """Put the chosen effects into the model; None, and the model as it was, where none is established.
+        """Put the effects of the best refitted set into the model; None where none is established.
 
-        Asked three times: of the strengths as few simulations give them, as the replicates correct them, and
-        of the final frames.
+        Asked twice: of the strengths as the data give them, and of the final frames. Effects of earlier
+        rounds are fitted anew with the new ones.
         """
-        before, shift, noise = self.model, z.both - null.mean, self._noise(null, 2)
-        simulator, choice = explanation.simulator, explanation.choice
-        chosen = self._needed(simulator, choice.present(self.settings.certainty), shift, noise)
-        while chosen:
-            added = self._added(simulator, chosen, shift, noise)
-            if added is None:
+        held = tuple(h for this in self.rounds for h in this.added.hypotheses)
+        refitter = self._refitter(z, held)
+        found = compare(refitter, held, explanation.hypotheses, explanation.choice)
+        added = None if found is None else refitter.sharpened(found.chosen, self.settings.extended_replicates)
+        while found is not None and added is not None:
+            kept = self._established(added, z)
+            if len(kept) == len(added.hypotheses):
+                return self._put(found, added, explanation, null)
+            if not kept or {h.tag for h in kept} <= {h.tag for h in held}:
                 break
-            self.model = (*before, *(h.effect for h in added.hypotheses))
-            _, maps = self._mapped()
-            extended = self._extended_null(maps, f"{simulator.prefix}-grown")  # of the random numbers
-            added, extended = self._corrected(added, null, extended, z)
-            proven = {h.tag for h in self._confirmed(added, z.final - null.mean, self._noise(null, 1))}
-            chosen = tuple(h for h in added.established(_ESTABLISHED) if h.tag in proven)
-            if len(chosen) == len(added.hypotheses):
-                self.model = (*before, *(h.effect for h in added.hypotheses))
-                self.fit, self.maps = self._mapped()
-                moved = self.fit.moved
-                self.rounds.append(Round(choice, added, explanation.hypotheses, null, extended, moved))
-                return extended
-        self.model = before
+            added = refitter.sharpened(refitter.refined(kept), self.settings.extended_replicates)
         return None
 
     def tolerance(self) -> FloatArray | float:
@@ -319,29 +304,31 @@ class FrameExplainer:
 
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _mapped(self) -> tuple[Refit, PixelMaps]:
-        """Return the fit of the seen frames under the present model, and maps to draw replicates from."""
+    def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, PixelMaps]:
+        """Return the fit of the seen frames under a model, and maps to draw replicates from."""
         plain, fit = self.plain, None
         assert plain.covariance is not None
-        if self.model:
+        if model:
             seen = self.frames.seen
             fit = refit_maps(
                 self.frames.stack[seen],
                 plain.maps,
-                self.model,
+                model,
                 plain.covariance,
                 numbers=self.frames.numbers[seen],
             )
         fit = fit or Refit(plain.maps, {}, plain.covariance)
         return fit, equivalent_sensor(fit.maps, fit.covariance)
 
-    def _replicates(self, maps: PixelMaps, prefix: str, count: int) -> list[Mapping[str, float]]:
-        """Simulate and observe the present model ``count`` times."""
-        text = "|".join(e.model_dump_json() for e in self.model)
+    def _replicates(
+        self, model: tuple[Effect, ...], maps: PixelMaps, prefix: str, count: int
+    ) -> list[Mapping[str, float]]:
+        """Simulate and observe a model ``count`` times."""
+        text = "|".join(e.model_dump_json() for e in model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
         taken = self.frames.acquisition(self.plain.ambiguous)
         tasks = [
-            Replicate(f"{prefix}-null-{digest}-{i}", maps, self.model, self._seed(prefix, i), taken)
+            Replicate(f"{prefix}-null-{digest}-{i}", maps, model, self._seed(prefix, i), taken)
             for i in range(count)
         ]
         vectors: list[Mapping[str, float]] = []
@@ -350,11 +337,6 @@ class FrameExplainer:
                 raise result
             vectors.append(result)
         return vectors
-
-    def _extended_null(self, maps: PixelMaps, prefix: str) -> NullModel:
-        """Return the null of the model with effects; statistics that they leave scatter as they did."""
-        vectors = self._replicates(maps, prefix, self.settings.extended_replicates)
-        return NullModel.from_replicates(self.first.names, as_matrix(self.first.names, vectors), self.first)
 
     def _counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         self.n_replicates += len(replicates)
@@ -370,79 +352,63 @@ class FrameExplainer:
         events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
         return Noise(covariance, self.settings.model_error, events)
 
-    def _needed(
-        self, simulator: ReplicateSimulator, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise
-    ) -> tuple[Hypothesis, ...]:
-        """Drop, the weakest first, what explains little that the others do not at their best strengths.
+    def _refitter(self, z: Measured, held: tuple[Hypothesis, ...]) -> Refitter:
+        """Return what fits effects beside those that the model had before the search."""
+        found = {h.tag for h in held}
+        present = tuple(e for e in self.model if e.tag not in found)
 
-        The comparison of the sets extrapolates strengths; of a strong effect that leaves enough for another.
+        def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
+            model = (*present, *effects)
+            fit, maps = self._mapped(model)
+            return fit, as_matrix(self.first.names, self._replicates(model, maps, "grown", count))
+
+        events = np.asarray(self._noise(self.first, 2).events)
+        return Refitter(draw, self.first, z.both, events)
+
+    def _established(self, added: Refitted, z: Measured) -> tuple[Hypothesis, ...]:
+        """Return the effects of which the data have certainly some, the final frames too.
+
+        Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
+        misses them once in seventy times; a chance passes once in six.
         """
-        if len(chosen) == 1:
-            return chosen
-        chosen = _tuned(simulator, chosen, shift, noise)
-        fit = fit_set(chosen, shift, noise)
-        weight = np.diag(noise.covariance) ** -0.5
-        order = np.argsort([float(np.sum((weight * part) ** 2)) for part in fit.parts])
-        for one in [chosen[i] for i in order if not fit.certain[i]]:
-            others = tuple(h for h in chosen if h.tag != one.tag)
-            if others:
-                others = _tuned(simulator, others, shift, noise)
-                gain = fit.log_score(shift, noise) - fit_set(others, shift, noise).log_score(shift, noise)
-                if gain < _WORTH:
-                    chosen, fit = others, fit_set(others, shift, noise)
-        return chosen
-
-    def _added(
-        self, simulator: ReplicateSimulator, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise
-    ) -> SetFit | None:
-        """Refine the strengths of the chosen set together; drop what may be nothing; None if that is all."""
-        noise = replace(noise, model_error=_FINE_ERROR)
-        while chosen:
-            chosen = _tuned(simulator, chosen, shift, noise)
-            kept = fit_set(chosen, shift, noise).established(_ESTABLISHED)
-            if len(kept) == len(chosen):
-                break
-            chosen = kept
-        else:
-            return None
-        fit = fit_set(chosen, shift, noise)
-        near = np.where(np.abs(fit.factors - 1.0) < _NEAR, fit.factors, 1.0)
-        last = [
-            Hypothesis(h.rescaled(float(c)), h.fingerprint * c) for h, c in zip(chosen, near, strict=True)
-        ]
-        return SetFit(tuple(last), np.ones(len(last)), fit.stderr / near, fit.certain)
-
-    def _confirmed(self, added: SetFit, shift: FloatArray, noise: Noise) -> tuple[Hypothesis, ...]:
-        """Return the effects that the final frames show too, which had no part in finding them.
-
-        A true effect of 4.5 standard errors in two thirds of the frames misses this once in seventy times; a
-        chance passes it once in six.
-        """
-        fit = replace(fit_set(added.hypotheses, shift, noise), certain=added.certain)
-        return fit.established(_CONFIRMED)
-
-    def _corrected(
-        self, added: SetFit, null: NullModel, extended: NullModel, z: Measured
-    ) -> tuple[SetFit, NullModel]:
-        """Correct the strengths by the mean of the replicates, of which one simulation was but a sample."""
-        total = added.parts.sum(axis=0)
-        moved = np.abs(total) > _MOVED
-        ratio = np.where(moved, (extended.mean - null.mean) / np.where(moved, total, 1.0), 1.0)
-        parts = added.parts * np.clip(ratio, 0.5, 2.0)
-        noise = replace(self._noise(extended, 2), model_error=_FINE_ERROR)
-        change, stderr = correction(parts, z.both - extended.mean, noise)
-        change *= np.array([bool(h.effect.strength) for h in added.hypotheses])
-        new = tuple(
-            Hypothesis(h.rescaled(1.0 + float(c)), part * (1.0 + c))
-            for h, part, c in zip(added.hypotheses, parts, change, strict=True)
+        first, n = self.first, len(added.vectors)
+        certain = _certain(added, z.both - first.mean, self._noise(first, 2))
+        noise = replace(self._noise(first, 1), covariance=added.covariance * (1.0 + 1.0 / n))
+        final = replace(fit_set(added.hypotheses, z.final - first.mean, noise), certain=certain)
+        proven = {h.tag for h in final.established(_CONFIRMED)}
+        clear = (1.0 + np.expm1(added.change) > _ESTABLISHED * added.stderr) | certain
+        return tuple(
+            h for h, is_clear in zip(added.hypotheses, clear, strict=True) if is_clear and h.tag in proven
         )
-        fit = SetFit(new, np.ones(len(new)), stderr / (1.0 + change), added.certain)
-        return fit, extended.shifted(np.sum(parts * change[:, None], axis=0))
+
+    def _put(
+        self, found: Comparison, added: Refitted, explanation: _Explanation, null: NullModel
+    ) -> NullModel:
+        """Put a set into the model, at the strengths to which its replicates correct it."""
+        change = np.where(np.abs(added.change) < _NEAR, np.expm1(added.change), 0.0)
+        corrected = tuple(
+            Hypothesis(h.rescaled(1.0 + float(c)), h.fingerprint * (1.0 + c))
+            for h, c in zip(added.hypotheses, change, strict=True)
+        )
+        tags = {h.tag for h in corrected}
+        present = tuple(e for e in self.model if e.tag not in tags)
+        self.model = (*present, *(h.effect for h in corrected))
+        self.fit, self.maps = self._mapped(self.model)
+        extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
+        extended = extended.shifted(np.sum(added.parts * change[:, None], axis=0))
+        errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))
+        now = {h.tag: h for h in corrected}
+        self.rounds = [this.updated(now, errors) for this in self.rounds]
+        before = {h.tag for this in self.rounds for h in this.added.hypotheses}
+        new = tuple(h for h in corrected if h.tag not in before)
+        fit = SetFit(
+            new, np.ones(len(new)), np.array([errors[h.tag] for h in new]), np.zeros(len(new), np.bool_)
+        )
+        self.rounds.append(Round(found, fit, explanation.hypotheses, null, extended, self.fit.moved))
+        return extended
 
 
-def _tuned(
-    simulator: ReplicateSimulator, chosen: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise
-) -> tuple[Hypothesis, ...]:
-    """Return a set at the strengths that explain the shift best."""
-    [best] = simulator.tuned([chosen], shift, noise, steps=_REFINEMENTS, close=_CLOSE, repeats=REPEATS)
-    return best
+def _certain(added: Refitted, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:
+    """Tell which effects an exact count asks for, however few events it has."""
+    counted = (added.parts * noise.events > 0.0) & (shift > 0.0)
+    return np.asarray(counted.any(axis=1))

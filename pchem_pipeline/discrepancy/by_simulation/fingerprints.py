@@ -33,6 +33,7 @@ __all__ = [
     "choose",
     "correction",
     "fit_set",
+    "log_density",
     "score_set",
     "seen_among",
     "tolerance",
@@ -42,9 +43,9 @@ FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
 _LEAK = 0.1
-_LARGEST_CORRECTION = 0.4
+_LARGEST_DECREASE, _LARGEST_INCREASE = 0.75, 3.0
 _PRICE = 3.0  # nats for the first effect of a set: none is there unless something speaks for it
-_PRICE_OF_MORE = 6.0  # nats for every further one
+PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
 _SHORTLIST = 9
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
@@ -132,7 +133,7 @@ class SetFit:
     def log_score(self, shift: FloatArray, noise: Noise) -> float:
         """Return the Gaussian log density of a shift of statistics, up to a constant, nats."""
         parts = self.parts
-        return _log_density(shift - parts.sum(axis=0), noise.of(parts))
+        return log_density(shift - parts.sum(axis=0), noise.of(parts))
 
     def distance(self, other: SetFit, noise: Noise) -> float:
         """Return how far the predictions of two sets lie apart, in standard deviations of the statistics."""
@@ -155,7 +156,7 @@ def correction(parts: FloatArray, residual: FloatArray, noise: Noise) -> tuple[F
     target = linalg.solve_triangular(factor, residual, lower=True)
     change = np.linalg.lstsq(design, target, rcond=None)[0]
     stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
-    return np.clip(change, -_LARGEST_CORRECTION, _LARGEST_CORRECTION), stderr
+    return np.clip(change, -_LARGEST_DECREASE, _LARGEST_INCREASE), stderr
 
 
 def tolerance(parts: FloatArray, model_error: float) -> FloatArray:
@@ -173,7 +174,7 @@ def tolerance(parts: FloatArray, model_error: float) -> FloatArray:
     return np.asarray(model_error * np.sqrt(own + leaked))
 
 
-def _log_density(residual: FloatArray, covariance: FloatArray) -> float:
+def log_density(residual: FloatArray, covariance: FloatArray) -> float:
     """Return the Gaussian log density of a residual, up to a constant, nats."""
     factor = linalg.cholesky(covariance, lower=True)
     white = linalg.solve_triangular(factor, residual, lower=True)
@@ -226,7 +227,7 @@ class ScoredSet:
     @property
     def worth(self) -> float:
         """Score less the price of its effects, nats."""
-        return self.score - _PRICE - _PRICE_OF_MORE * (len(self.hypotheses) - 1)
+        return self.score - _PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
 
 
 @dataclass(frozen=True)
@@ -314,7 +315,7 @@ def choose(
                 scored = score_set(members, shifts, noise)
                 if _all_needed(scored, shifts, noise):
                     sets.append(scored)
-    base = sum(_log_density(shift, noise.covariance) for shift in shifts)
+    base = sum(log_density(shift, noise.covariance) for shift in shifts)
     sets = [s for s in sets if s.worth > base]
     if not sets:
         return None

@@ -1,4 +1,4 @@
-"""How a chosen set enters the model: what is not needed, or not established in the end, stays outside."""
+"""How effects enter the model: refitted until they stop moving, the simplest set that leaves nothing, proven."""
 
 from __future__ import annotations
 
@@ -9,108 +9,137 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, own_signature
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, seen_among
-from pchem_pipeline.discrepancy.null import Measured
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
+from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_class
 
-M = 6
-NOISE = Noise(np.eye(M), 0.05)
+NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
+M = len(NAMES)
 STRENGTHS = {"row_noise": "row_noise_dn", "frame_noise": "frame_noise_dn", "exposure_drift": "drift"}
+#: what a unit of each effect (of strength ** power) does to the statistics once the pixels are refitted
+TRUTH = {
+    "row_noise": (np.eye(M)[0] * 40.0, 0.6),
+    "frame_noise": (np.eye(M)[1] * 40.0, 1.0),
+    "exposure_drift": (np.eye(M)[2] * 40.0, 1.0),
+}
 
 
-def hypothesis(tag: str, place: int, size: float) -> Hypothesis:
-    effect = effect_class(tag).model_validate({"tag": tag, STRENGTHS[tag]: 0.1})
-    return Hypothesis(effect, size * np.eye(M)[place])
+def effect(tag: str, strength: float) -> Effect:
+    return effect_class(tag).model_validate({"tag": tag, STRENGTHS[tag]: strength})
 
 
-ROW, FRAME, DRIFT = hypothesis("row_noise", 0, 40.0), hypothesis("frame_noise", 1, 9.0), hypothesis(
-    "exposure_drift", 2, 6.0
-)  # fmt: skip
+def factor(one: Effect) -> float:
+    return float(getattr(one, one.strength) / 0.1) ** one.power
 
 
-class Exact:
-    """A simulator in which strengths are what they are."""
-
-    prefix = "r0"
-
-    def tuned(self, sets: Sequence[Any], *_: Any, **__: Any) -> list[Any]:
-        return list(sets)
+def statistics(effects: Sequence[Effect]) -> np.ndarray:
+    """Return the mean of the statistics: a power of the factor, so that a fingerprint extrapolates badly."""
+    shifts = [TRUTH[e.tag][0] * factor(e) ** TRUTH[e.tag][1] for e in effects]
+    return np.sum(shifts, axis=0) if shifts else np.zeros(M)
 
 
-class Chosen:
-    def __init__(self, *hypotheses: Hypothesis) -> None:
-        self.hypotheses = hypotheses
-
-    def present(self, certainty: float) -> tuple[Hypothesis, ...]:
-        return self.hypotheses
+def hypothesis(tag: str, strength: float = 0.1) -> Hypothesis:
+    one = effect(tag, strength)
+    # what it does to pixels that are not refitted is half as much again
+    return Hypothesis(one, 1.5 * statistics([one]))
 
 
-def search(corrected: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> FrameExplainer:
-    """Return a search whose replicates correct the strengths to so many standard errors."""
-    found = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
-    no_fit = SimpleNamespace(moved={})
+class World:
+    """Refitted models that can be drawn from, and how often that was done."""
 
-    def correct(added: SetFit, *_: Any) -> tuple[SetFit, str]:
-        errors = [1.0 / corrected[h.tag] for h in added.hypotheses]
-        return SetFit(added.hypotheses, np.ones(len(errors)), np.array(errors), added.certain), "extended"
+    def __init__(self, truth: Sequence[Effect], seed: int = 1) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.drawn = 0
+        self.null = NullModel.from_replicates(NAMES, self.rng.standard_normal((40, M)))
+        mean = statistics(truth)
+        self.z = Measured(*(mean + self.rng.standard_normal(M) for _ in range(3)))
 
-    monkeypatch.setattr(found, "_noise", lambda *_: NOISE)
-    monkeypatch.setattr(found, "_mapped", lambda *_: (no_fit, "maps"))
-    monkeypatch.setattr(found, "_extended_null", lambda *_: "extended")
-    monkeypatch.setattr(found, "_corrected", correct)
-    return found
+    def draw(self, effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+        self.drawn += count
+        vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
+        return SimpleNamespace(moved={}), vectors
 
+    def refitter(self) -> Refitter:
+        return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
 
-def add(found: FrameExplainer, *hypotheses: Hypothesis, final: Sequence[Hypothesis] | None = None) -> Any:
-    total, last = (sum(h.fingerprint for h in some) for some in (hypotheses, final or hypotheses))
-    z = Measured(np.asarray(total), np.asarray(total), np.asarray(last))
-
-    class Nothing:
-        mean = np.zeros(M)
-
-    explanation = _Explanation(Exact(), hypotheses, Chosen(*hypotheses))  # type: ignore[arg-type]
-    null = found.add(explanation, Nothing(), z)  # type: ignore[arg-type]
-    assert null == ("extended" if found.rounds else None)
-    return found.rounds[-1] if found.rounds else None
+    def compare(self, *hypotheses: Hypothesis, held: Sequence[Hypothesis] = ()) -> Comparison | None:
+        refitter = self.refitter()
+        shifts = (self.z.train - self.null.mean, self.z.test - self.null.mean)
+        choice = choose(hypotheses, shifts, refitter.noise(self.null.covariance, 40))
+        assert choice is not None
+        return compare(refitter, held, hypotheses, choice)
 
 
-def test_what_the_replicates_correct_to_less_than_a_finding_is_taken_back(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    found = search({"row_noise": 12.0, "exposure_drift": 4.0}, monkeypatch)
-    added = add(found, ROW, DRIFT)
-    assert [h.tag for h in added.added.hypotheses] == ["row_noise"]
-    assert [e.tag for e in found.model] == ["row_noise"]
-    both = search({"row_noise": 12.0, "exposure_drift": 5.0}, monkeypatch)
-    assert len(add(both, ROW, DRIFT).added.hypotheses) == 2
+@pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
+def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) -> None:
+    world = World([effect("row_noise", strength)])
+    found = world.refitter().refined([hypothesis("row_noise")])
+    assert found.settled
+    wanted, [got] = factor(effect("row_noise", strength)), [factor(e) for e in found.effects]
+    error = 1.5 * found.stderr[0] / TRUTH["row_noise"][1]  # six replicates scatter too
+    assert abs(np.log(got / wanted)) < 3.5 * error + 0.05
+    assert world.drawn <= 6 * 7
 
 
-def test_what_the_final_frames_do_not_show_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = search({"row_noise": 12.0, "exposure_drift": 6.0}, monkeypatch)
-    assert [h.tag for h in add(found, ROW, DRIFT, final=[ROW]).added.hypotheses] == ["row_noise"]
+def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
+    world = World([effect("row_noise", 0.5)])
+    # frame noise helps the fingerprint of row noise out where that is extrapolated
+    mimic = Hypothesis(effect("frame_noise", 0.1), 20.0 * (np.eye(M)[0] + np.eye(M)[1]))
+    found = world.compare(hypothesis("row_noise"), mimic)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise"}
+    assert [c.hypothesis.tag for c in found.rivals_of("row_noise")][0] == "row_noise"
 
 
-def test_where_nothing_is_left_the_model_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = search({"exposure_drift": 3.0}, monkeypatch)
-    found.model = (ROW.effect,)
-    assert add(found, DRIFT) is None
-    assert found.model == (ROW.effect,)
+def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
+    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    later = world.compare(hypothesis("frame_noise"), held=[hypothesis("row_noise")])
+    assert later is not None
+    assert later.chosen.tags == {"row_noise", "frame_noise"}
+    none = world.compare(hypothesis("row_noise"), held=[hypothesis("exposure_drift")])
+    assert none is None  # what was held has nothing in the data
 
 
-def test_an_effect_that_explains_little_besides_the_others_is_dropped() -> None:
-    found = FrameExplainer.__new__(FrameExplainer)
-    strong = ROW.fingerprint
-    twin = hypothesis("frame_noise", 0, 8.0)  # moves only what the strong one moves
-    kept = found._needed(Exact(), (ROW, twin), 1.1 * strong, NOISE)  # type: ignore[arg-type]
-    assert [h.tag for h in kept] == ["row_noise"]
-    kept = found._needed(Exact(), (ROW, FRAME), strong + FRAME.fingerprint, NOISE)  # type: ignore[arg-type]
-    assert [h.tag for h in kept] == ["row_noise", "frame_noise"]
+def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() -> None:
+    own, noise = np.eye(M)[1] * 10.0, np.ones(M)
+    left = np.eye(M)[1] * 8.0
+    assert own_signature(own, np.eye(M)[:1] * 40.0, left, noise)
+    assert not own_signature(own, np.eye(M)[:1] * 40.0, -left, noise)
+    assert not own_signature(own, np.eye(M)[:1] * 40.0, 0.3 * left, noise)
+    assert not own_signature(own, np.eye(M)[1:2] * 40.0, left, noise)
 
 
-def test_seen_among_needs_the_direction_of_the_effect() -> None:
-    others, own = np.array([ROW.fingerprint]), FRAME.fingerprint
-    assert seen_among(own, others, ROW.fingerprint + own, NOISE)
-    assert not seen_among(own, others, ROW.fingerprint - own, NOISE)
-    assert not seen_among(own, others, ROW.fingerprint + 0.2 * own, NOISE)
+def add(world: World, monkeypatch: pytest.MonkeyPatch, *hypotheses: Hypothesis, final: Any = None) -> Any:
+    """Return a search to which a round was added, and the null that it came to."""
+    search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
+    search.first = world.null
+    z = world.z if final is None else Measured(world.z.train, world.z.test, final)
+    monkeypatch.setattr(search, "_refitter", lambda *_: world.refitter())
+    monkeypatch.setattr(search, "_mapped", lambda *_: (SimpleNamespace(moved={}), "maps"))
+    shifts = (z.train - world.null.mean, z.test - world.null.mean)
+    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
+    assert choice is not None
+    return search, search.add(_Explanation(None, hypotheses, choice), world.null, z)  # type: ignore[arg-type]
+
+
+def test_what_is_found_enters_the_model_at_its_best_strength(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, extended = add(World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"))
+    assert [e.tag for e in search.model] == ["row_noise"]
+    assert search.model[0].row_noise_dn == pytest.approx(0.5, rel=0.05)
+    assert np.abs(extended.mean[0] - statistics(search.model)[0]) < 3.0
+
+
+def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World([effect("row_noise", 0.1)])
+    search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=np.zeros(M))
+    assert extended is None
+    assert search.model == ()

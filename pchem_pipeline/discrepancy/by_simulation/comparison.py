@@ -1,0 +1,197 @@
+"""Which set of effects is in the data, compared after the best fit of each.
+
+The fingerprints say which sets are worth a refit (:mod:`.fingerprints`). One effect that leaves nothing
+beyond chance after its best fit is all there is; only where every single one leaves something are sets of
+several compared, and each of their effects must have a signature of its own: statistics that the others, at
+their best fit, do not account for and do not touch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    PRICE_OF_MORE,
+    Choice,
+    Contender,
+    Hypothesis,
+    fit_set,
+)
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.null import look_elsewhere, two_sided
+
+__all__ = ["Comparison", "compare", "leaves_nothing", "own_signature"]
+
+FloatArray = NDArray[np.float64]
+
+_MOST_SINGLES = 7
+_MOST_OF_ONE = 3  # hypotheses of the same effect
+_MOST_SETS = 4
+_LOOSE = 0.1  # relative error of a fingerprint before its refit
+# nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
+_FAR, _FAR_SHARE = 40.0, 0.25
+_LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
+_SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
+_MOVED = 3.0  # by which that effect must move it
+_UNTOUCHED = 0.5  # of that, the most by which the others may move it
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Sets at their best fit.
+
+    Attributes:
+        chosen: the best.
+        tried: all, the best first.
+    """
+
+    chosen: Refitted
+    tried: tuple[Refitted, ...]
+
+    def rivals_of(self, tag: str) -> tuple[Contender, ...]:
+        """Return what could stand in the place of an effect of the chosen set, itself first."""
+        others = self.chosen.tags - {tag}
+        found: dict[str, Contender] = {}
+        for one in self.tried:
+            new = one.tags - others
+            if not others <= one.tags or len(new) != 1 or new & found.keys():
+                continue
+            [name] = new
+            hypothesis = next(h for h in one.hypotheses if h.tag == name)
+            behind = _worth(one) - _worth(self.chosen)
+            found[name] = Contender(
+                hypothesis, behind, _apart(one, self.chosen), float(np.exp(min(behind, 0.0)))
+            )
+        total = sum(c.probability for c in found.values())
+        shared = [Contender(c.hypothesis, c.score, c.stderr, c.probability / total) for c in found.values()]
+        return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))
+
+    def with_rival(self, tag: str, rival: str) -> Refitted | None:
+        """Return the best set that has a rival in the place of an effect; None where none was fitted."""
+        wanted = (self.chosen.tags - {tag}) | {rival}
+        return next((one for one in self.tried if one.tags == wanted), None)
+
+
+def compare(
+    refitter: Refitter, held: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis], choice: Choice
+) -> Comparison | None:
+    """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
+
+    Args:
+        refitter: fits sets.
+        held: effects that the model was given in earlier rounds; they are fitted anew with the others.
+        hypotheses: all new ones, the likeliest first.
+        choice: how their sets compare by fingerprints.
+    """
+    tried: list[Refitted] = []
+
+    def refit(members: Sequence[Hypothesis]) -> None:
+        best = max((one.score for one in tried), default=-np.inf)
+        tried.append(refitter.refined((*held, *members), best))
+
+    for hypothesis in _singles(hypotheses, choice):
+        if not tried or not _beaten(refitter, hypothesis, max(tried, key=_worth)):
+            refit((hypothesis,))
+    best = max(tried, key=_worth)
+    if not leaves_nothing(refitter, best):
+        for members in _sets(choice, tried):
+            refit(members)
+    tried.sort(key=_worth, reverse=True)
+    chosen = next((one for one in tried if _all_seen(refitter, one, tried)), None)
+    return None if chosen is None else Comparison(chosen, tuple(tried))
+
+
+def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
+    """Tell whether a set leaves no statistic beyond chance."""
+    p = float(two_sided(one.rest, refitter.null.freedom).min())
+    return look_elsewhere(p, refitter.null.effective_tests) > _LEFT
+
+
+def _beaten(refitter: Refitter, hypothesis: Hypothesis, best: Refitted) -> bool:
+    """Tell whether a refit of a hypothesis is in vain: far behind a set that leaves nothing.
+
+    By its fingerprint at the best strength; how far that is trusted goes with what there is to explain.
+    """
+    if not leaves_nothing(refitter, best):
+        return False
+    shift = refitter.target - refitter.null.mean
+    noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
+    score = fit_set([hypothesis], shift, noise).log_score(shift, noise)
+    return score < best.score - _FAR - _FAR_SHARE * (best.score - refitter.nothing)
+
+
+def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: FloatArray) -> bool:
+    """Tell whether an effect has statistics of its own: left by the others, untouched by them, and explained.
+
+    Args:
+        own: what the effect does, shape (m,).
+        others: what the others do, shape (e, m).
+        left: what their best fit leaves, in its errors, shape (m,).
+        noise: standard deviations of the statistics, shape (m,).
+    """
+    touched = np.abs(others).max(axis=0, initial=0.0)
+    mine = (np.abs(own) > _MOVED * noise) & (touched < _UNTOUCHED * np.abs(own))
+    return bool(np.any(mine & (np.abs(left) > _SEEN) & (left * own > 0.0)))
+
+
+def _worth(one: Refitted) -> float:
+    return one.score - PRICE_OF_MORE * (len(one.hypotheses) - 1)
+
+
+def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
+    """Return hypotheses to be refitted alone: those of the best set, and the likeliest of all."""
+    chosen = [*choice.best.hypotheses]
+    for hypothesis in hypotheses:
+        same = sum(h.tag == hypothesis.tag for h in chosen)
+        if same < _MOST_OF_ONE and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
+            chosen.append(hypothesis)
+    return chosen
+
+
+def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis, ...]]:
+    """Return sets of several to be refitted, without those that hold another kind of a better effect."""
+    kinds: dict[str, Hypothesis] = {}
+    for one in sorted(singles, key=_worth, reverse=True):
+        kinds.setdefault(one.hypotheses[-1].tag, one.hypotheses[-1])
+    found: dict[frozenset[str], tuple[Hypothesis, ...]] = {}
+    for scored in choice.tried:
+        if len(scored.hypotheses) > 1 and len(found) < _MOST_SETS:
+            # of an effect that was refitted alone, the kind that did best; its strength is that of the set
+            members = tuple(h if h.tag not in kinds else _kind(h, kinds[h.tag]) for h in scored.hypotheses)
+            found.setdefault(scored.tags, members)
+    return list(found.values())
+
+
+def _kind(member: Hypothesis, best: Hypothesis) -> Hypothesis:
+    """Return a member of a set, of the kind of another hypothesis where they are of different kinds."""
+    strength = member.effect.strength
+    without = {strength}
+    same = member.effect.model_dump(exclude=without) == best.effect.model_dump(exclude=without)
+    return member if same else best
+
+
+def _all_seen(refitter: Refitter, one: Refitted, tried: Sequence[Refitted]) -> bool:
+    """Tell whether each effect of a set has a signature of its own beside the best fit of the others."""
+    if len(one.hypotheses) == 1:
+        return True
+    noise = np.sqrt(np.diag(refitter.noise(one.covariance, len(one.vectors)).covariance))
+    for place, hypothesis in enumerate(one.hypotheses):
+        others = next((t for t in tried if t.tags == one.tags - {hypothesis.tag}), None)
+        if others is None:
+            others = refitter.refined([h for h in one.hypotheses if h.tag != hypothesis.tag], one.score)
+        part = one.hypotheses[place].fingerprint
+        if not own_signature(part, others.parts, others.rest, noise):
+            return False
+    return True
+
+
+def _apart(first: Refitted, second: Refitted) -> float:
+    """Return how far two predictions lie apart, in standard deviations of the statistics."""
+    factor = linalg.cholesky((first.covariance + second.covariance) / 2.0, lower=True)
+    white = linalg.solve_triangular(factor, first.mean - second.mean, lower=True)
+    return float(np.sqrt(white @ white))

@@ -1,0 +1,238 @@
+"""Sets of effects at their best fit under the law: refit, simulate, compare, correct, until they stop moving.
+
+The fingerprint of an effect is what it does on top of pixels that were fitted without it. A strong effect has
+moved those: their read noise holds a part of what it adds, and the fingerprint extrapolates badly. Here the
+pixels are fitted with the effects in their law, replicates are drawn from that fit, and the strengths are
+corrected by what the replicates leave of the data (indirect inference, Gourieroux, Monfort and Renault 1993,
+by secants): an effect is judged by what is left after its best fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, correction, log_density
+from pchem_pipeline.discrepancy.by_simulation.maps import Refit
+from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.effects.framework.effect import Effect
+
+__all__ = ["Refitted", "Refitter"]
+
+FloatArray = NDArray[np.float64]
+
+_FEW = 6  # replicates at each strength on the way
+_MOST_STEPS = 5
+_CLOSE = 0.05  # relative change of a factor that is not worth another simulation
+_LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
+_SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
+_FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
+_MOVED = 4.0  # errors of its mean by which a statistic must move to count as moved
+# nats by which a set must promise to come near the best one, beside a tenth of what that explains
+_REACH, _REACH_SHARE = 30.0, 0.1
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A set of effects at strengths for which the refitted model was simulated.
+
+    Attributes:
+        hypotheses: the effects, with the shift of the statistics that each has a part in, (m,) each.
+        stderr: relative standard errors of the factors (of ``strength ** power``), shape (e,).
+        fit: of the pixels with them.
+        vectors: statistics of replicates drawn from it, shape (b, m).
+        covariance: of the statistics of one split under it, shape (m, m).
+        change: logarithms of the factors by which the data ask for more of each, shape (e,).
+        rest: deviations of the data from the mean, with their errors and those allowed to the effects as the
+            unit, shape (m,).
+        score: log density of the rest, nats.
+        promise: the same where the strengths are changed as the data ask for, if all goes in proportion.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    stderr: FloatArray
+    fit: Refit
+    vectors: FloatArray
+    covariance: FloatArray
+    change: FloatArray
+    rest: FloatArray
+    score: float
+    promise: float
+
+    @property
+    def tags(self) -> frozenset[str]:
+        """Of the effects."""
+        return frozenset(h.tag for h in self.hypotheses)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects."""
+        return tuple(h.effect for h in self.hypotheses)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of the statistics, shape (m,)."""
+        return np.asarray(self.vectors.mean(axis=0))
+
+    @property
+    def parts(self) -> FloatArray:
+        """Shift of the statistics by effect, shape (e, m)."""
+        return np.array([h.fingerprint for h in self.hypotheses])
+
+    @property
+    def settled(self) -> bool:
+        """Whether the strengths are what the data ask for, to a few per cent or a standard error."""
+        return bool(np.all(np.abs(self.change) < np.maximum(_CLOSE, self.stderr)))
+
+
+@dataclass
+class Refitter:
+    """Fits sets of effects to the statistics of the data.
+
+    Attributes:
+        draw: refits the pixels with effects beside those of the model, and returns the fit and the statistics
+            of so many replicates of it, which share their random numbers whatever the effects.
+        null: of the model without them.
+        target: mean of the statistics of ``splits`` parts of the data, shape (m,).
+        events: see :class:`~.fingerprints.Noise`.
+        splits: number of parts.
+    """
+
+    draw: Callable[[tuple[Effect, ...], int], tuple[Refit, FloatArray]]
+    null: NullModel
+    target: FloatArray
+    events: FloatArray
+    splits: int = 2
+    steps: int = _MOST_STEPS
+
+    def refined(
+        self, hypotheses: Sequence[Hypothesis], rival: float = -np.inf, replicates: int = _FEW
+    ) -> Refitted:
+        """Return a set at the strengths that explain the data best, or the best that was simulated.
+
+        Args:
+            hypotheses: effects with guessed strengths and what they do there.
+            rival: score of another set: where there is no hope to come near it, this one is given up.
+            replicates: at each strength.
+        """
+        best = now = self._simulated(tuple(hypotheses), None, replicates)
+        nothing, shortened = self.nothing, 0
+        for _ in range(self.steps):
+            if best.settled or best.promise < rival - _REACH - _REACH_SHARE * (rival - nothing):
+                break
+            step = np.clip(best.change, -_LARGEST_STEP, _LARGEST_STEP) * 0.5**shortened
+            moved = _moved(best.hypotheses, step)
+            if moved is None:
+                break
+            now = self._simulated(moved, best, replicates)
+            if now.score > best.score:
+                best, shortened = now, 0
+            elif shortened < 2:
+                shortened += 1
+            else:
+                break
+        return best
+
+    @property
+    def nothing(self) -> float:
+        """Log density of the data under the model without effects, nats."""
+        noise = self.noise(self.null.covariance, self.null.n_replicates)
+        return log_density(self.target - self.null.mean, noise.covariance)
+
+    def sharpened(self, one: Refitted, replicates: int) -> Refitted:
+        """Return a set with more replicates at its strengths."""
+        if one.vectors.shape[0] >= replicates:
+            return one
+        return self._simulated(one.hypotheses, one, replicates)
+
+    def noise(self, covariance: FloatArray, replicates: int) -> Noise:
+        """Return the noise of the data less the mean of so many replicates."""
+        return Noise(covariance * (1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
+
+    def _simulated(
+        self, hypotheses: tuple[Hypothesis, ...], before: Refitted | None, replicates: int
+    ) -> Refitted:
+        """Simulate effects at their strengths; ``before`` is the same set at other strengths."""
+        fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
+        mean = vectors.mean(axis=0)
+        covariance = self._covariance(vectors)
+        parts = self._parts(hypotheses, before, mean)
+        noise = self.noise(covariance, replicates)
+        residual = self.target - mean
+        scaling = np.array([bool(h.effect.strength) for h in hypotheses])
+        change, stderr = correction(parts, residual, noise)
+        change = np.where(scaling, np.log1p(np.maximum(change, -0.9)), 0.0)
+        found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
+        allowed = noise.of(parts)
+        promised = residual - np.expm1(change) @ parts
+        return Refitted(
+            found,
+            stderr,
+            fit,
+            vectors,
+            covariance,
+            change,
+            rest=residual / np.sqrt(np.diag(allowed)),
+            score=log_density(residual, allowed),
+            promise=log_density(promised, allowed),
+        )
+
+    def _parts(
+        self, hypotheses: tuple[Hypothesis, ...], before: Refitted | None, mean: FloatArray
+    ) -> FloatArray:
+        """Return how the statistics go with the logarithm of each factor, shape (e, m).
+
+        From nothing to the first strength the refitted model has moved by its own shift, not by the
+        fingerprints'; from one strength to the next, by a secant (Broyden 1965).
+        """
+        parts = np.array([h.fingerprint for h in hypotheses])
+        if before is None:
+            total, shift = parts.sum(axis=0), mean - self.null.mean
+            return np.asarray(_spread(parts, shift - total) if len(parts) > 1 else shift[None])
+        step = _step(before.effects, tuple(h.effect for h in hypotheses))
+        length = float(step @ step)
+        if length < _SMALLEST_SECANT**2:
+            return parts
+        old = before.parts
+        slope = old + np.outer(step, (mean - before.mean - step @ old) / length)
+        # a secant holds between the two; a shift in proportion to the factor has its end's slope
+        return np.asarray(slope * np.exp(step / 2.0)[:, None])
+
+    def _covariance(self, vectors: FloatArray) -> FloatArray:
+        """Return the covariance of the statistics: that of the null, and more where they scatter more.
+
+        Statistics that the effects leave where they were scatter as they did.
+        """
+        null, n = self.null, len(vectors)
+        moved = np.abs(vectors.mean(axis=0) - null.mean) > _MOVED * null.std / np.sqrt(n)
+        ratio = np.where(moved, np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0), 1.0)
+        return np.asarray(null.covariance * np.outer(ratio, ratio))
+
+
+def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothesis, ...] | None:
+    """Return the hypotheses at other strengths, None where their limits do not let them move."""
+    new = tuple(
+        Hypothesis(h.rescaled(float(np.exp(s))), h.fingerprint * np.exp(s))
+        for h, s in zip(hypotheses, step, strict=True)
+    )
+    return None if all(a.effect == b.effect for a, b in zip(new, hypotheses, strict=True)) else new
+
+
+def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
+    """Return the logarithms of the factors between two strengths of the same effects."""
+    found = []
+    for old, new in zip(before, after, strict=True):
+        a, b = (float(getattr(e, e.strength, 1.0)) if e.strength else 1.0 for e in (old, new))
+        found.append(old.power * np.log(b / a) if a * b > 0.0 else 0.0)
+    return np.array(found)
+
+
+def _spread(parts: FloatArray, rest: FloatArray) -> FloatArray:
+    """Give what the parts together do not account for to each, as they have moved a statistic."""
+    weight = parts**2
+    total = weight.sum(axis=0)
+    share = np.where(total > 1e-12, weight / np.maximum(total, 1e-12), 1.0 / len(parts))
+    return np.asarray(parts + share * rest)
