@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hidden import effects_light, effects_noise, effects_other, effects_readout
+from hidden import effects_decoys, effects_light, effects_noise, effects_other, effects_readout
 from hidden.base import Hidden
 from hidden.sensor import Sensor, draw_sensor
 
@@ -22,7 +22,8 @@ def _all_of(module) -> dict[str, type[Hidden]]:
 LIBRARY = _all_of(effects_light) | _all_of(effects_noise) | _all_of(effects_readout)
 UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
 OUTSIDE = tuple(tag for tag in _all_of(effects_other) if tag not in UNTESTABLE)
-ALL = LIBRARY | _all_of(effects_other)
+DECOYS = _all_of(effects_decoys)
+ALL = LIBRARY | _all_of(effects_other) | DECOYS
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,8 @@ def compare(
         best = max((one.score for one in tried), default=-np.inf)
         tried.append(refitter.refined((*held, *members), best))
 
-    for hypothesis in _singles(hypotheses, choice):
+    # an erratic one, whose refit looks for levels in each pixel, last: it may be beaten by then
+    for hypothesis in sorted(_singles(hypotheses, choice), key=lambda h: type(h.effect).erratic):
         if not tried or not _beaten(refitter, hypothesis, max(tried, key=_worth)):
             refit((hypothesis,))
     best = max(tried, key=_worth)
@@ -148,7 +149,8 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     chosen = [*choice.best.hypotheses]
     for hypothesis in hypotheses:
         same = sum(h.tag == hypothesis.tag for h in chosen)
-        if same < _MOST_OF_ONE and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
+        most = 1 if type(hypothesis.effect).erratic else _MOST_OF_ONE
+        if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
             chosen.append(hypothesis)
     return chosen
 

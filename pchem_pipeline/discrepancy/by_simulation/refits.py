@@ -28,6 +28,7 @@ _FEW = 6  # replicates at each strength on the way
 _MOST_STEPS = 5
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
 _LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
+_CERTAIN = 3.5  # errors of a difference of means: less is chance
 _SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
 _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
 _MOVED = 4.0  # errors of its mean by which a statistic must move to count as moved
@@ -120,9 +121,11 @@ class Refitter:
         """
         best = now = self._simulated(tuple(hypotheses), None, replicates)
         nothing, shortened = self.nothing, 0
-        for _ in range(self.steps):
+        for step_number in range(self.steps):
             if best.settled or best.promise < rival - _REACH - _REACH_SHARE * (rival - nothing):
                 break
+            if step_number and best.score < rival and any(type(h.effect).erratic for h in hypotheses):
+                break  # its refit looks for levels in every pixel: dear
             step = np.clip(best.change, -_LARGEST_STEP, _LARGEST_STEP) * 0.5**shortened
             moved = _moved(best.hypotheses, step)
             if moved is None:
@@ -159,7 +162,7 @@ class Refitter:
         fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
         mean = vectors.mean(axis=0)
         covariance = self._covariance(vectors)
-        parts = self._parts(hypotheses, before, mean)
+        parts = self._parts(hypotheses, before, vectors, covariance)
         noise = self.noise(covariance, replicates)
         residual = self.target - mean
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
@@ -181,23 +184,31 @@ class Refitter:
         )
 
     def _parts(
-        self, hypotheses: tuple[Hypothesis, ...], before: Refitted | None, mean: FloatArray
+        self,
+        hypotheses: tuple[Hypothesis, ...],
+        before: Refitted | None,
+        vectors: FloatArray,
+        covariance: FloatArray,
     ) -> FloatArray:
         """Return how the statistics go with the logarithm of each factor, shape (e, m).
 
         From nothing to the first strength the refitted model has moved by its own shift, not by the
-        fingerprints'; from one strength to the next, by a secant (Broyden 1965).
+        fingerprints'; from one strength to the next, by a secant (Broyden 1965). What is within chance of
+        what was foreseen is taken as foreseen: a slope that holds the scatter of the replicates would be
+        correlated with what they leave, and every strength would come out too low.
         """
+        mean, replicates = vectors.mean(axis=0), len(vectors)
         parts = np.array([h.fingerprint for h in hypotheses])
         if before is None:
-            total, shift = parts.sum(axis=0), mean - self.null.mean
-            return np.asarray(_spread(parts, shift - total) if len(parts) > 1 else shift[None])
+            error = np.sqrt(np.diag(covariance) * (1.0 / replicates + 1.0 / self.null.n_replicates))
+            return _spread(parts, _beyond_chance(mean - self.null.mean - parts.sum(axis=0), error))
         step = _step(before.effects, tuple(h.effect for h in hypotheses))
         length = float(step @ step)
         if length < _SMALLEST_SECANT**2:
             return parts
-        old = before.parts
-        slope = old + np.outer(step, (mean - before.mean - step @ old) / length)
+        old, error = before.parts, np.sqrt(np.diag(covariance) * 2.0 / replicates)
+        unforeseen = _beyond_chance(mean - before.mean - step @ old, error)
+        slope = old + np.outer(step, unforeseen / length)
         # a secant holds between the two; a shift in proportion to the factor has its end's slope
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
 
@@ -228,6 +239,11 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
         a, b = (float(getattr(e, e.strength, 1.0)) if e.strength else 1.0 for e in (old, new))
         found.append(old.power * np.log(b / a) if a * b > 0.0 else 0.0)
     return np.array(found)
+
+
+def _beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:
+    """Return differences of means where they are beyond chance, 0 elsewhere."""
+    return np.asarray(np.where(np.abs(difference) > _CERTAIN * error, difference, 0.0))
 
 
 def _spread(parts: FloatArray, rest: FloatArray) -> FloatArray:

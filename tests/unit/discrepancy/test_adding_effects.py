@@ -1,4 +1,4 @@
-"""How effects enter the model: refitted until they stop moving, the simplest set that leaves nothing, proven."""
+"""How effects enter the model: at their best refit, the simplest set that leaves nothing, proven at last."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     found = world.compare(hypothesis("row_noise"), mimic)
     assert found is not None
     assert found.chosen.tags == {"row_noise"}
-    assert [c.hypothesis.tag for c in found.rivals_of("row_noise")][0] == "row_noise"
+    assert found.rivals_of("row_noise")[0].hypothesis.tag == "row_noise"
 
 
 def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:

@@ -1,0 +1,314 @@
+"""Effects that the package's library leaves out on purpose: whatever gets a name there is invented.
+
+``TRIED`` were looked at while the naming was made; ``SEALED`` only once, when it stood.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from hidden.base import Hidden
+
+
+class LostBit(Hidden):
+    """A bit of the converter reads 0 in some of the samples; strength: their share."""
+
+    tag: ClassVar[str] = "lost_bit"
+    s95: ClassVar[float] = 1e-3
+
+    def draw(self):
+        self.bit = int(self.pick("bit", 8, 16))
+
+    def convert(self, t, dn, code):
+        return np.where(self.rng.random(code.shape) < self.strength, code & ~self.bit, code)
+
+
+class CornerGlow(Hidden):
+    """Light in a corner that bursts in one frame of fifty; strength: e- at the corner."""
+
+    tag: ClassVar[str] = "corner_glow"
+    s95: ClassVar[float] = 0.15
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+
+    def draw(self):
+        y, x = np.indices(self.sensor.shape)
+        reach = max(self.sensor.shape) / 5
+        self.shape = np.exp(-np.hypot(y, x) / reach)
+
+    def exposure(self, t, h):
+        return h + self.strength * self.shape * (self.rng.random() < 0.02)
+
+
+class RowRepeat(Hidden):
+    """Rows that repeat the row above; strength: share of the rows."""
+
+    tag: ClassVar[str] = "row_repeat"
+    s95: ClassVar[float] = 2e-3
+
+    def convert(self, t, dn, code):
+        found = code.copy()
+        for y in np.flatnonzero(self.rng.random(code.shape[0] - 1) < self.strength) + 1:
+            found[y] = code[y - 1]
+        return found
+
+
+class NeighbourMedian(Hidden):
+    """A sample far above its eight neighbours becomes their median; strength: share of those replaced."""
+
+    tag: ClassVar[str] = "neighbour_median"
+    s95: ClassVar[float] = 0.05
+    most: ClassVar[float] = 1.0
+
+    def convert(self, t, dn, code):
+        around = np.stack(
+            [np.roll(code, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
+        )
+        median = np.median(around, axis=0)
+        limit = 3.0 * np.sqrt(np.median(self.sensor.exposure)) * np.median(self.sensor.step)
+        replaced = (code - median > limit) & (self.rng.random(code.shape) < self.strength)
+        return np.where(replaced, median.astype(code.dtype), code)
+
+
+class PreviousBit(Hidden):
+    """An offset that follows the lowest bit of the sample read before in the row; strength: DN."""
+
+    tag: ClassVar[str] = "previous_bit"
+    s95: ClassVar[float] = 0.1
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+
+    def convert(self, t, dn, code):
+        odd = (np.roll(code, 1, axis=1) & 1).astype(float)
+        odd[:, 0] = 0.5
+        return np.floor(dn + self.strength * (odd - 0.5) + 0.5).astype(np.int64)
+
+
+class TapGain(Hidden):
+    """The gain of one readout tap, a quarter of the columns, moves frame by frame; strength: relative."""
+
+    tag: ClassVar[str] = "tap_gain"
+    s95: ClassVar[float] = 0.01
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+
+    def signal(self, t, v):
+        v = v.copy()
+        quarter = v.shape[1] // 4
+        v[:, quarter : 2 * quarter] *= 1 + self.strength * self.rng.standard_normal()
+        return v
+
+
+class BlackClamp(Hidden):
+    """The black level follows the mean of the frame's left eighth; strength: part of it that is taken off."""
+
+    tag: ClassVar[str] = "black_clamp"
+    s95: ClassVar[float] = 0.05
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+
+    def voltage(self, t, dn):
+        left = dn[:, : max(dn.shape[1] // 8, 1)] - self.sensor.bias[:, : max(dn.shape[1] // 8, 1)]
+        self.level = left.mean() if not hasattr(self, "level") else 0.9 * self.level + 0.1 * left.mean()
+        return dn - self.strength * (left.mean() - self.level)
+
+
+class DeadTime(Hidden):
+    """Electrons that come soon after another are lost; strength: part lost per electron already there."""
+
+    tag: ClassVar[str] = "dead_time"
+    s95: ClassVar[float] = 2e-3
+    most: ClassVar[float] = 0.1
+
+    def electrons(self, t, k):
+        return k - self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
+
+
+class GainStitch(Hidden):
+    """Above a code the gain is another; strength: relative change."""
+
+    tag: ClassVar[str] = "gain_stitch"
+    s95: ClassVar[float] = 3e-3
+
+    def draw(self):
+        low, high = self.sensor.code_range
+        self.code = low + self.between("place", 0.5, 0.8) * (high - low)
+
+    def voltage(self, t, dn):
+        return np.where(dn > self.code, self.code + (1 + self.strength) * (dn - self.code), dn)
+
+
+class MissingCodes(Hidden):
+    """Codes that never come, regularly; their samples read one less. Strength: share of samples moved."""
+
+    tag: ClassVar[str] = "missing_codes"
+    s95: ClassVar[float] = 2e-3
+    most: ClassVar[float] = 1.0
+
+    def draw(self):
+        self.period = int(self.pick("period", 11, 13, 19))
+
+    def convert(self, t, dn, code):
+        moved = (code % self.period == 5) & (self.rng.random(code.shape) < self.period * self.strength)
+        return code - moved
+
+
+class RowSwap(Hidden):
+    """Neighbouring rows that change places; strength: share of the rows."""
+
+    tag: ClassVar[str] = "row_swap"
+    s95: ClassVar[float] = 5e-3
+    most: ClassVar[float] = 0.5
+
+    def convert(self, t, dn, code):
+        found = code.copy()
+        for y in np.flatnonzero(self.rng.random(code.shape[0] // 2) < 2 * self.strength) * 2:
+            found[[y, y + 1]] = code[[y + 1, y]]
+        return found
+
+
+class FlippedBit(Hidden):
+    """A bit of the converter flips in some samples; strength: their share."""
+
+    tag: ClassVar[str] = "flipped_bit"
+    s95: ClassVar[float] = 1e-3
+
+    def draw(self):
+        self.bit = int(self.pick("bit", 2, 4))
+
+    def convert(self, t, dn, code):
+        return np.where(self.rng.random(code.shape) < self.strength, code ^ self.bit, code)
+
+
+class ColumnRepeat(Hidden):
+    """In some frames a column repeats its left neighbour; strength: share of columns and frames."""
+
+    tag: ClassVar[str] = "column_repeat"
+    s95: ClassVar[float] = 2e-3
+
+    def convert(self, t, dn, code):
+        found = code.copy()
+        for x in np.flatnonzero(self.rng.random(code.shape[1] - 1) < self.strength) + 1:
+            found[:, x] = code[:, x - 1]
+        return found
+
+
+class BlendedFrames(Hidden):
+    """Frames that are the mean of themselves and the one before; strength: share of the frames."""
+
+    tag: ClassVar[str] = "blended_frames"
+    s95: ClassVar[float] = 2e-3
+    most: ClassVar[float] = 0.5
+
+    def record(self, t, frames):
+        if t > 0 and self.rng.random() < self.strength:
+            frames[t] = (frames[t].astype(np.int64) + frames[t - 1]) // 2
+
+
+class CoarseAbove(Hidden):
+    """Above a code the converter gives every other code alone; strength: share of those samples."""
+
+    tag: ClassVar[str] = "coarse_above"
+    s95: ClassVar[float] = 0.02
+    most: ClassVar[float] = 1.0
+
+    def draw(self):
+        low, high = self.sensor.code_range
+        self.code = int(low + self.between("place", 0.4, 0.7) * (high - low))
+
+    def convert(self, t, dn, code):
+        moved = (code > self.code) & (self.rng.random(code.shape) < self.strength)
+        return np.where(moved, code & ~1, code)
+
+
+class BurstingBlock(Hidden):
+    """A block of pixels whose offset jumps together in one frame of twenty; strength: DN."""
+
+    tag: ClassVar[str] = "bursting_block"
+    s95: ClassVar[float] = 0.5
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+
+    def draw(self):
+        (ny, nx), side = self.sensor.shape, max(self.sensor.shape[0] // 6, 2)
+        y, x = self.rng.integers(0, ny - side), self.rng.integers(0, nx - side)
+        self.affected = np.zeros((ny, nx), bool)
+        self.affected[y : y + side, x : x + side] = True
+
+    def voltage(self, t, dn):
+        return dn + self.strength * self.affected * (self.rng.random() < 0.05)
+
+
+class RowTilt(Hidden):
+    """A slope along each row, drawn anew; strength: DN rms at its ends."""
+
+    tag: ClassVar[str] = "row_tilt"
+    s95: ClassVar[float] = 0.15
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+
+    def voltage(self, t, dn):
+        along = np.linspace(-1, 1, dn.shape[1])
+        return dn + self.strength * self.rng.standard_normal((dn.shape[0], 1)) * along
+
+
+class NoisyTime(Hidden):
+    """Read noise that is larger in a fifth of the run; strength: relative."""
+
+    tag: ClassVar[str] = "noisy_time"
+    s95: ClassVar[float] = 0.05
+
+    def draw(self):
+        self.begin = self.between("begin", 0.1, 0.7) * self.sensor.n_frames
+
+    def noise(self, t, n, k):
+        return n * (1 + self.strength * (self.begin <= t < self.begin + self.sensor.n_frames / 5))
+
+
+class EmptySamples(Hidden):
+    """Samples that are read without their electrons; strength: their share."""
+
+    tag: ClassVar[str] = "empty_samples"
+    s95: ClassVar[float] = 1e-3
+    most: ClassVar[float] = 0.2
+
+    def electrons(self, t, k):
+        return np.where(self.rng.random(k.shape) < self.strength, 0, k)
+
+
+class LoudColumn(Hidden):
+    """Columns whose pixels share a deviation from frame to frame, one in twelve; strength: DN rms."""
+
+    tag: ClassVar[str] = "loud_column"
+    s95: ClassVar[float] = 0.25
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.25, 0.25)
+
+    def draw(self):
+        self.loud = self.rng.random(self.sensor.shape[1]) < 1 / 12
+        self.loud[self.rng.integers(self.loud.size)] = True
+
+    def voltage(self, t, dn):
+        return dn + self.strength * self.loud * self.rng.standard_normal(dn.shape[1])
+
+
+class NegativeGhost(Hidden):
+    """Large samples leave the next frame of their pixel lower; strength: DN per electron above four."""
+
+    tag: ClassVar[str] = "negative_ghost"
+    s95: ClassVar[float] = 0.3
+    warmup: ClassVar[int] = 1
+
+    def draw(self):
+        self.before = np.zeros(self.sensor.shape)
+
+    def signal(self, t, v):
+        shifted = v - self.strength / np.median(self.sensor.step) * np.maximum(self.before - 4, 0)
+        self.before = v
+        return shifted
+
+
+TRIED = (
+    "lost_bit", "corner_glow", "row_repeat", "neighbour_median", "previous_bit", "tap_gain", "black_clamp",
+    "dead_time", "gain_stitch", "missing_codes", "row_swap", "flipped_bit",
+)  # fmt: skip
+SEALED = (
+    "column_repeat", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
+    "empty_samples", "loud_column", "negative_ghost", "trap_limited_lag", "self_trigger_cut",
+    "output_crosstalk", "checkerboard_offset",
+)  # fmt: skip
