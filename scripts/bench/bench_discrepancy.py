@@ -120,6 +120,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--others", type=int, default=4, help="of each untestable effect, and of each outside"
     )
+    parser.add_argument("--decoys", type=int, default=2, help="of each decoy, at each level")
+    parser.add_argument("--sealed", type=int, default=0, help="of each decoy of the sealed half")
     parser.add_argument(
         "--shape", nargs=3, type=int, default=(64, 64, 4000), metavar=("ROWS", "COLUMNS", "FRAMES")
     )
@@ -146,6 +148,7 @@ def main() -> None:
         run_commands(options.command, options.first, shape, options.folder, options.processes)
         return
     names = ("effects", "levels", "seeds", "first", "nulls", "pairs", "triples", "leave_out", "others")
+    names += ("decoys", "sealed")
     cases = Plan(**{name: getattr(options, name) for name in names}, shape=shape).cases()
     if not options.report:
         done = {r["case"]["key"] for r in read_results(path)}

@@ -17,6 +17,15 @@ EFFECTS = (
 )  # fmt: skip
 UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
 OUTSIDE = ("trap_limited_lag", "self_trigger_cut", "output_crosstalk", "checkerboard_offset")
+#: left out of the library on purpose; those of ``SEALED`` are for the last look, when nothing changes
+TRIED = (
+    "lost_bit", "corner_glow", "row_repeat", "neighbour_median", "previous_bit", "tap_gain", "black_clamp",
+    "dead_time", "gain_stitch", "missing_codes", "row_swap", "flipped_bit",
+)  # fmt: skip
+SEALED = (
+    "column_repeat", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
+    "empty_samples", "loud_column", "negative_ghost", *OUTSIDE,
+)  # fmt: skip
 #: effects that a stationary stack hardly tells apart: the one for the other is no invention
 TWINS = (
     ("overdispersed_counts", "branching_counts"),
@@ -47,7 +56,7 @@ class Case:
     """One stack with something hidden, and how to look at it.
 
     Attributes:
-        kind: single, null, untestable, outside, pair or left_out.
+        kind: single, null, untestable, outside, decoy, sealed, pair or left_out.
         hidden: tags.
         level: times the strength that is found in 95 % of stacks.
         index: number of the repetition.
@@ -93,6 +102,7 @@ class Plan:
         triples: stacks with three.
         leave_out: repetitions of each effect, at level 4, that is not among the candidates.
         others: repetitions of each untestable effect and of each outside the library.
+        decoys, sealed: repetitions of each decoy of either half.
         shape: rows, columns and frames.
     """
 
@@ -105,6 +115,8 @@ class Plan:
     triples: int
     leave_out: int
     others: int
+    decoys: int
+    sealed: int
     shape: tuple[int, int, int]
 
     def cases(self) -> list[Case]:
@@ -126,6 +138,10 @@ class Plan:
         for kind, tags in (("untestable", UNTESTABLE), ("outside", OUTSIDE)):
             other = range(self.first, self.first + self.others)
             groups.append([Case(kind, (tag,), 4.0, i, self.shape) for i in other for tag in tags])
+        for kind, tags, count in (("decoy", TRIED, self.decoys), ("sealed", SEALED, self.sealed)):
+            for level in self.levels:
+                other = range(self.first, self.first + count)
+                groups.append([Case(kind, (tag,), level, i, self.shape) for i in other for tag in tags])
         placed = [
             ((i + 0.5) / len(group), n, case)
             for n, group in enumerate(groups)

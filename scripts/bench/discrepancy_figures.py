@@ -11,6 +11,7 @@ from discrepancy_cases import EFFECTS, twins_of
 
 Record = dict[str, Any]
 _LARGEST_SET = 3
+_STRONG = 4.0  # times s95
 _GOOD_SENSOR = 0.32  # e-, about the middle of the sensors that are drawn
 
 
@@ -115,6 +116,7 @@ def print_figures(records: Iterable[Record]) -> None:
     _confusion(answers)
     _naming(answers)
     _by_read_noise(records, answers)
+    _strengths([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
     _gaps([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
     compared = [(r, a) for r, a in zip(records, answers, strict=True) if r.get("bias")]
     _bias_titles()
@@ -147,7 +149,8 @@ def _confusion(answers: Sequence[Answer]) -> None:
 
 def _naming(answers: Sequence[Answer]) -> None:
     print("\nNaming")
-    for level, alone, inside, wrong in ((4.0, 0.92, 0.98, 0.02), (1.5, 0.0, 0.85, 0.05)):
+    for level in sorted({a.level for a in answers if a.kind == "single"}):
+        alone, inside, wrong = (0.0, 0.85, 0.05) if level < _STRONG else (0.95, 0.98, 0.01)
         group = [a for a in answers if a.kind == "single" and a.level == level]
         if alone:
             _share(f"single effects, {level:g} s95: named alone", group, lambda a: a.alone, least=alone)
@@ -178,6 +181,43 @@ def _naming(answers: Sequence[Answer]) -> None:
                 most=0.05,
             )
         _share(f"{title}: unexplained", group, lambda a: a.verdict == "unexplained", least=0.5)
+
+    for kind in ("decoy", "sealed"):
+        group = [a for a in answers if a.kind == kind]
+        _share(f"{kind}s: any name", group, lambda a: a.answered, most=0.05)
+        _share(f"{kind}s: seen", group, lambda a: not a.silent, least=0.5)
+
+
+def _strengths(pairs: Sequence[tuple[Record, Answer]]) -> None:
+    """Print how far named strengths lie from the truth, where both are the same number."""
+    print(
+        "\nStrength of effects named alone, in its standard errors from the truth (those of the same meaning)"
+    )
+    for level in sorted({a.level for _, a in pairs}):
+        off = [pull for r, a in pairs if a.alone and a.level == level for pull in _pulls(r)]
+        _share(
+            f"single effects, {level:g} s95: within 3 standard errors", off, lambda z: abs(z) < 3, least=0.95
+        )
+
+
+#: parameter of the package that is the hidden strength itself
+_SAME_STRENGTH = {
+    "frame_noise": "frame_noise_dn", "row_noise": "row_noise_dn", "column_noise": "column_noise_dn",
+}  # fmt: skip
+
+
+def _pulls(record: Record) -> list[float]:
+    """Return the deviation of the found strength in standard errors, none where the meanings differ."""
+    [hidden], steps = record.get("hidden") or [{"tag": "", "parameters": {}}], record["verdict"]["steps"]
+    name = _SAME_STRENGTH.get(hidden["tag"], "")
+    if hidden["tag"] == "signal_dependent_noise" and hidden["parameters"].get("grows_with") == "root":
+        name = "noise_e"
+    if hidden["tag"] == "overdispersed_counts" and hidden["parameters"].get("law") == "gamma":
+        name = "relative_variance"
+    found = steps[0].get("parameters", {}).get(name) if steps else None
+    if not found or not found["stderr"]:
+        return []
+    return [(found["value"] - hidden["strength"]) / found["stderr"]]
 
 
 def _by_read_noise(records: Sequence[Record], answers: Sequence[Answer]) -> None:

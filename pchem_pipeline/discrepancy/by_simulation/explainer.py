@@ -321,15 +321,15 @@ class FrameExplainer:
         return fit, equivalent_sensor(fit.maps, fit.covariance)
 
     def _replicates(
-        self, model: tuple[Effect, ...], maps: PixelMaps, prefix: str, count: int
+        self, model: tuple[Effect, ...], maps: PixelMaps, prefix: str, count: int, begin: int = 0
     ) -> list[Mapping[str, float]]:
-        """Simulate and observe a model ``count`` times."""
+        """Simulate and observe a model ``count`` times, with the random numbers from ``begin`` on."""
         text = "|".join(e.model_dump_json() for e in model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
         taken = self.frames.acquisition(self.plain.ambiguous)
         tasks = [
             Replicate(f"{prefix}-null-{digest}-{i}", maps, model, self._seed(prefix, i), taken)
-            for i in range(count)
+            for i in range(begin, begin + count)
         ]
         vectors: list[Mapping[str, float]] = []
         for result in self._counted(tasks):
@@ -357,10 +357,16 @@ class FrameExplainer:
         found = {h.tag for h in held}
         present = tuple(e for e in self.model if e.tag not in found)
 
+        known: dict[tuple[str, ...], tuple[Refit, PixelMaps, list[Mapping[str, float]]]] = {}
+
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             model = (*present, *effects)
-            fit, maps = self._mapped(model)
-            return fit, as_matrix(self.first.names, self._replicates(model, maps, "grown", count))
+            key = tuple(e.model_dump_json() for e in model)
+            if key not in known:
+                known[key] = (*self._mapped(model), [])
+            fit, maps, vectors = known[key]
+            vectors += self._replicates(model, maps, "grown", count - len(vectors), len(vectors))
+            return fit, as_matrix(self.first.names, vectors[:count])
 
         events = np.asarray(self._noise(self.first, 2).events)
         return Refitter(draw, self.first, z.both, events)

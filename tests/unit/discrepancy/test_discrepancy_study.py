@@ -9,7 +9,7 @@ from helpers.places import ROOT
 sys.path.append(str(ROOT / "scripts" / "bench"))
 
 from bench_discrepancy import read_results
-from discrepancy_cases import EFFECTS, OUTSIDE, UNTESTABLE, Plan, remaining
+from discrepancy_cases import EFFECTS, OUTSIDE, SEALED, TRIED, UNTESTABLE, Plan, remaining
 from discrepancy_figures import Answer, print_figures, wilson
 from hidden import chain
 
@@ -71,7 +71,13 @@ def test_figures_count_and_compare_with_their_targets(capsys):
     wrong = record(["row_noise"], "named", "adc_inl")
     failed = record(["row_noise"], "error", error="ValueError: broken")
     null = record([], "consistent", kind="null", level=0.0)
-    print_figures([*good, wrong, failed, null])
+    decoys = [
+        record(["lost_bit"], "unexplained", kind="decoy"),
+        record(["row_swap"], "named", "rts_noise", kind="decoy"),
+    ]
+    good[1]["hidden"] = [{"tag": "row_noise", "strength": 0.4, "parameters": {}}]
+    good[1]["verdict"]["steps"][0]["parameters"] = {"row_noise_dn": {"value": 0.41, "stderr": 0.002}}
+    print_figures([*good, wrong, failed, null, *decoys])
     lines = capsys.readouterr().out.splitlines()
 
     def line(text):
@@ -83,6 +89,8 @@ def test_figures_count_and_compare_with_their_targets(capsys):
     assert "0/1 " in line("nothing hidden: any name  ")
     assert "1/1 " in line("all, bias: beyond one s.e.")
     assert "reached" in line("a placebo closes a quarter")
+    assert "1/2 " in line("decoys: any name")
+    assert "0/1 " in line("4 s95: within 3 standard errors")
     assert any("failed x1: ValueError: broken" in text for text in lines)
 
 
@@ -93,7 +101,7 @@ def test_the_interval_of_a_fraction():
 
 
 def test_every_beginning_of_the_study_is_balanced():
-    cases = Plan(EFFECTS, (4.0, 1.5), 10, 0, 200, 40, 10, 2, 4, SHAPE).cases()
+    cases = Plan(EFFECTS, (4.0, 1.5), 10, 0, 200, 40, 10, 2, 4, 2, 1, SHAPE).cases()
     assert len({case.key for case in cases}) == len({case.seed for case in cases}) == len(cases)
     whole = Counter((case.kind, case.level) for case in cases)
     for share in (0.1, 0.3, 0.7):
@@ -110,6 +118,8 @@ def test_the_study_knows_the_effects_of_the_hidden_chain():
     assert set(EFFECTS) == set(chain.LIBRARY)
     assert set(UNTESTABLE) == set(chain.UNTESTABLE)
     assert set(OUTSIDE) == set(chain.OUTSIDE)
+    assert set(TRIED) | set(SEALED) == set(chain.DECOYS) | set(OUTSIDE)
+    assert not set(TRIED) & set(SEALED)
 
 
 def test_a_result_cut_off_by_an_interruption_is_done_again(tmp_path, capsys):
