@@ -35,6 +35,7 @@ class Check:
         limit: size that is found in 19 of 20 runs like this one; NaN where that is not known.
         effects: tags of effects that show like this: where the model has one of them, the check says so.
         where: rows, columns, frames or codes that carry it, in words; empty for all.
+        region: part of the sensor that it is in, as ``model.effects`` takes a region; None: everywhere alike.
         advice: what it does to the results, in words.
         level: how grave it is; "good" where it is not beyond chance.
         p_global: probability of as much by chance in any of the checks.
@@ -51,6 +52,7 @@ class Check:
     limit: float = math.nan
     effects: tuple[str, ...] = ()
     where: str = ""
+    region: dict[str, Any] | None = None
     advice: str = ""
     level: Level = "good"
     p_global: float = math.nan

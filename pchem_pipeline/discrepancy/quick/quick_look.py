@@ -14,15 +14,16 @@ statistics with simulations.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
+from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
+from pchem_pipeline.discrepancy.quick.places import SensorPlace, block_deviations, sensor_maps, sensor_place
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -122,7 +123,72 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     checks += series_checks(mean, error, skewness)
     common = _Common(frame, rows, columns, sums)
     checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps)]
-    return [*checks, *_repeats(sums)]
+    return [*_located(checks, sums), *_repeats(sums)]
+
+
+#: The map that shows where each check fails.
+_MAP_OF = {
+    "frame_noise": "next_x",
+    "row_noise": "next_x",
+    "column_noise": "next_y",
+    "neighbours_x": "next_x",
+    "neighbours_y": "next_y",
+    "lag": "lag",
+    "drift": "spread",
+}
+#: Checks of which a part of the sensor alone may fail.
+_LOCAL = ("neighbours_x", "neighbours_y", "lag")
+
+
+def _located(checks: list[Check], sums: StackSums) -> list[Check]:
+    """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
+    maps = sensor_maps(sums)
+    places = {name: sensor_place(name, values, SIGNIFICANCE / len(maps)) for name, values in maps.items()}
+    found = []
+    for check in checks:
+        place = places.get(_MAP_OF.get(check.name, ""))
+        found.append(check if place is None else _placed(check, place, sums))
+    if "spread" in maps:
+        found.append(_local_drift(sums, places["spread"]))
+    return found
+
+
+def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
+    """Return a check with its place; noise of lines has the size that it has there."""
+    p, size = check.p, check.size
+    if check.name in _LOCAL:
+        p = of_many(min(check.p, place.p), 2.0)
+    if check.name in ("row_noise", "column_noise") and place.only_there:
+        shared = sums.next_x if check.name == "row_noise" else sums.next_y
+        inside = place.region.mask(sums.shape)
+        excess = float(np.nanmean(shared[inside]) - np.nanmean(shared[~inside]))
+        size = max(size, math.sqrt(max(excess, 0.0)))
+    words, numbers = place.region.words(), place.region.numbers()
+    return replace(check, p=p, size=size, where=check.where or words, region=numbers)
+
+
+def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
+    """Return whether a part of the sensor moves along the run, and the rest does not."""
+    title = "a part of the sensor drifts apart from the rest"
+    effects = ("bias_drift", "exposure_drift", "bias_jumps", "persistence")
+    advice = "it widens the read noise there"
+    if place is None:
+        return Check("local_drift", title, 1.0, 0.0, "DN", effects=effects, advice=advice)
+    inside = place.region.mask(sums.shape) & (sums.variance > 0)
+    common = block_deviations(sums)[:, inside].mean(axis=1)
+    chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
+    size = math.sqrt(max(float(np.average(common**2, weights=sums.lengths)) - chance, 0.0))
+    return Check(
+        "local_drift",
+        title,
+        place.p,
+        size,
+        "DN",
+        effects=effects,
+        where=place.region.words(),
+        region=place.region.numbers(),
+        advice=advice,
+    )
 
 
 # -- what is common to lines and frames ----------------------------------------------------------

@@ -11,6 +11,7 @@ from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, codes_of, maps_of, 
 
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
+from pchem_pipeline.effects.framework.region import Region
 
 SHAPE = (800, 32, 32)
 SIGMA = READ_NOISE / GAIN  # DN
@@ -33,7 +34,7 @@ def clean() -> QuickLook:
 def test_a_clean_stack_passes_all_checks(clean: QuickLook) -> None:
     assert clean.found == ()
     assert {check.level for check in clean.checks} == {"good"}
-    assert len(clean.checks) == 14
+    assert len(clean.checks) == 15
     assert clean.samples == np.prod(SHAPE)
 
 
@@ -127,6 +128,39 @@ def test_a_single_noisy_row_is_told() -> None:
     check = by_name(looked(stack(rng, SHAPE, moved)))["row_noise"]
     assert check.found
     assert check.where == "most in row 21"
+
+
+def test_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
+    rng = np.random.default_rng(21)
+
+    def moved(dn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        dn[:, :, 24:] += 0.8 * SIGMA * rng.standard_normal(dn.shape[:2])[:, :, None]
+        return dn
+
+    check = by_name(looked(stack(rng, SHAPE, moved)))["row_noise"]
+    assert check.found
+    assert check.region == {"columns": [[24, 32]]}
+    assert check.where == "columns 24 to 31"
+    assert check.size == pytest.approx(0.8 * SIGMA, rel=0.1)
+    assert check.level == "serious"
+
+
+def test_a_corner_that_drifts_is_found_there_with_its_rms() -> None:
+    rng = np.random.default_rng(22)
+    ramp = np.linspace(-0.5, 0.5, SHAPE[0])[:, None, None]
+
+    def moved(dn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        dn[:, :8, 16:] += 2.0 * ramp
+        return dn
+
+    look = looked(stack(rng, SHAPE, moved))
+    check = by_name(look)["local_drift"]
+    assert check.found
+    assert check.region is not None
+    true = Region(rows=((0, 8),), columns=((16, 32),))
+    assert Region.model_validate(check.region).overlap(true, SHAPE[1:]) > 0.9
+    # of the means over four blocks, the last one short, less the drift of all
+    assert check.size == pytest.approx(2.0 / np.sqrt(12), rel=0.25)
 
 
 def test_a_drift_is_found_with_its_rms_and_is_nothing_else() -> None:
