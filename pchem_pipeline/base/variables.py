@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 __all__ = [
+    "CHARGE_RATES",
     "FREE_SATELLITES",
     "INTERVALS",
     "LENGTHS",
@@ -22,6 +23,9 @@ __all__ = [
 
 #: The four parameters of the PCD, in the order of every (…, parameter) axis.
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+
+#: Names of the quanta exposure over the integration time: in the dark, and where something else made charge.
+CHARGE_RATES = ("dark_current", "charge_rate")
 
 #: Arrays of the group ``fit`` that exist only where the model holds effects.
 FREE_SATELLITES = ("satellite_amplitude_e", "satellite_weight")
@@ -78,7 +82,8 @@ _PARAMETER_WORDS = {
     "read_noise_dn": ("DN", "read noise, quantisation included", "sigma"),
     "read_noise_e": ("e-", "read noise, quantisation included", "sigma_e-"),
     "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R"),
-    "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time", "i_d"),
+    "charge_rate": ("e-/px/s", "charge rate: quanta exposure / integration time", "H/t"),
+    "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time, in the dark", "i_d"),
     "spurious_charge": ("e-", "spurious charge: exposure that does not grow with time or light", "H_0"),
     "charge_per_level": ("e-/level", "slope of the quanta exposure against the light level", ""),
 }
@@ -292,8 +297,8 @@ _ALL: list[Variable] = [
         "fit/satellite_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN without any"
     ),
     Variable("fit/satellite_weight", _MAP, "float64", "1", "probability off the quiet level; 0 without any"),
-    *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")),
-    *_ends("maps", (*INTERVALS, "dark_current")),
+    *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)),
+    *_ends("maps", (*INTERVALS, *CHARGE_RATES)),
     Variable(
         "maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is called misfit"
     ),

@@ -108,6 +108,12 @@ def run(
         float | None, typer.Option(help="camera files: integration time of a frame, s")
     ] = None,
     bit_depth: Annotated[int | None, typer.Option(help="camera files: bits of the ADC")] = None,
+    kind: Annotated[
+        Literal["dark", "light", "unknown"] | None,
+        typer.Option(
+            help="camera files: what made the charge; H over time is dark current in the dark alone"
+        ),
+    ] = None,
     mode: Annotated[
         Literal["copy", "reference"] | None,
         typer.Option(help="camera files: copy them into the store, or leave them where they are"),
@@ -127,7 +133,7 @@ def run(
     from pchem_pipeline.commands.new_run import find_or_start
     from pchem_pipeline.run.session import cropped, up_to
 
-    given = {"integration_time": integration_time, "bit_depth": bit_depth, "mode": mode}
+    given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}
     wanted = command.options
     target, is_new = find_or_start(targets, store, known, wanted.roi, write=not wanted.dry_run)
@@ -183,7 +189,7 @@ def joint(
 ) -> None:
     """Fit several exposures of a sensor together, as a run whose samples they are.
 
-    One gain, bias and read noise for each pixel; dark current as the slope of H. Runs get their histograms.
+    One gain, bias and read noise for each pixel; charge rate as the slope of H. Runs get their histograms.
     """
     from pchem_pipeline.commands.joint import find_joint, run_joint
 

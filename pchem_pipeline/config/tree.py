@@ -104,6 +104,7 @@ class RunConfig(Section):
             "format": simulated.format,
             "integration_time": simulated.integration_time,
             "bit_depth": simulated.bit_depth,
+            "kind": "unknown" if simulated.parameters.dark_current is None else "dark",
         }
         return {**data, "input": {**known, **given, "files": files}}
 

@@ -49,13 +49,18 @@ class InputSettings(Section):
     against: Literal["integration_time", "light_level", "none"] = Field(
         default="integration_time",
         description="samples: what their exposures are drawn against. integration_time: the slope of H is "
-        "the dark current and its offset the spurious charge. none: no line",
+        "the charge rate (in the dark the dark current) and its offset the spurious charge. none: no line",
     )
     shown_sample: int | None = Field(
         default=None,
         ge=0,
         description="samples: whose histograms, H and ensemble are shown, counted from 0; null: the last "
         "that holds electrons",
+    )
+    kind: Literal["dark", "light", "unknown"] = Field(
+        default="unknown",
+        description="what made the charge: dark (nothing but the sensor: H over time is its dark current), "
+        "light, or unknown; of the last two H over time is called charge rate",
     )
     format: str = Field(
         default="auto",
@@ -118,8 +123,7 @@ class InputSettings(Section):
     integration_time: float | None = Field(
         default=None,
         gt=0,
-        description="integration time of a frame, s; null: from the file, else unknown (no dark current "
-        "then)",
+        description="integration time of a frame, s; null: from the file, else unknown (no charge rate then)",
     )
     on_bad_file: Literal["error", "skip"] = Field(
         default="error",

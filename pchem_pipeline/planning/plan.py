@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.planning.frames import best_exposure, exposure_grid, frames_needed, precision
 from pchem_pipeline.planning.likelihood_limits import ambiguity, gain_rival, rounding_shift
 from pchem_pipeline.planning.point import FloatArray, Point
@@ -17,7 +18,7 @@ from pchem_pipeline.planning.targets import Target
 __all__ = ["LEAST_SHARE", "Need", "Plan", "SamplesPlan", "plan_one_sample", "plan_samples"]
 
 #: Parameters that are an electron off where the electron numbers are.
-_COUNTED = ("quanta_exposure", "dark_current", "bias")
+_COUNTED = ("quanta_exposure", *CHARGE_RATES, "bias")
 #: Without so much knowledge of the gain, the bound says nothing about real fits.
 _SEEN = Target("conversion_gain", 25.0, "%")
 _TRIED = 10  # exposures

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.planning.point import FloatArray, Point
 
 __all__ = ["TARGET_NAMES", "Target", "parse_target"]
@@ -17,6 +18,7 @@ __all__ = ["TARGET_NAMES", "Target", "parse_target"]
 #: Parameters that can be planned for, with the units in which a precision can be given.
 TARGET_NAMES: dict[str, tuple[str, ...]] = {
     "quanta_exposure": ("%", "e-"),
+    "charge_rate": ("%",),
     "dark_current": ("%",),
     "conversion_gain": ("%", "e-/DN"),
     "bias": ("e-", "DN"),
@@ -47,7 +49,7 @@ class Target:
     @property
     def shared(self) -> bool:
         """Whether all samples of a pixel share the parameter."""
-        return self.name not in ("quanta_exposure", "dark_current")
+        return self.name not in ("quanta_exposure", *CHARGE_RATES)
 
     def gradient(self, point: Point) -> FloatArray:
         """Return the derivative of the parameter by the coordinates of the information, shape (4,).
@@ -56,7 +58,7 @@ class Target:
         """
         return {
             "quanta_exposure": np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0]),
-            "dark_current": np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0]),
+            **dict.fromkeys(CHARGE_RATES, np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0])),
             "conversion_gain": np.array([0.0, 1.0, 0.0, 0.0]),
             "bias": np.array([0.0, 0.0, 1.0, 0.0]),
             "read_noise_dn": np.array([0.0, 0.0, 0.0, 1.0]),

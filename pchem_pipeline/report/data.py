@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
@@ -38,16 +39,16 @@ FloatArray = NDArray[np.float64]
 FEW_CHANNELS = 32
 
 #: The maps of Appendix C, in the order of the paper.
-MAP_NAMES = ("dark_current", "conversion_gain", "bias", "read_noise_e")
+MAP_NAMES = (*CHARGE_RATES, "conversion_gain", "bias", "read_noise_e")
 
-#: Maps of the line through several exposures, beside the dark current.
+#: Maps of the line through several exposures, beside the charge rate.
 LINE_MAPS = ("charge_per_level", "spurious_charge")
 
 #: Order of the axis ``channel`` of the arrays of a verdict.
 CHANNELS = ("charge", "readout")
 
 #: The parts of a report that a run may lack; the keys of ``ReportData.missing``.
-PARTS = ("pixels", "maps", "dark_current", "ensemble", "nuced", "electrons", "components", "truth", "methods")
+PARTS = ("pixels", "maps", "charge_rate", "ensemble", "nuced", "electrons", "components", "truth", "methods")
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,14 @@ class Sample:
         bias: it holds no electrons.
         n_frames: frames.
         integration_time: s, as its run says; None where it does not.
+        kind: dark, light or unknown, as its run says.
     """
 
     name: str
     bias: bool
     n_frames: int
     integration_time: float | None
+    kind: str = "unknown"
 
 
 @dataclass(frozen=True)

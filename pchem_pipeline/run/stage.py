@@ -174,6 +174,13 @@ class StageContext:
         return SensorInfo.read(self.store)
 
     @property
+    def charge_rate(self) -> str:
+        """Name of the map of charge over time: ``dark_current`` where all was dark, else ``charge_rate``."""
+        exposed = [sample.kind for sample in self.sensor.samples if not sample.bias]
+        kinds = exposed if self.config.input.kind == "unknown" and exposed else [self.config.input.kind]
+        return "dark_current" if all(kind == "dark" for kind in kinds) else "charge_rate"
+
+    @property
     def integration_time(self) -> float | None:
         """Seconds per frame: from the configuration, else from the files."""
         return self.config.input.integration_time or self.sensor.integration_time

@@ -69,13 +69,13 @@ def fit_inputs(context: StageContext) -> dict[str, Any]:
 def integration_time(context: StageContext) -> dict[str, Any]:
     """Return what the files may say and the settings of the maps do not: time, or the samples' exposures."""
     if not context.config.input.samples:
-        return {"integration_time": context.integration_time}
+        return {"integration_time": context.integration_time, "rate": context.charge_rate}
     from pchem_pipeline.stages.samples import exposure_axis
 
     settings = context.config.input
     x = exposure_axis(settings, context.sensor.samples)
     known = None if x is None else [None if math.isnan(each) else each for each in x.tolist()]
-    return {"against": settings.against, "exposures": known}
+    return {"against": settings.against, "exposures": known, "rate": context.charge_rate}
 
 
 def verdict(context: StageContext) -> dict[str, str] | None:

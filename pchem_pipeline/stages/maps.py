@@ -16,7 +16,7 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery, poores
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
-from pchem_pipeline.model.maps.sample_maps import LINE_MAPS, line_maps
+from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.store.files import without_nan
@@ -28,15 +28,18 @@ if TYPE_CHECKING:
 __all__ = ["maps_tile", "run"]
 
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
-_NO_TIME = "integration time is not known: no dark current; give input.integration_time, s"
+_NO_TIME = "integration time is not known: no charge rate; give input.integration_time, s"
 
 
-def maps_tile(fit: Mapping[str, NDArray[Any]], integration_time: float | None) -> dict[str, NDArray[Any]]:
+def maps_tile(
+    fit: Mapping[str, NDArray[Any]], integration_time: float | None, rate: str = "charge_rate"
+) -> dict[str, NDArray[Any]]:
     """Return all maps of a tile.
 
     Args:
         fit: the arrays of the group ``fit`` of the tile, by name.
         integration_time: s, or None.
+        rate: name of H over the integration time.
 
     Returns:
         The arrays of the group ``maps`` of the tile, by name.
@@ -45,12 +48,12 @@ def maps_tile(fit: Mapping[str, NDArray[Any]], integration_time: float | None) -
     maps: dict[str, NDArray[Any]] = dict(parameters)
     maps |= {f"{name}_stderr": fit[f"{name}_stderr"] for name in PARAMETERS}
     stderr = np.stack([fit[f"{name}_stderr"] for name in PARAMETERS], axis=-1)
-    maps |= derived_maps(parameters, covariance_from(stderr, fit["correlation"]), integration_time)
+    maps |= derived_maps(parameters, covariance_from(stderr, fit["correlation"]), integration_time, rate)
     for name in (path for each in INTERVALS for path in interval_names(each)):
         if name in fit:
             maps[name] = fit[name]
     if integration_time is not None and "quanta_exposure_low" in fit:
-        ends = zip(interval_names("dark_current"), interval_names("quanta_exposure"), strict=True)
+        ends = zip(interval_names(rate), interval_names("quanta_exposure"), strict=True)
         maps |= {name: fit[source] / integration_time for name, source in ends}
     maps["quality"] = quality_map(fit["fit_status"], fit["conversion_gain"])
     return maps
@@ -63,8 +66,8 @@ def run(context: StageContext) -> None:
         StoreError: the fit is missing, or the store refuses.
     """
     time, line = context.integration_time, _line(context)
-    of_time = ("dark_current",) if time is not None and line is None else ()
-    names = [*_SUMMARISED, *(of_time if line is None else LINE_MAPS[line.against])]
+    of_time = (context.charge_rate,) if time is not None and line is None else ()
+    names = [*_SUMMARISED, *(of_time if line is None else line.names)]
     context.create_maps([f"maps/{name}" for each in names for name in (each, f"{each}_stderr")])
     ends = [path for each in (*INTERVALS, *of_time) for path in interval_names(each)]
     if context.store.has(f"fit/{ends[0]}"):
@@ -74,23 +77,27 @@ def run(context: StageContext) -> None:
         _create_residuals(context, len(line.x))
     elif time is None and not context.sensor.samples:
         context.note(_NO_TIME)
-    task = functools.partial(_do_tile, store=context.store.path, integration_time=time, line=line)
+    task = functools.partial(
+        _do_tile, store=context.store.path, integration_time=time, rate=context.charge_rate, line=line
+    )
     context.run_units(context.tiles(), task, needs="fit")
     _summarise(context, names)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """What the exposures of several samples are drawn against, and where each stands (NaN: nowhere)."""
+    """What slope and offset of several samples are called, and where each stands (NaN: nowhere)."""
 
-    against: str
+    names: tuple[str, ...]
     x: tuple[float, ...]
 
 
 def _line(context: StageContext) -> _Line | None:
     settings = context.config.input
     x = exposure_axis(settings, context.sensor.samples) if context.sensor.samples else None
-    return None if x is None else _Line(settings.against, tuple(x.tolist()))
+    return (
+        None if x is None else _Line(line_map_names(settings.against, context.charge_rate), tuple(x.tolist()))
+    )
 
 
 def _create_residuals(context: StageContext, n_samples: int) -> None:
@@ -102,14 +109,14 @@ def _create_residuals(context: StageContext, n_samples: int) -> None:
 
 
 def _do_tile(
-    tile: Tile, *, store: Path, integration_time: float | None, line: _Line | None = None
+    tile: Tile, *, store: Path, integration_time: float | None, rate: str, line: _Line | None = None
 ) -> dict[str, Any]:
     opened = open_store(store)
     needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "fit_status"]
     needed += [path for name in INTERVALS for path in interval_names(name) if opened.has(f"fit/{path}")]
     fit = {name: opened.read(f"fit/{name}", tile.region) for name in needed}
     fit["correlation"] = opened.read("fit/correlation", (*tile.region, slice(None)))
-    for name, values in maps_tile(fit, integration_time).items():
+    for name, values in maps_tile(fit, integration_time, rate).items():
         opened.write(f"maps/{name}", tile.region, values)
     if line is not None:
         _write_line(opened, tile, line)
@@ -122,7 +129,7 @@ def _write_line(store: RunStore, tile: Tile, line: _Line) -> None:
     exposure = store.read("samples/quanta_exposure", cube).reshape(len(line.x), -1).T
     covariance = store.read("samples/covariance", tile.region)
     maps, left = line_maps(
-        exposure, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.against
+        exposure, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.names
     )
     for name, values in maps.items():
         store.write(f"maps/{name}", tile.region, values.reshape(tile.shape))

@@ -178,7 +178,7 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray
         time = sample.integration_time if given.integration_time is None else given.integration_time
         if time is None:
             raise ConfigError(
-                f"{where} has no integration time, so there is no slope for the dark current; "
+                f"{where} has no integration time, so there is no slope for the charge rate; "
                 "give integration_time, s, or set input.against: none"
             )
         found[i] = time
@@ -207,7 +207,13 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
 
 def _sample(settings: InputSettings, i: int, found: OpenSample) -> Sample:
     bias = settings.samples[i].bias
-    return Sample(found.store.path.name, bias, found.sensor.n_frames, found.integration_time)
+    return Sample(
+        found.store.path.name,
+        bias,
+        found.sensor.n_frames,
+        found.integration_time,
+        found.target.config.input.kind,
+    )
 
 
 def shown_sample(settings: InputSettings) -> int:

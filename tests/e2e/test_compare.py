@@ -107,10 +107,10 @@ def other_capture(store, *, exposure=1.0, seed=1):
         "bias",
         "read_noise_dn",
         "read_noise_e",
-        "dark_current",
+        "charge_rate",
     ):
         values, error = store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
-        factor = exposure if name in ("quanta_exposure", "dark_current") else 1.0
+        factor = exposure if name in ("quanta_exposure", "charge_rate") else 1.0
         values = factor * values + np.sqrt(2) * error * rng.standard_normal(values.shape)
         store.write(f"maps/{name}", whole(store, f"maps/{name}"), values)
     store.delete("maps/analog_read_noise_e")
@@ -127,11 +127,11 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     assert "Against A (a.zarr), C changed; B did not." in here(shell, "a.zarr", "b.zarr", "warm <b>.zarr")
     same, moved = numbers(shell)["comparisons"]
     assert not same["changed"]
-    assert moved["maps"]["dark_current"]["reasons"]["shifted"]
+    assert moved["maps"]["charge_rate"]["reasons"]["shifted"]
     assert not any(moved["maps"]["bias"]["reasons"].values())
     # 20 % of the exposure is many standard errors: the test can fail
-    z = moved["maps"]["dark_current"]["median_z"] / np.sqrt(
-        np.pi / (2 * moved["maps"]["dark_current"]["n_counted"])
+    z = moved["maps"]["charge_rate"]["median_z"] / np.sqrt(
+        np.pi / (2 * moved["maps"]["charge_rate"]["n_counted"])
     )
     assert z > 20
     page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 NY, NX = 70, 90
-PANEL = ("quanta_exposure", "dark_current", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
+PANEL = ("quanta_exposure", "charge_rate", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 HOSTILE = '<script>window.hit = 1</script><img src=x onerror="window.hit = 2">'
 
 

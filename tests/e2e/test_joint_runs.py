@@ -142,7 +142,7 @@ def test_nothing_is_done_twice_and_tiles_do_not_matter(joint):
     target, is_new = find_joint([joint / "dark.zarr"])
     assert not is_new
     record = store.records.read("fit")
-    run_joint(target, QUIET)
+    run_joint(target, QUIET, print)
     assert store.records.read("fit") == record
     four = [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "bias: true")]
     other = fit(write(joint, "wide", four, tile=16))

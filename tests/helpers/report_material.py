@@ -147,8 +147,8 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
         error = relative[name] * np.abs(values)
         maps[name] = np.where(bad, np.nan, values + error * rng.standard_normal(shape))
         maps[f"{name}_stderr"] = np.where(bad, np.nan, error)
-    maps["dark_current"] = maps["quanta_exposure"] / 4.87
-    maps["dark_current_stderr"] = maps["quanta_exposure_stderr"] / 4.87
+    maps["charge_rate"] = maps["quanta_exposure"] / 4.87
+    maps["charge_rate_stderr"] = maps["quanta_exposure_stderr"] / 4.87
     status = np.where(bad, int(FitStatus.TOO_FEW_BINS), 0).astype(np.uint16)
     status[bad & (rng.random(shape) < 0.5)] = int(FitStatus.GAIN_NOT_IDENTIFIED)
     status[~bad & (rng.random(shape) < 0.01)] |= int(FitStatus.POOR_FIT)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
-from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.commands.compare.arrays import compare_arrays
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
@@ -34,7 +34,7 @@ from pchem_pipeline.store.run_store import RunStore
 __all__ = ["MAPS", "compare_runs", "comparison_of"]
 
 #: The maps that are compared.
-MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", "dark_current")
+MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
 
 _ENSEMBLE = (
     "dn",

@@ -15,7 +15,7 @@ __all__ = ["settings_that_differ", "versions_that_differ"]
 
 
 #: Settings that decide results by another way than a stage's list.
-_BESIDE = {"input.integration_time": ("maps",), "input.files": ("ingest",)}
+_BESIDE = {"input.integration_time": ("maps",), "input.kind": ("maps",), "input.files": ("ingest",)}
 
 
 def settings_that_differ(one: RunConfig, other: RunConfig) -> list[Setting]:

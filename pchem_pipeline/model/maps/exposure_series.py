@@ -1,4 +1,4 @@
-"""A straight line through the exposures of a pixel: dark current, spurious charge, and how linear it is."""
+"""A straight line through the exposures of a pixel: charge rate, spurious charge, and how linear it is."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ExposureLine:
     """``H_j = slope x_j + offset`` in n pixels; NaN where a pixel has no exposures.
 
     Attributes:
-        slope: e- per unit of x: the dark current i_d, e-/px/s, where x is the integration time; shape (n,).
+        slope: e- per unit of x: the charge rate, e-/px/s, where x is the integration time; shape (n,).
         offset: e-: charge that does not grow with x (spurious charge), shape (n,).
         covariance: of slope and offset, shape (n, 2, 2).
         residual: H_j minus the line, e-, shape (n, J).

@@ -59,21 +59,25 @@ class MapSummary:
 
 
 def derived_maps(
-    parameters: Mapping[str, FloatArray], covariance: FloatArray, integration_time: float | None
+    parameters: Mapping[str, FloatArray],
+    covariance: FloatArray,
+    integration_time: float | None,
+    rate: str = "charge_rate",
 ) -> dict[str, FloatArray]:
-    """Derive dark current and read noise in electrons, with standard errors by the delta method.
+    """Derive charge rate and read noise in electrons, with standard errors by the delta method.
 
-    ``sigma_e- = sigma g`` and ``i_d = H / t_int`` (Hendrickson et al. 2023, Sec. IV). The analog read
-    noise is ``sigma_R = g sqrt(sigma^2 - 1/12)`` (below eq. X_density): NaN where the estimate is below
-    rounding alone.
+    ``sigma_e- = sigma g`` and ``i_d = H / t_int``, which in the dark is the dark current (Hendrickson et al.
+    2023, Sec. IV). The analog read noise is ``sigma_R = g sqrt(sigma^2 - 1/12)`` (below eq. X_density): NaN
+    where the estimate is below rounding alone.
 
     Args:
         parameters: the four maps by name (``variables.PARAMETERS``), each of one shape.
         covariance: covariance of (H, g, mu, sigma), shape (..., 4, 4).
-        integration_time: t_int, s; None leaves out the dark current.
+        integration_time: t_int, s; None leaves out the rate.
+        rate: name of H / t_int: ``charge_rate``, in the dark ``dark_current``.
 
     Returns:
-        ``read_noise_e``, ``analog_read_noise_e``, ``dark_current``, each with ``<name>_stderr``.
+        ``read_noise_e``, ``analog_read_noise_e`` and the rate, each with ``<name>_stderr``.
     """
     gain, sigma = parameters["conversion_gain"], parameters["read_noise_dn"]
     analog_variance = sigma**2 - QUANTISATION_VARIANCE
@@ -87,8 +91,8 @@ def derived_maps(
         "analog_read_noise_e_stderr": _delta(analog, slope, covariance),
     }
     if integration_time is not None:
-        maps["dark_current"] = parameters["quanta_exposure"] / integration_time
-        maps["dark_current_stderr"] = _root(covariance[..., 0, 0]) / integration_time
+        maps[rate] = parameters["quanta_exposure"] / integration_time
+        maps[f"{rate}_stderr"] = _root(covariance[..., 0, 0]) / integration_time
     return maps
 
 

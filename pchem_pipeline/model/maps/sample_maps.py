@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,16 +10,21 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.exposure_series import exposure_line
 
-__all__ = ["LINE_MAPS", "line_maps", "own_variance"]
+__all__ = ["line_map_names", "line_maps", "own_variance"]
 
 FloatArray = NDArray[np.float64]
 
-#: Names of slope and offset of the exposures against what they are drawn over.
-LINE_MAPS: dict[str, tuple[str, ...]] = {
-    "integration_time": ("dark_current", "spurious_charge"),
-    "light_level": ("charge_per_level", "spurious_charge"),
-    "none": (),
-}
+
+def line_map_names(against: str, rate: str) -> tuple[str, ...]:
+    """Return the names of slope and offset of the exposures against what they are drawn over.
+
+    Args:
+        against: integration_time, light_level or none.
+        rate: name of the slope over time: ``charge_rate``, in the dark ``dark_current``.
+    """
+    if against == "none":
+        return ()
+    return rate if against == "integration_time" else "charge_per_level", "spurious_charge"
 
 
 def own_variance(covariance: FloatArray) -> FloatArray:
@@ -50,7 +56,7 @@ def own_variance(covariance: FloatArray) -> FloatArray:
 
 
 def line_maps(
-    exposure: FloatArray, covariance: FloatArray, x: FloatArray, against: str
+    exposure: FloatArray, covariance: FloatArray, x: FloatArray, names: Sequence[str]
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return the line through the exposures of each pixel, and what is left of them.
 
@@ -58,7 +64,7 @@ def line_maps(
         exposure: H of n pixels in J samples, e-, shape (n, J).
         covariance: of (H_1 ... H_J, g, mu, sigma), shape (n, J + 3, J + 3).
         x: integration times (s) or light levels of the samples, NaN for those without electrons, shape (J,).
-        against: which of the two; a key of :data:`LINE_MAPS`.
+        names: of slope and offset, as of :func:`line_map_names`.
 
     Returns:
         Slope and offset with standard errors, (n,), by name; and the residuals (n, J) with theirs, chi-square
@@ -68,7 +74,7 @@ def line_maps(
     own = own_variance(covariance)[:, use]
     line = exposure_line(exposure[:, use], covariance[:, use][:, :, use], own, x[use])
     maps: dict[str, NDArray[Any]] = {}
-    for i, (name, values) in enumerate(zip(LINE_MAPS[against], (line.slope, line.offset), strict=True)):
+    for i, (name, values) in enumerate(zip(names, (line.slope, line.offset), strict=True)):
         maps[name], maps[f"{name}_stderr"] = values, np.sqrt(line.covariance[:, i, i])
     left: dict[str, NDArray[Any]] = {"linearity_chi2": line.chi2, "linearity_p": line.p}
     residuals = {"linearity_residual": line.residual, "linearity_residual_stderr": line.residual_stderr}

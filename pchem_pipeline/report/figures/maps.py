@@ -32,7 +32,8 @@ _STRIP = 2
 _LONGEST_RATIO = 4.0
 
 _CAPTIONS = {
-    "dark_current": "Dark current: quanta exposure over integration time.",
+    "charge_rate": "Charge rate: quanta exposure over integration time; what made the charge is not said.",
+    "dark_current": "Dark current: quanta exposure over integration time, in the dark.",
     "conversion_gain": "Conversion gain: electrons per digital number.",
     "bias": "Bias: the digital number at zero electrons.",
     "read_noise_e": "Read noise in electrons, quantisation included.",

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
@@ -17,10 +18,10 @@ from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.style import Drawing, Look, colours_of, note, styled
 from pchem_pipeline.report.style.wording import measured, short, symbol
 
-#: Label, unit and noun of what the exposures are drawn against, and the map of the slope.
+#: Label and unit of what the exposures are drawn against, and the maps that their slope may be.
 AXES = {
-    "integration_time": ("integration time", "s", "dark current", "dark_current"),
-    "light_level": ("light level", "", "charge per light level", "charge_per_level"),
+    "integration_time": ("integration time", "s", CHARGE_RATES),
+    "light_level": ("light level", "", ("charge_per_level",)),
 }
 
 _LINE_CAPTION = (
@@ -38,9 +39,10 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     samples = data.samples
     if samples is None or samples.against not in AXES:
         return []
-    words, _unit, noun, slope = AXES[samples.against]
-    if not data.has_values(slope) or not samples.on_line:
+    slope = slope_of(data)
+    if slope is None or not samples.on_line:
         return []
+    words, noun = AXES[samples.against][0], symbol(slope)[1]
     table = exposure_table(samples)
     line = _median(data.maps[slope]), _median(data.maps["spurious_charge"])
     centre, error, _low, _high = middle(data.maps[slope])
@@ -55,6 +57,13 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             partial(draw_exposures, table=table, line=line),
         )
     ]
+
+
+def slope_of(data: ReportData) -> str | None:
+    """Return the name of the map of the slope of the exposures; None where there is none."""
+    if data.samples is None or data.samples.against not in AXES:
+        return None
+    return next((name for name in AXES[data.samples.against][2] if data.has_values(name)), None)
 
 
 def transfer_figures(data: ReportData, _: ReportSettings) -> list[Figure]:

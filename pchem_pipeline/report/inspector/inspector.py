@@ -28,6 +28,7 @@ _CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
 #: Values in the table of a pixel, in its order; the others follow below.
 PANEL_MAPS = (
     "maps/quanta_exposure",
+    "maps/charge_rate",
     "maps/dark_current",
     "maps/conversion_gain",
     "maps/bias",

@@ -13,13 +13,14 @@ from functools import partial
 from typing import Any
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.samples import AXES
+from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import Table, provenance_tables
 from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.wording import symbol
 
 #: (id, heading, introduction, parts that may be missing) of the sections that show figures.
 SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
@@ -74,7 +75,7 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         "Histogram and map of each parameter. Structure in a map points to the architecture of the sensor.",
         (
             "maps",
-            "dark_current",
+            "charge_rate",
         ),
     ),
     (
@@ -235,7 +236,9 @@ def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> 
         intro = f"{intro} {MAP_READING[reading]}"
     if id_ == "exposures" and data.samples is not None:
         words = AXES.get(data.samples.against)
-        intro = intro.format(against=words[0], noun=words[2]) if words else _NO_LINE
+        slope = slope_of(data)
+        noun = symbol(slope)[1] if slope else "charge"
+        intro = intro.format(against=words[0], noun=noun) if words else _NO_LINE
     content = {"intro": intro, "missing": missing, "pictures": shown, "tables": tables}
     return Section(id_, title, "figures", content)
 

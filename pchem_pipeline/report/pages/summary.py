@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.model.fit.status import FLAGGED
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.report.data import ReportData
@@ -19,7 +20,7 @@ from pchem_pipeline.report.style.wording import count, measured, percent, scient
 
 Level = Literal["good", "note", "caution", "serious"]
 
-_KEY_MAPS = ("read_noise_e", "conversion_gain", "dark_current", "quanta_exposure", "bias")
+_KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
 
 #: Ratio of an RMSE to that of sampling noise alone up to which the model explains the data, and from which
 #: it clearly does not.
@@ -148,7 +149,7 @@ def _medians(data: ReportData) -> str:
             "those of the others would be of pixels that chance chose."
         )
     parts = []
-    for name in ("read_noise_e", "conversion_gain", "dark_current"):
+    for name in ("read_noise_e", "conversion_gain", *CHARGE_RATES):
         if data.has_values(name):
             summary = map_summary(data, name)
             unit = symbol(name)[2]
@@ -302,7 +303,7 @@ def _quick_look(data: ReportData) -> list[Flag]:
 def _conditions(data: ReportData) -> list[Flag]:
     found = [
         Flag("note", _as_sentence(data.missing[part]))
-        for part in ("dark_current", "ensemble")
+        for part in ("charge_rate", "ensemble")
         if part in data.missing
     ]
     noisy = data.has_values("read_noise_e") and map_summary(data, "read_noise_e").median > _TOO_NOISY
@@ -325,11 +326,11 @@ def _conditions(data: ReportData) -> list[Flag]:
                     f"Stage {stage.get('stage')} is {stage['state']}: the report shows a part only.",
                 )
             )
-        # why there is no dark current is said once, with what is missing
+        # why there is no charge rate is said once, with what is missing
         found += [
             Flag("note", _as_sentence(f"{stage.get('stage')}: {remark}"))
             for remark in stage.get("notes", ())
-            if not ("dark_current" in data.missing and "no dark current" in remark)
+            if not ("charge_rate" in data.missing and "no charge rate" in remark)
         ]
     return list(dict.fromkeys(found))
 

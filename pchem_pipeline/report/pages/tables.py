@@ -196,6 +196,7 @@ def _channels(data: ReportData) -> Table:
 
 _ORDER = (
     "quanta_exposure",
+    "charge_rate",
     "dark_current",
     "charge_per_level",
     "spurious_charge",

@@ -36,6 +36,7 @@ _SYMBOLS = {
     "read_noise_dn": (r"$\sigma$", "read noise", "DN"),
     "read_noise_e": (r"$\sigma_{\mathrm{e}^-}$", "read noise", "e-"),
     "analog_read_noise_e": (r"$\sigma_R$", "analog read noise", "e-"),
+    "charge_rate": (r"$H/t$", "charge rate", "e-/px/s"),
     "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
     "spurious_charge": (r"$H_0$", "spurious charge", "e-"),
     "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),

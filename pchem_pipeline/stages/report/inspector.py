@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import quoted
-from pchem_pipeline.base.variables import VARIABLES, Variable
+from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map
@@ -61,6 +61,8 @@ _FIRST = (
     "maps/conversion_gain_stderr",
     "maps/quanta_exposure",
     "maps/quanta_exposure_stderr",
+    "maps/charge_rate",
+    "maps/charge_rate_stderr",
     "maps/dark_current",
     "maps/dark_current_stderr",
     "maps/bias",
@@ -206,9 +208,10 @@ def _median(values: NDArray[Any]) -> float:
 
 def _multiple_of_exposure(store: RunStore, variable: Variable) -> tuple[str, float] | None:
     """Return the map of H, or of its error, with the factor that makes it this one; None for other maps."""
-    if not variable.path.startswith("maps/dark_current"):
+    rate = next((name for name in CHARGE_RATES if variable.path.startswith(f"maps/{name}")), None)
+    if rate is None:
         return None
-    other = variable.path.replace("dark_current", "quanta_exposure")
+    other = variable.path.replace(rate, "quanta_exposure")
     if not store.has(other):
         return None
     current, exposure = store.read(variable.path), store.read(other)

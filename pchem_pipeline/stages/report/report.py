@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
@@ -317,11 +317,11 @@ def _input_text(sensor: SensorInfo) -> str:
 def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]:
     """Say why parts are left out."""
     found: dict[str, str] = {}
-    if "dark_current" not in maps:
-        found["dark_current"] = (
-            "no dark current: the samples are not drawn over their integration time (input.against)"
+    if not set(CHARGE_RATES) & maps.keys():
+        found["charge_rate"] = (
+            "no charge rate: the samples are not drawn over their integration time (input.against)"
             if run.sensor.samples
-            else "no dark current, since the integration time is not known; set input.integration_time (s)"
+            else "no charge rate, since the integration time is not known; set input.integration_time (s)"
         )
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"

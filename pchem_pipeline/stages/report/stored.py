@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.base.variables import (
+    CHARGE_RATES,
+    FREE_SATELLITES,
+    INTERVALS,
+    PARAMETERS,
+    interval_names,
+    variables_of,
+)
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import model_of, read_added_exposure
@@ -136,7 +143,7 @@ def read_run(store: RunStore) -> StoredRun:
         # only what has a value can agree with its model or not
         failed = (fit["fit_status"] & int(FAILED)) != 0
         fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
-    ends = {name: interval_names(name) for name in (*INTERVALS, "dark_current")}
+    ends = {name: interval_names(name) for name in (*INTERVALS, *CHARGE_RATES)}
     found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
     shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}
     return StoredRun(

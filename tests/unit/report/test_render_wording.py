@@ -96,6 +96,7 @@ def test_the_units_of_maps_are_those_of_the_store() -> None:
         "bias",
         "read_noise_dn",
         "read_noise_e",
+        "charge_rate",
         "dark_current",
     ):
         assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit)

@@ -27,6 +27,7 @@ from pchem_pipeline.report.settings import ReportSettings
 NOT_HERE = {
     "exposures",
     "photon_transfer",
+    "map_dark_current",
     "map_charge_per_level",
     "map_spurious_charge",
     "methods_gain_error",
@@ -250,8 +251,8 @@ def all_failed() -> ReportData:
 
 def channels() -> ReportData:
     data = report_data((1, 5))
-    maps = {name: values for name, values in data.maps.items() if "dark" not in name}
-    missing = {"dark_current": "no integration time", "ensemble": "no frames", "electrons": "no frames"}
+    maps = {name: values for name, values in data.maps.items() if "charge_rate" not in name}
+    missing = {"charge_rate": "no integration time", "ensemble": "no frames", "electrons": "no frames"}
     return replace(
         data,
         maps=maps,
@@ -289,7 +290,7 @@ def test_ready_made_histograms_are_channels_and_say_what_is_left_out() -> None:
     assert "4 far <red>" in page.text
     assert "Left out: no integration time" in page.text
     assert "Left out: no frames" in page.text
-    assert "dark_current" not in [str(a["id"]).removeprefix("figure-map_") for a in page.of("figure")]
+    assert "charge_rate" not in [str(a["id"]).removeprefix("figure-map_") for a in page.of("figure")]
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -20,11 +20,16 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.electrons.electrons import NO_NUMBER, electron_numbers
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.pages.summary import key_numbers, sentence
+from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
+from pchem_pipeline.stages.report.report import report_data
+from pchem_pipeline.stages.report.stored import read_run
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
@@ -137,7 +142,7 @@ def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
         assert np.isnan(found[FAILED_PIXEL])
         np.testing.assert_array_equal(np.delete(found, 3, 0), np.delete(truth[name], 3, 0))
     np.testing.assert_allclose(
-        np.delete(store.read("maps/dark_current"), 3, 0), np.delete(truth["quanta_exposure"] / 4.87, 3, 0)
+        np.delete(store.read("maps/charge_rate"), 3, 0), np.delete(truth["quanta_exposure"] / 4.87, 3, 0)
     )
     quality = store.read("maps/quality")
     assert (quality[0, 0], quality[FAILED_PIXEL], quality[1, 1]) == (1, 2, 0)
@@ -145,10 +150,10 @@ def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
     assert attributes["summary"]["read_noise_e"]["n_missing"] == 1
     assert attributes["fit_status"]["not_converged"] == 1
     assert attributes["fit_status"]["ok"] == NY * NX - 2
-    assert store.array("maps/dark_current").attrs["units"] == "e-/px/s"
+    assert store.array("maps/charge_rate").attrs["units"] == "e-/px/s"
 
 
-def test_no_integration_time_means_no_dark_current(prepared: Path, tmp_path: Path) -> None:
+def test_no_integration_time_means_no_charge_rate(prepared: Path, tmp_path: Path) -> None:
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path)
     write_fit(context)
@@ -158,8 +163,29 @@ def test_no_integration_time_means_no_dark_current(prepared: Path, tmp_path: Pat
         update={"input": context.config.input.model_copy(update={"integration_time": None})}
     )
     assert execute("maps", context).state == "complete"
-    assert not context.store.has("maps/dark_current")
+    assert not context.store.has("maps/charge_rate")
     assert "integration_time" in context.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
+def test_dark_current_is_of_the_dark_alone(prepared: Path, tmp_path: Path, kind: str) -> None:
+    fresh_copy(prepared, tmp_path)
+    write_fit(make_context(tmp_path))
+    execute("maps", make_context(tmp_path))
+    context = make_context(tmp_path, input={"kind": kind})
+    wanted, other = ("dark_current", "charge_rate") if kind == "dark" else ("charge_rate", "dark_current")
+    state = status(STAGES["maps"], context)
+    assert state.words() == (
+        "stale - input.rate charge_rate -> dark_current" if kind == "dark" else "complete"
+    )
+    assert execute("maps", context).state == "complete"
+    assert context.store.has(f"maps/{wanted}")
+    assert not context.store.has(f"maps/{other}")
+    assert wanted in context.store.attributes("maps")["summary"]
+    data = report_data(read_run(context.store), context.config, context.integration_time, [])
+    words = wanted.replace("_", " ")
+    assert words in sentence(data)
+    assert [number.label for number in key_numbers(data) if number.name == wanted] == [words]
 
 
 def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
@@ -421,7 +447,7 @@ def test_export(finished: StageContext, tmp_path: Path) -> None:
     with (tmp_path / "out" / "summary.csv").open() as file:
         rows = {row["map"]: row for row in csv.DictReader(file)}
     assert float(rows["conversion_gain"]["median"]) == pytest.approx(np.nanmedian(gain))
-    assert rows["dark_current"]["unit"] == "e-/px/s"
+    assert rows["charge_rate"]["unit"] == "e-/px/s"
     assert rows["bias"]["n_missing"] == "1"
     with (tmp_path / "out" / "fit_status.csv").open() as file:
         assert {row["fit_status"]: row["pixels"] for row in csv.DictReader(file)}["poor_fit"] == "1"

@@ -91,9 +91,9 @@ def test_what_does_not_fit_is_left_to_the_server(
     assert set(shown.sample.exact) == {*here, *alike}
 
 
-def test_the_dark_current_costs_nothing(store: RunStore, data: ReportData) -> None:
+def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> None:
     shown = inspector_of(store, data.maps, data.fit)
-    entry = next(each for each in shown.maps if each.path == "maps/dark_current")
+    entry = next(each for each in shown.maps if each.path == "maps/charge_rate")
     assert entry.packed is None
     assert entry.same_as == ("maps/quanta_exposure", pytest.approx(1 / 4.87))
 

@@ -97,6 +97,7 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     assert execute("report", context).state == "complete"
     store = folder / "run.zarr"
     of_others = {"exposures", "photon_transfer", "map_charge_per_level", "map_spurious_charge"}
+    of_others |= {"map_dark_current"}
     of_others |= {"methods_gain_error", *(name for _, name in DISCREPANCY_FIGURES)}
     names = {f"{name}.svg" for name in set(FIGURE_NAMES) - of_others}
     assert {path.name for path in (store / "figures").iterdir()} == names
@@ -162,11 +163,11 @@ def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
 def test_what_a_run_lacks_is_said(folder: Path) -> None:
     context = make_context(folder)
     context.store.delete("ensemble")
-    for name in ("maps/dark_current", "maps/dark_current_stderr"):
+    for name in ("maps/charge_rate", "maps/charge_rate_stderr"):
         context.store.delete(name)
     data = gather(context.store, context.config, None, [])
-    assert set(data.missing) == {"dark_current", "ensemble", "nuced", "electrons", "components", "methods"}
-    assert "input.integration_time" in data.missing["dark_current"]
+    assert set(data.missing) == {"charge_rate", "ensemble", "nuced", "electrons", "components", "methods"}
+    assert "input.integration_time" in data.missing["charge_rate"]
 
 
 def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:

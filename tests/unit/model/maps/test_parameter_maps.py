@@ -47,7 +47,7 @@ def numeric_stderr(function: object, covariance: np.ndarray, at: np.ndarray) -> 
 FUNCTIONS = {
     "read_noise_e": lambda h, g, mu, s: g * s,
     "analog_read_noise_e": lambda h, g, mu, s: g * np.sqrt(s * s - 1 / 12),
-    "dark_current": lambda h, g, mu, s: h / 4.87,
+    "charge_rate": lambda h, g, mu, s: h / 4.87,
 }
 
 
@@ -68,7 +68,7 @@ def test_noise_below_rounding_has_no_analog_part() -> None:
     assert np.isnan(maps["analog_read_noise_e"]).all()
     assert np.isnan(maps["analog_read_noise_e_stderr"]).all()
     assert maps["read_noise_e"][0, 0] == pytest.approx(0.028)
-    assert "dark_current" not in maps
+    assert "charge_rate" not in maps
 
 
 def test_quality_follows_the_status() -> None:
