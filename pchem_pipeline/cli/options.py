@@ -123,6 +123,12 @@ def region_of(text: str | None) -> tuple[int, int, int, int] | None:
         (y0, y1), (x0, x1) = (map(int, part.split(":")) for part in text.split(","))
     except ValueError:
         raise ConfigError(f"--roi {text!r}: write y0:y1,x0:x1 in pixels, such as 0:128,64:192") from None
+    for name, first, end in (("y", y0, y1), ("x", x0, x1)):
+        if not 0 <= first < end:
+            raise ConfigError(
+                f"--roi {text}: {name} goes from {first} to {end}, which holds no pixel; write y0:y1,x0:x1 "
+                "with 0 <= y0 < y1 and 0 <= x0 < x1, ends excluded, such as 0:128,64:192"
+            )
     return y0, y1, x0, x1
 
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
+from pchem_pipeline.commands.new_run import other_settings
 from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.target import Target, find_run
@@ -53,10 +54,7 @@ def find_joint(
         find_run(each)
     text, is_new = dump_config(config), write and not path.exists()
     if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise ConfigError(
-            f"{path} exists with other settings; use them with: pchem joint {quoted(path)}, "
-            "or choose another --store"
-        )
+        raise ConfigError(other_settings(path, config, "joint"))
     if write:
         write_atomic(path, text.encode())
     return Target(config, path.parent, place, path), is_new

@@ -35,8 +35,7 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     values = dict(given)
     if "with_runs" in values:
         values["with_runs"] = tuple(str(Path(path).resolve()) for path in values["with_runs"])
-    if values:
-        target = target.changed("methods", **values)
+    changed = target.changed("methods", **values)  # says what is wrong with them
     if not (target.store / "zarr.json").exists():
         raise StoreError(
             f"{target.store} does not exist; run: pchem run {quoted(target.config_path or target.store)}"
@@ -44,8 +43,9 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     store = RunStore.open(target.store)
     # before anything of an earlier comparison is given up
     if store.has("histogram/counts"):
-        open_other_runs(store, target.base_dir, target.config.methods.with_runs)
-    run_stages(target, ["methods"], command)
+        open_other_runs(store, target.base_dir, changed.config.methods.with_runs)
+    chosen = replace(command.options, settings=tuple(values.items()))
+    run_stages(target, ["methods"], replace(command, options=chosen))
     if command.options.dry_run:
         return ""
     reported = {state.stage: state.state for state in run_status(target)}["report"] != "missing"

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError, quoted
-from pchem_pipeline.config.load import dump_config, make_config, parse_config
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
+from pchem_pipeline.commands.compare.settings import settings_that_differ
+from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config
 from pchem_pipeline.config.template import commented_config
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["find_or_start", "write_template"]
+__all__ = ["find_or_start", "first_try", "other_settings", "write_template"]
 
 _YAML = (".yaml", ".yml")
+#: Settings that differ, as many as a message tells.
+_SHOWN = 4
 
 
 def write_template(path: Path, files: Sequence[str], *, simulated: bool, force: bool) -> None:
@@ -78,13 +84,62 @@ def find_or_start(
     )
     text = dump_config(config)
     if path.exists() and path.read_text(encoding="utf-8") != text and not _came_to_nothing(place, path):
-        raise ConfigError(
-            f"{path} exists with other settings; use them with: pchem run {quoted(path)}, "
-            "or choose another --store"
-        )
+        raise ConfigError(other_settings(path, config, "run"))
     if write:
         write_atomic(path, text.encode())
     return Target(config, path.parent, place, path), True
+
+
+def other_settings(path: Path, config: RunConfig, command: str) -> str:
+    """Return in one line how the settings of a YAML file differ from those given, and the ways out.
+
+    Args:
+        path: the YAML file.
+        config: what was given.
+        command: the command that takes the YAML.
+
+    Raises:
+        ConfigError: the YAML is wrong.
+    """
+    differ = settings_that_differ(load_config(path), config)
+    shown = [f"{each.name} {each.one} there, {each.other} here" for each in differ[:_SHOWN]]
+    more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
+    keys = "; ".join([*shown, *more]) or "the same settings, written otherwise"
+    return (
+        f"{path} exists with other settings ({keys}); go on with those there: pchem {command} "
+        f"{quoted(path)}; or edit them there, or begin another run with --store NAME.zarr"
+    )
+
+
+@contextlib.contextmanager
+def first_try(target: Target, text: str | None) -> Iterator[None]:
+    """Write the YAML of a run; where the run is refused before any work, take away what was not there before.
+
+    Args:
+        target: the run.
+        text: of its YAML; None: it has one.
+    """
+    local = not isinstance(target.store, RemotePath)
+    had_store, path = not local or target.store.exists(), target.config_path
+    had_yaml = text is None or path is None or path.exists()
+    if text is not None and path is not None:
+        write_atomic(path, text.encode())
+    try:
+        yield
+    except (ConfigError, InputError, StoreError):
+        if not had_store and _is_empty(target.store):
+            shutil.rmtree(target.store, ignore_errors=True)
+            if not had_yaml and path is not None:
+                path.unlink(missing_ok=True)
+        raise
+
+
+def _is_empty(place: Path) -> bool:
+    """Tell whether no stage has done anything in a store, which may not exist."""
+    if not (place / ".pchem").is_dir():
+        return not place.exists()
+    records = RunStore.open(place).records
+    return all(records.read(name) is None for name in STAGES)
 
 
 def _came_to_nothing(place: Path, path: Path) -> bool:

@@ -205,7 +205,7 @@ def _region(settings: InputSettings, rows: int, columns: int) -> tuple[int, int,
     y0, y1, x0, x1 = settings.roi
     if y1 > rows or x1 > columns:
         raise InputError(
-            f"input.roi {list(settings.roi)} reaches beyond the frames of {rows} rows and {columns} "
-            "columns; correct it"
+            f"input.roi {list(settings.roi)} reaches beyond the frames of {rows} rows and {columns} columns "
+            f"(--roi {y0}:{y1},{x0}:{x1}; all of them: 0:{rows},0:{columns}); correct it"
         )
     return y0, y1, x0, x1

@@ -107,17 +107,20 @@ def _perform(
             records.forget(stage.name)  # it was refused before it began, and leaves no trace
         else:
             records.write(record)
-    return _finish(stage, context, record)
+    return _finish(stage, context, record, time.perf_counter() - wall, cpu_seconds() - cpu)
 
 
-def _finish(stage: Stage, context: StageContext, record: StageRecord) -> StageState:
-    """Say how a stage ended."""
+def _finish(
+    stage: Stage, context: StageContext, record: StageRecord, seconds: float, cpu: float
+) -> StageState:
+    """Say how a stage ended: the time of this command, and of all commands where that is longer."""
     done = len(context.store.records.done(stage.name, record.fingerprint))
+    earlier = f"; {record.seconds:.1f} s with earlier commands" if record.seconds > seconds + 0.1 else ""
     context.reporter.info(
-        f"{stage.name}: {done} of {record.keys} units in {record.seconds:.1f} s "
-        f"({record.cpu_seconds:.1f} s CPU, peak {record.peak_rss_bytes / 2**20:.0f} MiB)",
+        f"{stage.name}: {done} of {record.keys} units in {seconds:.1f} s "
+        f"({cpu:.1f} s CPU, peak {record.peak_rss_bytes / 2**20:.0f} MiB{earlier})",
         stage=stage.name,
-        seconds=record.seconds,
+        seconds=seconds,
         peak_rss_bytes=record.peak_rss_bytes,
     )
     if not context.failed:

@@ -66,12 +66,21 @@ AnyUnit = TypeVar("AnyUnit", bound=Unit)
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line adds to the configuration; none of it changes a result."""
+    """What the command line adds to the configuration.
+
+    Attributes:
+        force: do it again.
+        dry_run: say what would be done.
+        tiles: only these.
+        roi: only this region.
+        settings: of a stage on demand, in place of those of its section; None: those of its last result.
+    """
 
     force: bool = False
     dry_run: bool = False
     tiles: str | None = None
     roi: tuple[int, int, int, int] | None = None
+    settings: tuple[tuple[str, Any], ...] | None = None
 
 
 @functools.lru_cache(maxsize=8)

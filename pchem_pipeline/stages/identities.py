@@ -91,10 +91,12 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
 
 def other_samples(context: StageContext) -> dict[str, Any]:
-    """Return which other runs join a comparison of methods, and their state."""
-    from pchem_pipeline.stages.methods import other_runs
+    """Return which other runs join a comparison of methods, their state, and what the command line chose."""
+    from pchem_pipeline.stages.methods import chosen, other_runs
 
-    return {**adc_limits(context), "with_runs": other_runs.other_samples(context)}
+    given = chosen.chosen_settings(context)
+    content = {**adc_limits(context), "with_runs": other_runs.other_samples(context)}
+    return {**content, "chosen": given} if given else content
 
 
 def search_start(context: StageContext) -> dict[str, Any]:

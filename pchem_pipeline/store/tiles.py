@@ -91,6 +91,7 @@ def roi_tiles(roi: tuple[int, int, int, int], grid: list[Tile]) -> list[Tile]:
     if not tiles or y0 >= y1 or x0 >= x1 or y0 < 0 or x0 < 0:
         last = grid[-1]
         raise ConfigError(
-            f"--roi {y0}:{y1},{x0}:{x1} selects nothing of a sensor of {last.y1} x {last.x1} pixels"
+            f"--roi {y0}:{y1},{x0}:{x1} selects nothing of a sensor of {last.y1} x {last.x1} pixels "
+            f"(y x x); choose within 0:{last.y1},0:{last.x1}"
         )
     return tiles

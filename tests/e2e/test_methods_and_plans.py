@@ -52,7 +52,11 @@ def test_methods_with_other_exposures(exposures):
     page = (exposures.folder / "bright.zarr" / "report.html").read_text()
     assert "Other methods beside PCH-EM" in page
     assert transfer["title"] in page
-    assert "methods     complete" in exposures.ok("status", "bright.zarr").stdout
+    # what the command line chose stays in force, also where the YAML is asked; other settings make it anew
+    for run in ("bright.zarr", "bright.yaml"):
+        assert "methods     complete" in exposures.ok("status", run).stdout
+    again = exposures.ok("methods", "bright.yaml", "--pixels", "20", "--study-pixels", "0", "--dry-run")
+    assert "input.chosen.pixels None -> 20" in again.stderr
     # what is up to date is not done again, and a wrong sample costs nothing of it
     before = (exposures.folder / "bright.zarr" / "methods.json").stat().st_mtime_ns
     for others, words in (

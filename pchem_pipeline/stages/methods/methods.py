@@ -25,6 +25,7 @@ from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.methods.chosen import methods_settings
 from pchem_pipeline.stages.methods.other_runs import open_other_runs
 from pchem_pipeline.stages.methods.result import METHODS_FILE
 
@@ -112,7 +113,7 @@ def run(context: StageContext) -> None:
             f"{context.store.path} has several samples, fitted together; compare methods in the run of one "
             "of them, with the others beside it: pchem methods RUN --with OTHER"
         )
-    settings = context.config.methods
+    settings = methods_settings(context)
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
     n_pixels = min(settings.pixels, context.sensor.ny * context.sensor.nx)
     for name in ("pixel_y", "pixel_x"):

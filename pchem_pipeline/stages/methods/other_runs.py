@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.methods.chosen import methods_settings
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ __all__ = ["open_other_runs", "other_samples"]
 def other_samples(context: StageContext) -> dict[str, Any]:
     """Return which histograms of other runs join a comparison, for its fingerprint; never raises."""
     found: dict[str, Any] = {}
-    for name in context.config.methods.with_runs:
+    for name in methods_settings(context).with_runs:
         path = context.base_dir / name
         try:
             record = RunStore.open(path).records.read("histogram")

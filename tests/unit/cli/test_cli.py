@@ -112,6 +112,12 @@ def test_wrong_roi_shows_how(text):
         invoke("fit", "run.zarr", "--roi", text)
 
 
+@pytest.mark.parametrize("text", ["4:2,0:5", "0:4,5:5", "-1:4,0:5"])
+def test_an_empty_roi_is_told_in_the_words_of_the_option(text):
+    with pytest.raises(ConfigError, match=r"^--roi .* holds no pixel; write y0:y1,x0:x1"):
+        invoke("fit", "run.zarr", "--roi", text)
+
+
 def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert invoke("init", "c.yaml", "x.fits").stdout == "c.yaml\n"

@@ -7,9 +7,9 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.cli.app import app
-from pchem_pipeline.commands.new_run import find_or_start
+from pchem_pipeline.commands.new_run import find_or_start, first_try
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
@@ -79,3 +79,44 @@ def test_commands_in_messages_can_be_pasted(tmp_path):
     (tmp_path / "my run").mkdir()
     with pytest.raises(Exception, match=r"--store '.*my run'"):
         RunStore.open(Path(tmp_path / "my run"))
+
+
+def test_a_refused_run_says_which_keys_differ_and_the_ways_out(tmp_path, file):
+    place = tmp_path / "run.zarr"
+    target, _ = find_or_start([file], place, {"bit_depth": 8, "integration_time": 2.0})
+    RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    with pytest.raises(ConfigError) as refused:
+        find_or_start([file], place, {"bit_depth": 8, "integration_time": 4.87})
+    said = str(refused.value)
+    assert "(input.integration_time 2.0 there, 4.87 here)" in said
+    assert f"pchem run {target.config_path}" in said
+    assert "--store" in said
+
+
+@pytest.mark.parametrize("options", [(), ("--roi", "0:99,0:4")])
+def test_a_first_try_that_is_refused_leaves_nothing_behind(tmp_path, file, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    if options:
+        tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError):
+        CliRunner().invoke(app, ["run", str(file), *options], catch_exceptions=False)
+    assert sorted(tmp_path.rglob("*")) == before
+    # a YAML of one's own stays
+    (tmp_path / "own.yaml").write_text(f"input: {{files: [{file.name!r}], roi: [0, 99, 0, 4]}}\n")
+    with pytest.raises(InputError):
+        CliRunner().invoke(app, ["run", "own.yaml"], catch_exceptions=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [file.name, "own.yaml"]
+
+
+def test_a_try_that_was_refused_later_keeps_what_was_done(tmp_path, file):
+    target, _ = find_or_start([file], tmp_path / "run.zarr", {}, write=False)
+
+    def lose_a_file():
+        RunStore.create(target.store).records.write(StageRecord("ingest", 1, "f", {}, keys=4))
+        raise InputError("a file is gone")
+
+    with pytest.raises(InputError), first_try(target, dump_config(target.config)):
+        lose_a_file()
+    assert target.store.exists()
+    assert (tmp_path / "run.yaml").exists()

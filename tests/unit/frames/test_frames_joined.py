@@ -148,7 +148,7 @@ def test_range_and_region_out_of_bounds(tmp_path: Path) -> None:
     refused(
         InputSettings(files=("a.npy",), roi=(0, 18, 0, 5)),
         tmp_path,
-        r"input\.roi \[0, 18, 0, 5\] reaches beyond",
+        r"input\.roi \[0, 18, 0, 5\] reaches beyond .* \(--roi 0:18,0:5; all of them: 0:\d+,0:\d+\)",
     )
     refused(
         InputSettings(files=("a.npy",), frame_range=(0, 13)), tmp_path, r"does not hold at least 2 of the 12"
