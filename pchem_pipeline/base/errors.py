@@ -21,9 +21,25 @@ __all__ = [
     "NotBelievedError",
     "PchEmError",
     "StoreError",
+    "install_hint",
     "one_line",
     "quoted",
 ]
+
+#: Extra to the libraries that it installs, as ``pyproject.toml`` has them.
+EXTRAS = {
+    "fits": ("astropy>=6.1",),
+    "hdf5": ("h5py>=3.11", "hdf5plugin>=5.0"),
+    "cluster": ("distributed>=2025.1",),
+    "s3": ("s3fs>=2025.2",),
+    "notebook": ("xarray>=2024.9",),
+}
+
+
+def install_hint(extra: str) -> str:
+    """Return the command that installs the libraries of an extra, wherever this package came from."""
+    return f"pip install {' '.join(shlex.quote(library) for library in EXTRAS[extra])}"
+
 
 #: characters of a message
 _LONGEST = 4000

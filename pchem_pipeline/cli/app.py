@@ -30,7 +30,7 @@ app = typer.Typer(
     name="pchem",
     help="Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -55,13 +55,19 @@ def init(
     path: Annotated[Path, typer.Argument(help="YAML file to write")] = Path("config.yaml"),
     files: Annotated[list[str] | None, typer.Argument(help="camera files, globs or folders")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="include a simulated camera")] = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="write the JSON schema of the YAML, for editors, beside it too")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Write a YAML file with every setting explained."""
+    """Write a YAML file with every setting explained.
+
+    With --schema an editor completes and checks its keys: the first line names the schema.
+    """
     from pchem_pipeline.commands.new_run import write_template
 
-    write_template(path, files or [], simulated=simulated, force=force)
-    typer.echo(path)
+    for written in write_template(path, files or [], simulated=simulated, schema=schema, force=force):
+        typer.echo(written)
 
 
 @app.command()

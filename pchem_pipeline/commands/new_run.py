@@ -12,7 +12,7 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config
-from pchem_pipeline.config.template import commented_config
+from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.stages.table import STAGES
@@ -27,8 +27,10 @@ _YAML = (".yaml", ".yml")
 _SHOWN = 4
 
 
-def write_template(path: Path, files: Sequence[str], *, simulated: bool, force: bool) -> None:
-    """Write the commented YAML of a new run.
+def write_template(
+    path: Path, files: Sequence[str], *, simulated: bool, force: bool, schema: bool = False
+) -> list[Path]:
+    """Write the commented YAML of a new run, and the schema of its keys if wanted; return what was written.
 
     Raises:
         ConfigError: the file exists, and ``force`` is not given.
@@ -36,9 +38,14 @@ def write_template(path: Path, files: Sequence[str], *, simulated: bool, force: 
     if path.exists() and not force:
         raise ConfigError(f"{path} exists; choose another name, or replace it with --force")
     given = list(files) or ([] if simulated else ["frames/*.tif"])
-    text = commented_config(path.name, files=given, simulated=simulated)
+    beside = path.with_name(SCHEMA_NAME) if schema else None
+    text = commented_config(path.name, files=given, simulated=simulated, schema=schema)
     parse_config(text, str(path))
     write_atomic(path, text.encode())
+    if beside is None:
+        return [path]
+    write_atomic(beside, json_schema().encode())
+    return [path, beside]
 
 
 def find_or_start(

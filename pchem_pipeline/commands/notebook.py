@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, quoted
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.figures import gather_run
 from pchem_pipeline.commands.notebook_plots import Plots, width_of
@@ -59,9 +59,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     try:
         import xarray as _  # noqa: F401
     except ImportError as error:
-        raise MissingDependencyError(
-            'open_run needs another library: pip install "pchem-pipeline[notebook]"'
-        ) from error
+        raise MissingDependencyError(f"open_run needs another library: {install_hint('notebook')}") from error
     return Run(find_run(Path(path)))
 
 

@@ -11,7 +11,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, MissingDependencyError, PchEmError
+from pchem_pipeline.base.errors import (
+    ConfigError,
+    IncompleteRunError,
+    MissingDependencyError,
+    PchEmError,
+    install_hint,
+)
 from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, Stop, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -51,7 +57,7 @@ class DistributedExecutor:
             import distributed
         except ImportError as error:
             raise MissingDependencyError(
-                'compute.backend: distributed needs another library: pip install "pchem-pipeline[cluster]"'
+                f"compute.backend: distributed needs another library: {install_hint('cluster')}"
             ) from error
         self._cluster: Any = None
         try:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import os
-import resource
 import sys
 from pathlib import Path
+from typing import Any
 
 from pchem_pipeline.base.kernel_cache import cache_folder
 
 __all__ = ["available_memory", "available_workers", "cpu_seconds", "peak_rss_bytes", "prepare_environment"]
+
+#: Unix alone has it.
+_RESOURCE: Any = importlib.import_module("resource") if importlib.util.find_spec("resource") else None
 
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLOSC_NTHREADS", "NUMBA_NUM_THREADS")
 
@@ -64,11 +69,13 @@ def cpu_seconds() -> float:
 
 
 def peak_rss_bytes() -> int:
-    """Return the largest resident set of this process or of one of its finished children."""
+    """Return the largest resident set of this process or of one of its finished children; 0 if not known."""
+    if _RESOURCE is None:
+        return 0
     own = _peak_of_this_program()
     if own is None:
-        own = _unit() * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return max(own, _unit() * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+        own = _unit() * _RESOURCE.getrusage(_RESOURCE.RUSAGE_SELF).ru_maxrss
+    return int(max(own, _unit() * _RESOURCE.getrusage(_RESOURCE.RUSAGE_CHILDREN).ru_maxrss))
 
 
 def _unit() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from typing import Any, get_args
 
@@ -12,7 +13,7 @@ from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pchem_pipeline.config.tree import RunConfig
 
-__all__ = ["commented_config"]
+__all__ = ["SCHEMA_NAME", "commented_config", "json_schema"]
 
 _HEAD = """\
 # A run of pchem_pipeline. Every setting is shown with its default; delete what you do not change.
@@ -20,17 +21,30 @@ _HEAD = """\
 """
 
 
-def commented_config(name: str, *, files: list[str], simulated: bool = False) -> str:
+#: File name of the JSON schema of the YAML.
+SCHEMA_NAME = "pchem.schema.json"
+
+
+def json_schema() -> str:
+    """Return the JSON schema of a run's YAML, as text; editors complete and check keys by it."""
+    schema = RunConfig.model_json_schema(by_alias=True)
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "A run of pchem_pipeline"}
+    return json.dumps({**schema, **head}, indent=1, sort_keys=True) + "\n"
+
+
+def commented_config(name: str, *, files: list[str], simulated: bool = False, schema: bool = False) -> str:
     """Return a YAML text with every setting, its default and what it means.
 
     Args:
         name: file name, for the comment on top.
         files: what to write as ``input.files``.
         simulated: include the section ``simulate``.
+        schema: name the schema beside it, as the language server of YAML reads it.
     """
     stem = name.rsplit(".", 1)[0]
     given = {"input.files": files, "run.store": f"{stem}.zarr", "simulate.output": f"{stem}-frames"}
-    lines = [_HEAD.format(name=name)]
+    lines = [f"# yaml-language-server: $schema={SCHEMA_NAME}"] if schema else []
+    lines.append(_HEAD.format(name=name))
     for key, field in RunConfig.model_fields.items():
         if key == "simulate" and not simulated:
             continue

@@ -11,7 +11,7 @@ import importlib
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError
+from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError, install_hint
 from pchem_pipeline.frames.reader import FrameReader
 
 __all__ = ["ENTRY_POINT_GROUP", "detect_format", "frame_suffixes", "reader_class", "reader_names", "require"]
@@ -142,5 +142,5 @@ def require(module: str, extra: str, what: str) -> None:
         importlib.import_module(module)
     except ImportError as error:
         raise MissingDependencyError(
-            f'reading and writing {what} needs {module}; install it: pip install "pchem-pipeline[{extra}]"'
+            f"reading and writing {what} needs {module}; install it: {install_hint(extra)}"
         ) from error

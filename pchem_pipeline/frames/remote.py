@@ -13,7 +13,7 @@ import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pchem_pipeline.base.errors import InputError, MissingDependencyError
+from pchem_pipeline.base.errors import InputError, MissingDependencyError, install_hint
 from pchem_pipeline.store.files import whole_file, write_atomic
 
 __all__ = ["fetch", "is_remote"]
@@ -49,7 +49,7 @@ def fetch(url: str) -> list[Path]:
         storage, path = fsspec.url_to_fs(url)
     except (ImportError, ValueError) as error:
         raise MissingDependencyError(
-            f'{url}: reading from there needs another library ({error}); pip install "pchem-pipeline[s3]"'
+            f"{url}: reading from there needs another library ({error}); install it: {install_hint('s3')}"
         ) from error
     try:
         storage.invalidate_cache()

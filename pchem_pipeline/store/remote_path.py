@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
 
-from pchem_pipeline.base.errors import MissingDependencyError, StoreError
+from pchem_pipeline.base.errors import MissingDependencyError, StoreError, install_hint
 
 __all__ = ["RemoteError", "RemotePath", "lock_folder", "place_of", "refused"]
 
@@ -178,7 +178,7 @@ def _storage(protocol: str) -> Any:
         return fsspec.filesystem(protocol, use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise MissingDependencyError(
-            f'{protocol}://: a store there needs another library ({error}); pip install "pchem-pipeline[s3]"'
+            f"{protocol}://: a store there needs another library ({error}); install it: {install_hint('s3')}"
         ) from error
 
 

@@ -1,15 +1,20 @@
 """The command line translates and calls once; what it calls is tested elsewhere."""
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.cli import app
 from pchem_pipeline.commands import first_screen, new_run
 from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import session
 from pchem_pipeline.run import target as run_target
 from pchem_pipeline.run.session import Command
@@ -110,6 +115,28 @@ def test_missing_files_are_named(tmp_path):
 def test_wrong_roi_shows_how(text):
     with pytest.raises(ConfigError, match="y0:y1,x0:x1"):
         invoke("fit", "run.zarr", "--roi", text)
+
+
+def test_the_schema_is_that_of_the_yaml_and_the_first_line_names_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = invoke("init", "c.yaml", "x.fits", "--schema").stdout
+    assert said.splitlines() == ["c.yaml", "pchem.schema.json"]
+    assert (tmp_path / "c.yaml").read_text().startswith("# yaml-language-server: $schema=pchem.schema.json\n")
+    schema = json.loads((tmp_path / "pchem.schema.json").read_text())
+    assert set(schema["properties"]) == set(RunConfig.model_fields)
+    fit = schema["$defs"]["FitSettings"]
+    assert fit["additionalProperties"] is False  # an editor marks a misspelt key
+    assert all("description" in each for each in fit["properties"].values())
+    assert load_config(tmp_path / "c.yaml").input.files == ("x.fits",)
+
+
+def test_help_has_a_short_name_and_the_package_is_the_command():
+    assert invoke("-h").stdout == invoke("--help").stdout
+    assert "y0:y1,x0:x1" in invoke("fit", "-h").stdout
+    answer = subprocess.run(
+        [sys.executable, "-m", "pchem_pipeline", "--version"], capture_output=True, text=True
+    )
+    assert answer.stdout == f"pchem {__version__}\n"
 
 
 @pytest.mark.parametrize("text", ["4:2,0:5", "0:4,5:5", "-1:4,0:5"])
