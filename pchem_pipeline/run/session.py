@@ -170,12 +170,17 @@ def _location(target: Target) -> dict[str, str]:
     return place if target.config_path is None else {**place, "config": str(target.config_path)}
 
 
-def run_status(target: Target) -> list[StageState]:
-    """Return the state of every stage, of those on demand where they were run, without changing anything."""
+def run_status(target: Target, options: Options | None = None) -> list[StageState]:
+    """Return the state of every stage, of those on demand where they were run, without changing anything.
+
+    Args:
+        target: the run.
+        options: of a command that is about to work on it; None: nothing is asked for.
+    """
     stages = pipeline_of(target.config)
     if not (target.store / "zarr.json").exists():
         return [StageState(name, "missing") for name in stages]
-    context = _reading_context(target, Reporter("off", quiet=True), Options())
+    context = _reading_context(target, Reporter("off", quiet=True), options or Options())
     done = (name for name in STAGES if context.store.records.read(name) is not None)
     stages += tuple(name for name in done if STAGES[name].on_demand)
     states: list[StageState] = []
@@ -194,7 +199,8 @@ def run_status(target: Target) -> list[StageState]:
 
 def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
     """Say what would be done, without writing anything."""
-    states = {state.stage: state for state in run_status(target)}
+    chosen = Options(settings=command.options.settings)
+    states = {state.stage: state for state in run_status(target, chosen)}
     reporter = Reporter("off", quiet=command.quiet)
     for name in stages:
         state = states.get(name, StageState(name, "missing"))
