@@ -41,6 +41,7 @@ __all__ = [
     "Rival",
     "State",
     "Step",
+    "Surveyed",
     "Verdict",
     "parameters_of",
     "read_verdict",
@@ -225,6 +226,21 @@ class Change(_Part):
     after: Number
 
 
+class Surveyed(_Part):
+    """A part of the sensor where a map of all pixels, from all frames, stands out.
+
+    Attributes:
+        map: next_x or next_y (covariance with the next pixel), lag (with the frame before) or spread (means
+            over blocks of frames scatter).
+        region: as ``model.effects`` takes a region.
+        p: probability of such a place by chance, anywhere.
+    """
+
+    map: str
+    region: dict[str, Any]
+    p: Number
+
+
 class Examined(_Part):
     """What was looked at.
 
@@ -233,6 +249,9 @@ class Examined(_Part):
         rows, columns: first, and end, on the sensor.
         train, test, final: frames (of histograms: samples) to find with, to score on, and for the last gap.
         histograms: number of those compared, where frames are not known; of several samples all count.
+        share: of the run's samples that were compared with simulations.
+        surveyed: of the run's samples by whose sums these were chosen; without such sums as ``share``.
+        places: where those stand out.
     """
 
     frames: int
@@ -242,6 +261,9 @@ class Examined(_Part):
     test: int
     final: int
     histograms: int | None = None
+    share: Number = _NAN
+    surveyed: Number = _NAN
+    places: tuple[Surveyed, ...] = ()
 
     @property
     def origin(self) -> tuple[int, int]:

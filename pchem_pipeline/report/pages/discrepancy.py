@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pchem_pipeline.discrepancy.verdict import Candidate, GapChange, Moved, Place, Rival, Step, Verdict
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.discrepancy_gap import gap_text
 from pchem_pipeline.report.pages.pictures import Picture
@@ -67,6 +68,14 @@ PARTS: tuple[tuple[str, str, str], ...] = (
         "examined.",
     ),
 )
+
+#: What the maps of the survey show.
+_SURVEYED = {
+    "next_x": "neighbours in a row alike",
+    "next_y": "neighbours in a column alike",
+    "lag": "successive frames alike",
+    "spread": "levels change along the run",
+}
 
 _EMPTY = {
     "where": "Nothing was kept to draw.",
@@ -529,6 +538,14 @@ def _examined(data: DiscrepancyData) -> Table:
     ):
         value = getattr(found.examined, key)
         rows.append((words, " to ".join(map(str, value)) if isinstance(value, tuple) else f"{value:,}"))
+    examined = found.examined
+    if math.isfinite(examined.share):
+        rows.append(("share of the run's samples", percent(examined.share, 1.0)))
+        rows.append(("share by whose sums these were chosen", percent(examined.surveyed, 1.0)))
+    for place in examined.places:
+        words = Region.model_validate(place.region).words()
+        what = _SURVEYED.get(place.map, place.map)
+        rows.append((f"whole sensor: {what}", f"{words} (p {probability_text(place.p)})"))
     if found.replicates:
         rows.append(("simulated replicates", f"{found.replicates:,}"))
     rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]

@@ -9,9 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.discrepancy.by_likelihood.explainer import SampleHistograms, find_in_histograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
@@ -19,37 +16,17 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
+from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, survey
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Window", "choose_window", "run"]
+__all__ = ["run"]
 
 _STAGE = "discrepancy"
-# frames tell more than pixels about what happens in time; pixels more about what is rare
-_FRAMES_WANTED = 6000
-
-
-@dataclass(frozen=True)
-class Window:
-    """The part of the stack that is looked at.
-
-    Attributes:
-        numbers: frame numbers, whole blocks, increasing.
-        rows, columns: first, and end.
-    """
-
-    numbers: NDArray[np.int64]
-    rows: tuple[int, int]
-    columns: tuple[int, int]
-
-    def pixel(self, y: int, x: int) -> tuple[int, int]:
-        """Return the place on the sensor of a pixel of the window."""
-        return y + self.rows[0], x + self.columns[0]
 
 
 @dataclass(frozen=True)
@@ -69,34 +46,6 @@ class _Unit:
         return (self.replicate.key,)
 
 
-def choose_window(
-    shape: tuple[int, int, int], max_samples: int, block_frames: int | None, roi: Sequence[int] | None = None
-) -> Window:
-    """Return what to look at: everything if small enough, else a window and blocks over the whole run.
-
-    Args:
-        shape: frames, rows, columns of the stack.
-        max_samples: frames x pixels to look at.
-        block_frames: frames in a block, or None to choose.
-        roi: rows and columns that the user asked for: y0, y1, x0, x1.
-    """
-    n_frames, ny, nx = shape
-    y0, y1, x0, x1 = roi or (0, ny, 0, nx)
-    frames = min(n_frames, max(_FRAMES_WANTED, max_samples // max((y1 - y0) * (x1 - x0), 1)))
-    side = max(max_samples // frames, 1)
-    if (y1 - y0) * (x1 - x0) > side:
-        height = min(y1 - y0, max(int(np.sqrt(side)), side // (x1 - x0)))
-        width = min(x1 - x0, side // height)
-        y0, x0 = y0 + (y1 - y0 - height) // 2, x0 + (x1 - x0 - width) // 2
-        y1, x1 = y0 + height, x0 + width
-    numbers = np.arange(n_frames, dtype=np.int64)
-    if frames < n_frames:
-        length = block_length(frames, block_frames)
-        starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
-        numbers = (starts[:, None] + np.arange(length)).ravel()
-    return Window(numbers, (y0, y1), (x0, x1))
-
-
 def run(context: StageContext) -> None:
     """Find discrepancies; write ``discrepancy.json`` and the arrays of its pictures.
 
@@ -111,7 +60,8 @@ def run(context: StageContext) -> None:
         return
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
-    window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi)
+    places = survey(context.store, source.shape[1:])
+    window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi, places)
     found = find_discrepancies(
         read_window(source, window),
         window.numbers,
@@ -123,7 +73,7 @@ def run(context: StageContext) -> None:
         mapper=_Mapper(context),
     )
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
-    found = replace(found, verdict=verdict)
+    found = replace(found, verdict=window.told(verdict, source.shape, places))
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 
@@ -201,22 +151,6 @@ class _Mapper:
 
 def _simulate(unit: _Unit) -> dict[str, float]:
     return unit.replicate()
-
-
-def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteger]:
-    """Return the frames of a window, (frame, y, x), DN."""
-    (y0, y1), (x0, x1) = window.rows, window.columns
-    stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
-    # not more at once than a few dozen megabytes, whatever the width of the sensor
-    step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
-    breaks = np.flatnonzero(np.diff(window.numbers) != 1) + 1
-    for part in np.split(np.arange(window.numbers.size), breaks):
-        frames = int(window.numbers[part[0]]), int(window.numbers[part[-1]]) + 1
-        with FrameStream(source, [window.rows], step, frames=frames) as stream:
-            for first, (block,) in stream:
-                at = int(part[0]) + first - frames[0]
-                stack[at : at + block.shape[0]] = block[:, :, x0:x1]
-    return stack
 
 
 def _write(context: StageContext, found: Discrepancy) -> None:

@@ -25,6 +25,7 @@ from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
+from pchem_pipeline.stages.quick_look import run_quick_look
 from pchem_pipeline.stages.report.drawing import draw_by_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
@@ -36,7 +37,6 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_index,
 )
 from pchem_pipeline.stages.report.plan_section import plan_section
-from pchem_pipeline.stages.report.quick import run_quick_look
 from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline

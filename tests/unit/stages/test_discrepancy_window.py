@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from helpers.quick_stacks import stack, sums_of
 
-from pchem_pipeline.stages.discrepancy.discrepancy import choose_window, read_window
+from pchem_pipeline.discrepancy.quick.places import SensorPlace
+from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.stages.discrepancy import window as module
+from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, survey
 
 
 class Frames:
@@ -47,3 +51,45 @@ def test_frames_of_the_window_are_those_of_the_stack():
     window = type(window)(np.r_[0:40, 100:160], window.rows, window.columns)
     stack = read_window(source, window)
     assert np.array_equal(stack, source.values[window.numbers][:, 2:6, 3:8])
+
+
+def place(p=1e-9, **region):
+    return SensorPlace(Region.model_validate(region), p, 1.0, 0.0)
+
+
+def test_the_window_lies_where_the_sensor_disagrees_half_of_it_outside():
+    tap = {"next_x": place(columns=[448, 512])}
+    window = choose_window((17750, 512, 512), 1 << 25, None, None, tap)
+    x0, x1 = window.columns
+    assert 0.4 < (x1 - 448) / (x1 - x0) < 0.6
+    blob = {"lag": place(1e-5, columns=[0, 9]), "spread": place(1e-20, rows=[20, 40], columns=[30, 50])}
+    window = choose_window((17750, 512, 512), 1 << 25, None, None, blob)
+    (y0, y1), (x0, x1) = window.rows, window.columns
+    assert y0 <= 20 < 40 <= y1
+    assert x0 <= 30 < 50 <= x1
+
+
+def test_without_a_place_or_outside_of_the_region_asked_for_the_middle_is_looked_at():
+    middle = choose_window((17750, 512, 512), 1 << 25, None)
+    assert choose_window((17750, 512, 512), 1 << 25, None, None, {}).rows == middle.rows
+    elsewhere = {"lag": place(rows=[500, 512])}
+    asked = choose_window((17750, 512, 512), 1 << 25, None, (0, 256, 0, 256), elsewhere)
+    assert asked.rows == choose_window((17750, 512, 512), 1 << 25, None, (0, 256, 0, 256)).rows
+
+
+def test_the_survey_finds_the_place_in_the_sums_of_all_frames(monkeypatch):
+    rng = np.random.default_rng(1)
+
+    def tap(dn):
+        dn[:, :, 40:] += rng.standard_normal(dn.shape[:2])[:, :, None]
+        return dn
+
+    monkeypatch.setattr(module, "read_sums", lambda store: sums_of(stack(rng, (600, 32, 48), tap)))
+    found = survey(None, (32, 48))
+    assert found["next_x"].region.numbers() == {"columns": [[40, 48]]}
+    assert found["next_x"].p < 1e-20
+    assert survey(None, (16, 48)) is None  # of another region of the sensor
+    monkeypatch.setattr(module, "read_sums", lambda store: sums_of(stack(rng, (600, 32, 48))))
+    assert survey(None, (32, 48)) == {}
+    monkeypatch.setattr(module, "read_sums", lambda store: None)
+    assert survey(None, (32, 48)) is None

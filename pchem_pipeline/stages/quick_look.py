@@ -1,4 +1,4 @@
-"""The quick look of a report: what it reads of the summaries and histograms of a run."""
+"""What a quick look reads of the summaries and histograms of a run, for the report and for a closer look."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.report.stored import StoredRun
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["run_quick_look"]
+__all__ = ["read_sums", "run_quick_look"]
 
 #: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
 _MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 23, 1 << 23
@@ -38,7 +38,10 @@ def run_quick_look(store: RunStore, run: StoredRun) -> QuickLook | None:
         return None
     model = tuple(effect.tag for effect in run.model.effects)
     missing: dict[str, str] = {}
-    sums = _sums(store, missing)
+    sums = read_sums(store)
+    if sums is None:
+        why = store.attributes("summary").get("missing", "the stage histogram has none")
+        missing["rows, columns, frames, neighbours and lags"] = str(why)
     codes = None
     if model:
         missing["codes"] = "the model has effects; pchem discrepancy compares the codes with it"
@@ -59,11 +62,16 @@ def _maps(run: StoredRun) -> PixelMaps | None:
     return PixelMaps(values[0], values[1], values[2], values[3], usable) if usable.any() else None
 
 
-def _sums(store: RunStore, missing: dict[str, str]) -> StackSums | None:
-    """Read the summaries of some blocks of frames, evenly spread over the run."""
+def read_sums(store: RunStore) -> StackSums | None:
+    """Read the summaries of a run: all covariances, and sums of blocks of frames spread over it.
+
+    Returns:
+        None where the stage histogram has not made them, or frames are fewer than two in each block.
+
+    Raises:
+        StoreError: an array is corrupt.
+    """
     if not store.has("summary/frame_mean"):
-        why = store.attributes("summary").get("missing", "the stage histogram has none")
-        missing["rows, columns, frames, neighbours and lags"] = str(why)
         return None
     mean = store.read("summary/frame_mean")
     starts = store.read("summary/block_start")

@@ -1,0 +1,170 @@
+"""Which part of a stack is looked at closely: where the summaries of all its samples disagree most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.quick.places import SensorPlace, sensor_maps, sensor_place
+from pchem_pipeline.discrepancy.splits import block_length
+from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
+from pchem_pipeline.stages.quick_look import read_sums
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["Window", "choose_window", "read_window", "survey"]
+
+# frames tell more than pixels about what happens in time; pixels more about what is rare
+_FRAMES_WANTED = 6000
+#: Probability of a chance, in any of the maps, below which a place decides where the window lies.
+_SIGNIFICANCE = 1e-3
+#: Windows tried along each edge of the sensor.
+_TRIED = 64
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of the stack that is looked at.
+
+    Attributes:
+        numbers: frame numbers, whole blocks, increasing.
+        rows, columns: first, and end.
+    """
+
+    numbers: NDArray[np.int64]
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+    def pixel(self, y: int, x: int) -> tuple[int, int]:
+        """Return the place on the sensor of a pixel of the window."""
+        return y + self.rows[0], x + self.columns[0]
+
+    def told(
+        self, verdict: Verdict, shape: tuple[int, int, int], places: Mapping[str, SensorPlace] | None
+    ) -> Verdict:
+        """Return a verdict that says how much of a stack of some shape it rests on, and on what else."""
+        pixels = (self.rows[1] - self.rows[0]) * (self.columns[1] - self.columns[0])
+        share = self.numbers.size * pixels / math.prod(shape)
+        surveyed = share if places is None else 1.0
+        spots = tuple(
+            Surveyed(map=name, region=place.region.numbers(), p=place.p)
+            for name, place in sorted((places or {}).items(), key=lambda item: item[1].p)
+        )
+        examined = verdict.examined.model_copy(update={"share": share, "surveyed": surveyed, "places": spots})
+        return verdict.model_copy(update={"examined": examined})
+
+
+def survey(store: RunStore, shape: tuple[int, int]) -> dict[str, SensorPlace] | None:
+    """Return where the whole sensor stands out, in all frames, from the summaries of the stage histogram.
+
+    Args:
+        store: the run.
+        shape: rows and columns of the sensor.
+
+    Returns:
+        The most significant place of each map of :func:`sensor_maps` that has one; None without summaries.
+
+    Raises:
+        StoreError: an array is corrupt.
+    """
+    sums = read_sums(store)
+    if sums is None or sums.shape != shape or sums.freedom <= 0:
+        return None
+    maps = sensor_maps(sums)
+    found = {name: sensor_place(name, values, _SIGNIFICANCE / len(maps)) for name, values in maps.items()}
+    return {name: place for name, place in found.items() if place is not None}
+
+
+def choose_window(
+    shape: tuple[int, int, int],
+    max_samples: int,
+    block_frames: int | None,
+    roi: Sequence[int] | None = None,
+    places: Mapping[str, SensorPlace] | None = None,
+) -> Window:
+    """Return what to look at: everything if small enough, else a window and blocks over the whole run.
+
+    The window lies where the sensor disagrees most, as much of it inside the place as outside: what is only
+    there shows against its quiet neighbours. Without such a place it lies in the middle.
+
+    Args:
+        shape: frames, rows, columns of the stack.
+        max_samples: frames x pixels to look at.
+        block_frames: frames in a block, or None to choose.
+        roi: rows and columns that the user asked for: y0, y1, x0, x1.
+        places: what :func:`survey` found.
+    """
+    n_frames, ny, nx = shape
+    y0, y1, x0, x1 = roi or (0, ny, 0, nx)
+    frames = min(n_frames, max(_FRAMES_WANTED, max_samples // max((y1 - y0) * (x1 - x0), 1)))
+    side = max(max_samples // frames, 1)
+    if (y1 - y0) * (x1 - x0) > side:
+        height = min(y1 - y0, max(int(np.sqrt(side)), side // (x1 - x0)))
+        width = min(x1 - x0, side // height)
+        y0, x0 = _corner(_worst(places or {}, shape[1:]), (y0, y1, x0, x1), (height, width))
+        y1, x1 = y0 + height, x0 + width
+    numbers = np.arange(n_frames, dtype=np.int64)
+    if frames < n_frames:
+        length = block_length(frames, block_frames)
+        starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
+        numbers = (starts[:, None] + np.arange(length)).ravel()
+    return Window(numbers, (y0, y1), (x0, x1))
+
+
+def _worst(places: Mapping[str, SensorPlace], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """Return the most significant place as a mask, (y, x)."""
+    if not places:
+        return None
+    return min(places.values(), key=lambda place: place.p).region.mask(shape)
+
+
+def _corner(
+    place: NDArray[np.bool_] | None, within: tuple[int, int, int, int], size: tuple[int, int]
+) -> tuple[int, int]:
+    """Return first row and column of a window of some size: half in the place, else in the middle.
+
+    Args:
+        place: pixels that stand out, (y, x); None: nothing does.
+        within: rows and columns that the window may have: y0, y1, x0, x1.
+        size: rows and columns of the window.
+    """
+    y0, y1, x0, x1 = within
+    middle = y0 + (y1 - y0 - size[0]) // 2, x0 + (x1 - x0 - size[1]) // 2
+    if place is None or not place[y0:y1, x0:x1].any():
+        return middle
+    ys, xs = (
+        np.unique(np.linspace(first, last - length, _TRIED).astype(np.int64))
+        for first, last, length in ((y0, y1, size[0]), (x0, x1, size[1]))
+    )
+    total = np.pad(np.cumsum(np.cumsum(place, axis=0, dtype=np.int64), axis=1), ((1, 0), (1, 0)))
+    inside = (
+        total[np.ix_(ys + size[0], xs + size[1])]
+        - total[np.ix_(ys, xs + size[1])]
+        - total[np.ix_(ys + size[0], xs)]
+        + total[np.ix_(ys, xs)]
+    )
+    both = np.minimum(inside, size[0] * size[1] - inside).astype(np.float64)
+    # of windows that hold as much of it the one nearest to the middle
+    away = np.abs(ys - middle[0])[:, None] + np.abs(xs - middle[1])[None, :]
+    row, column = np.unravel_index(int(np.argmax(both - 1e-6 * away)), both.shape)
+    return int(ys[row]), int(xs[column])
+
+
+def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteger]:
+    """Return the frames of a window, (frame, y, x), DN."""
+    (y0, y1), (x0, x1) = window.rows, window.columns
+    stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
+    # not more at once than a few dozen megabytes, whatever the width of the sensor
+    step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
+    breaks = np.flatnonzero(np.diff(window.numbers) != 1) + 1
+    for part in np.split(np.arange(window.numbers.size), breaks):
+        frames = int(window.numbers[part[0]]), int(window.numbers[part[-1]]) + 1
+        with FrameStream(source, [window.rows], step, frames=frames) as stream:
+            for first, (block,) in stream:
+                at = int(part[0]) + first - frames[0]
+                stack[at : at + block.shape[0]] = block[:, :, x0:x1]
+    return stack
