@@ -34,9 +34,15 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
     tolerance,
 )
-from pchem_pipeline.discrepancy.by_simulation.maps import Refit, equivalent_sensor, expected_codes, refit_maps
+from pchem_pipeline.discrepancy.by_simulation.maps import (
+    Refit,
+    Sensor,
+    expected_codes,
+    learn_sensor,
+    refit_maps,
+)
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate, by_part
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, suspicious
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
@@ -62,7 +68,6 @@ _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no s
 # than a single one would by chance
 _ESTABLISHED = 4.5
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
-_MISTAKEN = 0.003  # share of pixels with an ambiguous bias from which replicates are fitted from nothing
 
 
 def find_discrepancies(
@@ -145,11 +150,11 @@ class FrameStack:
             start=maps,
         )
 
-    def acquisition(self, mistaken: float = 0.0) -> Acquisition:
+    def acquisition(self, as_data: bool = False) -> Acquisition:
         """Return how replicates of the train part are taken.
 
         Args:
-            mistaken: share of pixels whose bias may be off by an electron.
+            as_data: those of train and test part, treated as the data are from the fit on.
         """
         return Acquisition(
             self.numbers[self.splits.train],
@@ -157,7 +162,7 @@ class FrameStack:
             self.splits.block_frames,
             self.bit_depth,
             self.integration_time,
-            fitted_with=self.numbers[self.splits.test] if mistaken > _MISTAKEN else None,
+            other=self.numbers[self.splits.test] if as_data else None,
         )
 
 
@@ -202,12 +207,12 @@ class FrameExplainer:
             )
         parts = splits.train, splits.test, splits.final
         self.evidence = tuple(self.frames.observe(part, self.plain.maps) for part in parts)
-        self.fit, self.maps = self._mapped(self.model)
+        self.fit, self.sensor = self._mapped(self.model)
         return self.evidence[0], splits.examined(self.frames.stack.shape)
 
     def null(self) -> tuple[NullModel, Measured]:
         """Simulate and observe the fitted model, refit included."""
-        vectors = self._replicates(self.model, self.maps, "r0", self.settings.replicates)
+        vectors = self._replicates(self.model, self.sensor, "r0", self.settings.replicates)
         common = set(STATISTICS).intersection(*vectors, *(e.z for e in self.evidence))
         names = tuple(name for name in STATISTICS if name in common)
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
@@ -227,7 +232,7 @@ class FrameExplainer:
         """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
         number = len(self.rounds)
         simulator = ReplicateSimulator(
-            self.maps,
+            self.sensor.usual(self._seed("sensor", number)),
             self.model,
             self.frames.acquisition(),
             null.names,
@@ -304,38 +309,37 @@ class FrameExplainer:
 
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, PixelMaps]:
-        """Return the fit of the seen frames under a model, and maps to draw replicates from."""
+    def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
+        """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
         plain, fit = self.plain, None
         assert plain.covariance is not None
+        frames, numbers = self.frames.stack[self.frames.seen], self.frames.numbers[self.frames.seen]
         if model:
-            seen = self.frames.seen
-            fit = refit_maps(
-                self.frames.stack[seen],
-                plain.maps,
-                model,
-                plain.covariance,
-                numbers=self.frames.numbers[seen],
-            )
+            fit = refit_maps(frames, plain.maps, model, plain.covariance, numbers=numbers)
         fit = fit or Refit(plain.maps, {}, plain.covariance)
-        return fit, equivalent_sensor(fit.maps, fit.covariance)
+        return fit, learn_sensor(frames, numbers, fit, model, plain.ambiguous)
 
     def _replicates(
-        self, model: tuple[Effect, ...], maps: PixelMaps, prefix: str, count: int, begin: int = 0
+        self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0
     ) -> list[Mapping[str, float]]:
-        """Simulate and observe a model ``count`` times, with the random numbers from ``begin`` on."""
+        """Simulate a model, and observe ``count`` parts of it or one more, from number ``begin`` (even) on.
+
+        A simulated stack has two parts, and a sensor of its own.
+        """
         text = "|".join(e.model_dump_json() for e in model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        taken = self.frames.acquisition(self.plain.ambiguous)
+        taken, stacks = self.frames.acquisition(as_data=True), range(begin // 2, (begin + count + 1) // 2)
+        seeds = {i: self._seed(prefix, i) for i in stacks}
         tasks = [
-            Replicate(f"{prefix}-null-{digest}-{i}", maps, model, self._seed(prefix, i), taken)
-            for i in range(begin, begin + count)
+            Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken)
+            for i, seed in seeds.items()
         ]
         vectors: list[Mapping[str, float]] = []
         for result in self._counted(tasks):
             if isinstance(result, Exception):
                 raise result
-            vectors.append(result)
+            vectors += by_part(result)
+        self.n_replicates += len(vectors) - len(tasks)
         return vectors
 
     def _counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
@@ -357,15 +361,15 @@ class FrameExplainer:
         found = {h.tag for h in held}
         present = tuple(e for e in self.model if e.tag not in found)
 
-        known: dict[tuple[str, ...], tuple[Refit, PixelMaps, list[Mapping[str, float]]]] = {}
+        known: dict[tuple[str, ...], tuple[Refit, Sensor, list[Mapping[str, float]]]] = {}
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             model = (*present, *effects)
             key = tuple(e.model_dump_json() for e in model)
             if key not in known:
                 known[key] = (*self._mapped(model), [])
-            fit, maps, vectors = known[key]
-            vectors += self._replicates(model, maps, "grown", count - len(vectors), len(vectors))
+            fit, sensor, vectors = known[key]
+            vectors += self._replicates(model, sensor, "grown", count - len(vectors), len(vectors))
             return fit, as_matrix(self.first.names, vectors[:count])
 
         events = np.asarray(self._noise(self.first, 2).events)
@@ -399,7 +403,7 @@ class FrameExplainer:
         tags = {h.tag for h in corrected}
         present = tuple(e for e in self.model if e.tag not in tags)
         self.model = (*present, *(h.effect for h in corrected))
-        self.fit, self.maps = self._mapped(self.model)
+        self.fit, self.sensor = self._mapped(self.model)
         extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
         extended = extended.shifted(np.sum(added.parts * change[:, None], axis=0))
         errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))

@@ -1,15 +1,20 @@
-"""The parameter maps under a model with effects, and a sensor to simulate whose fit comes out like them."""
+"""The parameter maps under a model with effects, and sensors to simulate whose fits come out like them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.by_simulation.population import (
+    Posterior,
+    posterior_of,
+    posterior_of_estimates,
+)
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
@@ -17,18 +22,16 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["Refit", "equivalent_sensor", "expected_codes", "refit_maps"]
+__all__ = ["Refit", "Sensor", "expected_codes", "learn_sensor", "refit_maps"]
 
 FloatArray = NDArray[np.float64]
 
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
-_FEWEST = 100  # pixels from which a covariance is worth something
-_FAR = 4.0  # robust standard deviations: pixels beyond say nothing about how the others scatter
-_MAD = 1.4826
-# scatter beyond the errors in any direction, in units of the errors' variance, below which it is chance
-_CHANCE = 0.05
+_FEWEST_CODES = 3  # that a pixel must have shown
+_MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 
 
 @dataclass(frozen=True)
@@ -130,79 +133,81 @@ def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: 
     }
 
 
-def equivalent_sensor(maps: PixelMaps, covariance: FloatArray) -> PixelMaps:
-    """Return maps that scatter as the true parameters do, given fitted ones.
+@dataclass(frozen=True)
+class Sensor:
+    """What is known of the true parameters of the pixels: sensors to simulate whose fits come out alike.
 
-    Fitted parameters scatter more than the true ones: by their errors. A simulation that took them for the
-    truth would, fitted again, scatter by those errors twice, and every statistic that looks at how pixels
-    differ would deviate without any effect, the more the worse a pixel's peaks are resolved.
+    Attributes:
+        posterior: of the pixels that can be simulated.
+        drawn: which those are, shape (y, x).
+        usable: pixels whose fit can be relied upon, shape (y, x).
+    """
 
-    In ``(log H, log g, mu, log sigma)``, where errors are nearly Gaussian, the covariance over the pixels is
-    ``C = T + mean(E_i)`` with the truth's T and the errors' E_i. Each pixel is moved by the map of optimal
-    transport from N(m, T + E_i) to N(m, T), which is linear and moves no pixel further than needed (Dowson
-    and Landau 1982). Where the errors are small against the scatter, nothing changes.
+    posterior: Posterior
+    drawn: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
+
+    def draw(self, seed: int) -> PixelMaps:
+        """Return maps that may be the true ones; ``usable`` are those that can be simulated."""
+        values = np.full((*self.drawn.shape, 4), np.nan)
+        values[self.drawn] = self.posterior.draw(np.random.default_rng(seed))
+        exposure, gain, bias, noise = (np.ascontiguousarray(values[..., i]) for i in range(4))
+        return PixelMaps(exposure, gain, bias, noise, self.drawn)
+
+    def usual(self, seed: int) -> PixelMaps:
+        """Return the same of the pixels whose fit can be relied upon."""
+        maps = self.draw(seed)
+        return replace(maps, usable=self.usable & self.drawn)
+
+
+def learn_sensor(
+    frames: NDArray[np.unsignedinteger],
+    numbers: NDArray[np.int64],
+    fit: Refit,
+    effects: Sequence[Effect],
+    mistaken: float,
+) -> Sensor:
+    """Learn what the pixels' true parameters may be.
 
     Args:
-        maps: fitted.
-        covariance: of (H, g, mu, sigma), shape (y, x, 4, 4); a pixel without a finite one stays.
-
-    Returns:
-        Maps with the same usable pixels.
+        frames: that were fitted, (frame, y, x), DN.
+        numbers: theirs in the run, shape (frame,).
+        fit: their maps under the model.
+        effects: of the model.
+        mistaken: share of pixels whose bias may be off by an electron.
     """
-    values = np.stack(
-        [np.log(maps.quanta_exposure), np.log(maps.conversion_gain), maps.bias, np.log(maps.read_noise_dn)],
-        axis=-1,
-    )
-    slope = np.stack(
-        [
-            1.0 / maps.quanta_exposure,
-            1.0 / maps.conversion_gain,
-            np.ones(maps.bias.shape),
-            1.0 / maps.read_noise_dn,
-        ],
-        axis=-1,
-    )
-    error = covariance * slope[..., :, None] * slope[..., None, :]
-    known = maps.usable & np.isfinite(error).all(axis=(-2, -1)) & np.isfinite(values).all(axis=-1)
-    if known.sum() < _FEWEST:
-        return maps
-    x, e = values[known], error[known]
-    centre = np.median(x, axis=0)
-    off = x - centre
-    usual = (np.abs(off) < _FAR * _MAD * np.median(np.abs(off), axis=0)).all(axis=1)
-    typical = e[usual].mean(axis=0)
-    truth = _scatter_beyond(np.cov(off[usual], rowvar=False), typical)
-    moved = np.einsum("nij,nj->ni", _transport(truth, e), off)
-    x = np.where(usual[:, None], centre + moved, x)
-    found = values.copy()
-    found[known] = x
-    return PixelMaps(
-        np.exp(found[..., 0]), np.exp(found[..., 1]), found[..., 2], np.exp(found[..., 3]), maps.usable
-    )
+    maps = fit.maps
+    usable = maps.usable.ravel()
+    every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    parameters = np.where(usable[:, None], np.stack([values.ravel() for values in every], axis=1), np.nan)
+    covariance = fit.covariance.reshape(-1, 4, 4)
+    shape = maps.usable.shape
+    places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers)
+    law = _law_of_all(effects, parameters, places)
+    if law is None or law.free_satellites:
+        drawn = usable
+        posterior = posterior_of_estimates(parameters[drawn], covariance[drawn])
+    else:
+        histograms = histogram_frames(frames)
+        counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
+        outside = (histograms.under + histograms.over).ravel()
+        drawn = (counts > 0).sum(axis=1) >= _FEWEST_CODES
+        drawn &= (outside <= _MOST_OUTSIDE * counts.sum(axis=1)) | usable
+        posterior = posterior_of(
+            counts[drawn],
+            histograms.origin.ravel()[drawn],
+            parameters[drawn],
+            law.of(drawn),
+            mistaken=mistaken,
+        )
+    return Sensor(posterior, drawn.reshape(maps.usable.shape), maps.usable)
 
 
-def _scatter_beyond(scatter: FloatArray, error: FloatArray) -> FloatArray:
-    """Return what is left of a covariance when that of the errors is taken off, at least nothing."""
-    root = np.linalg.cholesky(error)
-    white = np.linalg.solve(root, np.linalg.solve(root, scatter).T)
-    sizes, axes = np.linalg.eigh((white + white.T) / 2.0)
-    left = np.where(sizes > 1.0 + _CHANCE, sizes - 1.0, 0.0)
-    factor = root @ axes
-    return np.asarray((factor * left) @ factor.T)
-
-
-def _transport(truth: FloatArray, error: FloatArray) -> FloatArray:
-    """Return the optimal transport from N(0, T + E_i) to N(0, T) for each E_i, shape (n, 4, 4)."""
-    scale = np.sqrt(np.diagonal(error, axis1=1, axis2=2).mean(axis=0))
-    truth, error = truth / np.outer(scale, scale), error / np.outer(scale, scale)
-    root = _power(truth, 0.5)
-    middle = _power(root @ (truth + error) @ root, -0.5)
-    return np.asarray(root @ middle @ root * scale[:, None] / scale[None, :])
-
-
-def _power(matrix: FloatArray, exponent: float) -> FloatArray:
-    """Return a power of symmetric matrices without negative eigenvalues; directions without size stay so."""
-    sizes, axes = np.linalg.eigh(matrix)
-    least = 1e-12 * sizes[..., -1:]
-    powers = np.where(sizes > least, np.maximum(sizes, np.maximum(least, 1e-300)) ** exponent, 0.0)
-    return np.asarray((axes * powers[..., None, :]) @ np.swapaxes(axes, -1, -2))
+def _law_of_all(effects: Sequence[Effect], parameters: FloatArray, places: PixelPlaces) -> SampleLaw | None:
+    """Return the law of all pixels, those without parameters as their middle; None where there is none."""
+    middle = np.nanmedian(parameters, axis=0)
+    full = np.where(np.isfinite(parameters), parameters, middle)
+    try:
+        return sample_law(effects, pixel_maps(list(full.T), np.ones(len(full), np.bool_)), places=places)
+    except ConfigError:
+        return None

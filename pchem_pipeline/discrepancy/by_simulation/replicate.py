@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -15,7 +16,17 @@ from pchem_pipeline.simulate.chain import dn_dtype, simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 
-__all__ = ["Acquisition", "Replicate", "simulate_frames", "truth_of"]
+__all__ = ["OF_OTHER", "Acquisition", "Replicate", "by_part", "simulate_frames", "truth_of"]
+
+#: Begins the names of the statistics of a replicate's second part.
+OF_OTHER = "other:"
+
+
+def by_part(found: Mapping[str, float]) -> tuple[dict[str, float], ...]:
+    """Return the statistics of a replicate's first part, and of its second one if it has one."""
+    first = {name: value for name, value in found.items() if not name.startswith(OF_OTHER)}
+    second = {name.removeprefix(OF_OTHER): v for name, v in found.items() if name.startswith(OF_OTHER)}
+    return (first, second) if second else (first,)
 
 
 @dataclass(frozen=True)
@@ -28,8 +39,10 @@ class Acquisition:
         block_frames: frames in a block.
         bit_depth: bits of the ADC.
         integration_time: s.
-        fitted_with: numbers of further frames from which, with these, the pixels' fits are begun; None:
-            they are begun at the truth, which is faster, and the same where no pixel's bias can be mistaken.
+        other: numbers of the frames of a second part; None: there is none. With one, both are treated as
+            those of the data: all their frames are fitted from nothing, this says which pixels can be used,
+            and each part is observed near that fit. Without one the fits are begun at the truth, which is
+            faster and will do for the difference that an effect makes.
     """
 
     numbers: NDArray[np.int64]
@@ -37,7 +50,7 @@ class Acquisition:
     block_frames: int
     bit_depth: int
     integration_time: float = 1.0
-    fitted_with: NDArray[np.int64] | None = None
+    other: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -58,28 +71,36 @@ class Replicate:
     seed: int
     acquisition: Acquisition
 
-    def evidence(self) -> Evidence:
-        """Simulate and observe."""
+    def evidence(self) -> tuple[Evidence, ...]:
+        """Simulate, and observe each part."""
         taken, start = self.acquisition, self.maps
-        if taken.fitted_with is None:
+        parts: tuple[NDArray[np.int64], ...] = (taken.numbers,)
+        if taken.other is None:
+            seen = taken.numbers
             frames = simulate_frames(self.maps, self.effects, self.seed, taken)
         else:
-            seen = np.union1d(taken.numbers, taken.fitted_with)
+            parts, seen = (*parts, taken.other), np.union1d(taken.numbers, taken.other)
             frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
             start = fitted_maps(frames, ~self.maps.usable)
-            frames = frames[np.isin(seen, taken.numbers)]
-        return observe(
-            frames,
-            taken.numbers,
-            n_run=taken.n_run,
-            block_frames=taken.block_frames,
-            exclude=~start.usable,
-            start=start,
+        return tuple(
+            observe(
+                frames[np.isin(seen, numbers)],
+                numbers,
+                n_run=taken.n_run,
+                block_frames=taken.block_frames,
+                exclude=~start.usable,
+                start=start,
+            )
+            for numbers in parts
         )
 
     def __call__(self) -> dict[str, float]:
-        """Simulate, observe, and return the statistics by name."""
-        return {name: float(value) for name, value in self.evidence().z.items()}
+        """Simulate, observe, and return the statistics by name, those of the second part behind a mark."""
+        first, *more = self.evidence()
+        found = {name: float(value) for name, value in first.z.items()}
+        for second in more:
+            found |= {OF_OTHER + name: float(value) for name, value in second.z.items()}
+        return found
 
 
 def simulate_frames(

@@ -1,0 +1,437 @@
+"""How the true parameters of a sensor's pixels are distributed, and where those of each pixel may lie.
+
+Fitted parameters scatter more than the true ones, by their errors; where peaks are hardly resolved the errors
+are large, skewed, and a bias may be off by an electron. A simulation that took the estimates for the truth
+would, fitted again, be wrong twice, and every statistic that looks at the shape of the histograms would
+deviate without any effect. The likelihood of all pixels together says how much of the scatter is real
+(empirical Bayes: Robbins 1956; Efron and Morris 1973).
+
+In ``theta = (log H, log 1/g, mu, log sigma_R^2)`` the pixels of a sensor follow Student's t with centre m and
+scatter T. Each pixel's likelihood is a parabola about its posterior maximum, with Fisher's information for
+its curvature; with these parabolas (m, T) maximise the marginal likelihood (EM: Dempster, Laird and Rubin
+1977, ex. 4.5.2), and the maxima are found anew, a few times over (Laplace's approximation; Lindstrom and
+Bates 1990). Maxima an electron apart count with their evidence. Where most pixels are ambiguous Laplace's
+approximation is skewed, and the same way in all of them: there m comes from the cumulants of all pixels, with
+its error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.mass import sample_slopes
+from pchem_pipeline.model.law.sample_law import SampleLaw
+
+__all__ = [
+    "Population",
+    "Posterior",
+    "posterior_of",
+    "posterior_of_estimates",
+    "to_parameters",
+    "to_theta",
+]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_MOST_LEARNT_FROM = 1000  # pixels that the population is learnt from
+_TAILS = 8.0  # degrees of freedom of Student's t: pixels far from the others are no reason to widen T
+_ROUNDS = 8  # of parabolas, each followed by EM
+_EM_STEPS = 60
+_NEWTON_STEPS = 3  # of each pixel between two rounds of EM, and in the end
+_LAST_STEPS = 8
+_SETTLED = 0.02  # nats: a smaller rise of the marginal likelihood per pixel ends the rounds
+_LEAST_MASS = 1e-60
+_LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN per electron
+# scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
+_LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
+_LOWEST_LOG_EXPOSURE, _LOWEST_LOG_VARIANCE = float(np.log(1e-5)), float(np.log(1e-4))
+# share of mistaken pixels up to which the fits are nearly the truth, and beyond which they are no start
+_HARDLY_ANY, _MANY = 0.003, 0.3
+_SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
+_BATCH = 1 << 19  # masses at once
+_MAD = 1.4826
+_ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
+_ARRIVED = 0.2  # nats, twice the rise that a further step promises: more, and a point is no maximum
+_APART = 4.0  # squared standard deviations between two maxima
+_RARE = 0.003
+_AGAIN = 100  # resamplings of the pixels behind the error of the centre
+_LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
+_OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not asked
+
+
+@dataclass(frozen=True)
+class Population:
+    """Student's t of theta over the pixels.
+
+    Attributes:
+        centre: m, shape (4,).
+        scatter: T, shape (4, 4).
+        uncertainty: covariance of the estimate of m, shape (4, 4).
+    """
+
+    centre: FloatArray
+    scatter: FloatArray
+    uncertainty: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Where the true theta of n pixels may lie: a mixture of Gaussians about j maxima each.
+
+    Attributes:
+        population: of all pixels.
+        theta: maxima, shape (j, n, 4).
+        covariance: shape (j, n, 4, 4).
+        weight: of the maxima, sums to 1 over j, shape (j, n).
+    """
+
+    population: Population
+    theta: FloatArray
+    covariance: FloatArray
+    weight: FloatArray
+
+    def likeliest(self) -> FloatArray:
+        """Return (H, g, mu, sigma) at the maximum of most weight, shape (n, 4)."""
+        best = self.weight.argmax(axis=0)
+        return to_parameters(self.theta[best, np.arange(best.size)])
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error."""
+        j, n = self.weight.shape
+        chosen = (rng.random(n) > np.cumsum(self.weight, axis=0)[: j - 1]).sum(axis=0)
+        every = np.arange(n)
+        covariance = self.covariance[chosen, every]
+        root = np.linalg.cholesky(covariance)
+        theta = self.theta[chosen, every] + np.einsum("nab,nb->na", root, rng.standard_normal((n, 4)))
+        sizes, axes = np.linalg.eigh(self.population.uncertainty)
+        moved = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * rng.standard_normal(4))
+        # each pixel follows the centre by as much as its own samples leave open
+        theta += covariance @ np.linalg.solve(self.population.scatter, moved)
+        return to_parameters(_inside(theta))
+
+
+def to_parameters(theta: FloatArray) -> FloatArray:
+    """Return (H, g, mu, sigma with quantisation) of theta, shape (..., 4)."""
+    found = np.empty_like(theta)
+    found[..., 0] = np.exp(theta[..., 0])
+    found[..., 1] = np.exp(-theta[..., 1])
+    found[..., 2] = theta[..., 2]
+    found[..., 3] = np.sqrt(np.exp(theta[..., 3]) + QUANTISATION_VARIANCE)
+    return found
+
+
+def to_theta(parameters: FloatArray) -> FloatArray:
+    """Return theta of (H, g, mu, sigma), shape (..., 4)."""
+    h, g, mu, sigma = np.moveaxis(parameters, -1, 0)
+    analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.05 * sigma**2)
+    return np.stack([np.log(h), -np.log(g), mu, np.log(analog)], axis=-1)
+
+
+def posterior_of(
+    counts: NDArray[np.integer],
+    origin: IntArray,
+    parameters: FloatArray,
+    law: SampleLaw | None = None,
+    *,
+    mistaken: float = 1.0,
+    seed: int = 0,
+) -> Posterior:
+    """Learn the population of the pixels from their histograms, and where each of them may lie.
+
+    Args:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        parameters: fitted (H, g, mu, sigma), shape (n, 4), NaN where there is none.
+        law: of the samples; the PCD if None.
+        mistaken: share of pixels whose bias may be off by an electron: says what starts are worth a try.
+        seed: of the choice of pixels to learn from.
+    """
+    pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw())
+    some = np.arange(len(counts))
+    if some.size > _MOST_LEARNT_FROM:
+        some = np.sort(np.random.default_rng(seed).choice(some, _MOST_LEARNT_FROM, replace=False))
+    start, population = _beginning(pixels, parameters, mistaken)
+    starts = np.stack([_shifted(start, each) for each in ((0,) if mistaken <= _HARDLY_ANY else _SHIFTS)])
+    population = _learn(pixels.of(some), starts[:, some], population)
+    return _climb(pixels, starts, population, _LAST_STEPS).posterior(population)
+
+
+def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Posterior:
+    """Learn the same from estimates (n, 4) with covariances (n, 4, 4), whose errors are taken for Gaussian.
+
+    Pixels without them are drawn like the others.
+    """
+    known = np.asarray(np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+    theta = to_theta(np.where(known[:, None], parameters, 1.0))
+    population = _first_guess(theta[known])
+    theta[~known] = population.centre
+    slope = np.stack([1 / parameters[:, 0], -1 / parameters[:, 1], np.ones(len(theta)), 2 / parameters[:, 3]])
+    error = covariance * slope.T[:, :, None] * slope.T[:, None, :]
+    information = np.zeros((1, *covariance.shape))
+    information[0, known] = np.linalg.inv(error[known] + 1e-12 * np.eye(4))
+    shape = (1, len(theta))
+    maxima = _Maxima(theta[None], np.zeros(shape), np.zeros((*shape, 4)), information, np.ones(len(theta)))
+    return maxima.posterior(_expectation_maximisation(maxima, population))
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Histograms (n, B) with the DN of their first bin (n,), and the law of their samples."""
+
+    counts: NDArray[np.integer]
+    origin: IntArray
+    law: SampleLaw
+
+    def of(self, some: NDArray[np.intp]) -> _Pixels:
+        """Return some of them."""
+        return replace(self, counts=self.counts[some], origin=self.origin[some], law=self.law.of(some))
+
+    def parabolas(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return log-likelihood (n,), score (n, 4) and Fisher's information (n, 4, 4) at theta (n, 4)."""
+        n, width = self.counts.shape
+        value, score, information = np.empty(n), np.empty((n, 4)), np.empty((n, 4, 4))
+        step = max(1, _BATCH // (5 * width))
+        for first in range(0, n, step):
+            part = slice(first, first + step)
+            own = to_parameters(theta[part])
+            columns = [np.ascontiguousarray(column) for column in own.T]
+            mass, slopes = sample_slopes(self.law.of(part), columns, self.origin[part], width)
+            # the kernel's second slope is in 1/g
+            slopes[:, 1] /= own[:, 1, None]
+            safe = np.maximum(mass, _LEAST_MASS)
+            relative = slopes / safe[:, None, :]
+            seen = self.counts[part].astype(np.float64)
+            value[part] = (seen * np.log(safe)).sum(axis=1)
+            score[part] = np.einsum("nab,nb->na", relative, seen)
+            information[part] = (slopes @ relative.transpose(0, 2, 1)) * seen.sum(axis=1)[:, None, None]
+        return value, score, information
+
+
+@dataclass
+class _Maxima:
+    """Parabolas of the log-likelihood about theta, shapes (j, n, ...), and each pixel's widening of T.
+
+    ``evidence`` is the logarithm of each pixel's marginal likelihood as of the last solution, shape (n,).
+    """
+
+    theta: FloatArray
+    value: FloatArray
+    score: FloatArray
+    information: FloatArray
+    widening: FloatArray
+    evidence: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def solve(self, population: Population) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return posterior mean (j, n, 4), covariance (j, n, 4, 4) and weight (j, n) under a population."""
+        prior = np.linalg.inv(population.scatter) / self.widening[:, None, None]
+        off = self.theta - population.centre
+        precision = self.information + prior
+        covariance = np.asarray(np.linalg.inv(precision), np.float64)
+        slope = self.score - np.einsum("nab,jnb->jna", prior, off)
+        step = np.einsum("jnab,jnb->jna", covariance, slope)
+        evidence = self.value - 0.5 * np.einsum("jna,nab,jnb->jn", off, prior, off)
+        evidence += 0.5 * (slope * step).sum(axis=2) + 0.5 * np.linalg.slogdet(covariance)[1]
+        self.evidence = np.logaddexp.reduce(evidence, axis=0) + 0.5 * np.linalg.slogdet(prior)[1]
+        weight = np.exp(evidence - evidence.max(axis=0))
+        arrived = (slope * step).sum(axis=2) < _ARRIVED
+        weight *= _distinct(self.theta + step, covariance, arrived)
+        return self.theta + step, covariance, weight / weight.sum(axis=0)
+
+    def likely(self, population: Population) -> FloatArray:
+        """Return the maxima without those kinds that hardly a pixel has, shape (i, n, 4)."""
+        share = self.solve(population)[2].mean(axis=1)
+        return np.asarray(self.theta[(share > _RARE) | (np.arange(share.size) == 0)])
+
+    def posterior(self, population: Population) -> Posterior:
+        """Return the posterior under a population."""
+        theta, covariance, weight = self.solve(population)
+        return Posterior(population, _inside(theta), covariance, weight)
+
+
+def _distinct(theta: FloatArray, covariance: FloatArray, arrived: NDArray[np.bool_]) -> FloatArray:
+    """Return 1 for each maximum that is one, and not one of the earlier ones, else 0, shape (j, n)."""
+    found = np.where(arrived, 1.0, 0.0)
+    found[0] = 1.0
+    for j in range(1, theta.shape[0]):
+        for i in range(j):
+            off = theta[j] - theta[i]
+            apart = np.einsum("na,nab,nb->n", off, np.linalg.inv(covariance[i]), off)
+            found[j] *= (apart > _APART) | (found[i] == 0.0)
+    return found
+
+
+def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: int) -> _Maxima:
+    """Find the posterior maxima near theta (j, n, 4) by damped scoring steps, each pixel by itself."""
+    j, n = theta.shape[:2]
+    flat = replace(
+        pixels, counts=np.tile(pixels.counts, (j, 1)), origin=np.tile(pixels.origin, j),
+        law=pixels.law.of(np.tile(np.arange(n), j)),
+    )  # fmt: skip
+    x = _inside(theta).reshape(-1, 4)
+    prior = np.linalg.inv(population.scatter)
+
+    def height(at: FloatArray, value: FloatArray) -> FloatArray:
+        off = at - population.centre
+        far = np.einsum("na,ab,nb->n", off, prior, off)
+        return np.asarray(value - 0.5 * (_TAILS + 4.0) * np.log1p(far / _TAILS))
+
+    value, score, information = flat.parabolas(x)
+    top, share = height(x, value), np.ones(len(x))
+    for _ in range(steps):
+        active = np.flatnonzero(share > 1e-3)
+        if active.size == 0:
+            break
+        off = x[active] - population.centre
+        far = np.einsum("na,ab,nb->n", off, prior, off)
+        pull = prior / ((_TAILS + far) / (_TAILS + 4.0))[:, None, None]
+        slope = score[active] - np.einsum("nab,nb->na", pull, off)
+        step = np.linalg.solve(information[active] + pull, slope[:, :, None])[:, :, 0]
+        promised = 0.5 * (step * slope).sum(axis=1)
+        limit = np.tile(_LARGEST_STEP, (active.size, 1))
+        limit[:, 2] *= np.exp(x[active, 1])
+        step *= np.minimum(1.0, (limit / np.maximum(np.abs(step), 1e-300)).min(axis=1))[:, None]
+        trial = _inside(x[active] + share[active, None] * step)
+        some = flat.of(active)
+        new = some.parabolas(trial)
+        better = height(trial, new[0]) > top[active]
+        took = active[better]
+        x[took], value[took], score[took], information[took] = (
+            trial[better], new[0][better], new[1][better], new[2][better],
+        )  # fmt: skip
+        top[took] = height(x[took], value[took])
+        share[took] = np.minimum(1.0, 2.0 * share[took])
+        share[active[~better]] *= 0.3
+        share[active[promised < 1e-3]] = 0.0
+    off = x - population.centre
+    far = np.einsum("na,ab,nb->n", off, prior, off)
+    wide = ((_TAILS + far) / (_TAILS + 4.0)).reshape(j, n).min(axis=0)
+    return _Maxima(
+        x.reshape(j, n, 4), value.reshape(j, n), score.reshape(j, n, 4), information.reshape(j, n, 4, 4), wide
+    )
+
+
+def _learn(pixels: _Pixels, theta: FloatArray, population: Population) -> Population:
+    """Return the population that makes the histograms likeliest; a centre that has an uncertainty stays."""
+    before = -np.inf
+    for _ in range(_ROUNDS):
+        maxima = _climb(pixels, theta, population, _NEWTON_STEPS)
+        population = _expectation_maximisation(maxima, population)
+        theta = maxima.likely(population)
+        now = float(maxima.evidence.mean())
+        if abs(now - before) < _SETTLED:
+            break
+        before = now
+    return population
+
+
+def _expectation_maximisation(maxima: _Maxima, population: Population) -> Population:
+    """Return centre (unless held) and scatter that maximise the marginal likelihood of the parabolas."""
+    hold = bool(population.uncertainty.any())
+    for _ in range(_EM_STEPS):
+        mean, covariance, weight = maxima.solve(population)
+        off = mean - population.centre
+        prior = np.linalg.inv(population.scatter)
+        far = np.einsum("jna,ab,jnb->jn", off, prior, off) + np.einsum("ab,jnba->jn", prior, covariance)
+        maxima.widening = (_TAILS + (weight * far).sum(axis=0)) / (_TAILS + 4.0)
+        share = weight / maxima.widening
+        centre = population.centre if hold else np.einsum("jn,jna->a", share, mean) / share.sum()
+        off = mean - centre
+        scatter = np.einsum("jn,jna,jnb->ab", share, off, off) + np.einsum("jn,jnab->ab", share, covariance)
+        population = replace(population, centre=centre, scatter=_at_least(scatter / weight.sum()))
+    return population
+
+
+def _at_least(scatter: FloatArray) -> FloatArray:
+    """Return a scatter with at least the least one along every direction."""
+    white = scatter / np.outer(_LEAST_SCATTER, _LEAST_SCATTER)
+    sizes, axes = np.linalg.eigh((white + white.T) / 2.0)
+    full = (axes * np.maximum(sizes, 1.0)) @ axes.T
+    return np.asarray(full * np.outer(_LEAST_SCATTER, _LEAST_SCATTER))
+
+
+def _inside(theta: FloatArray) -> FloatArray:
+    """Return theta with some exposure and some read noise."""
+    found = theta.copy()
+    found[..., 0] = np.maximum(found[..., 0], _LOWEST_LOG_EXPOSURE)
+    found[..., 3] = np.maximum(found[..., 3], _LOWEST_LOG_VARIANCE)
+    return found
+
+
+def _beginning(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> tuple[FloatArray, Population]:
+    """Return a start of theta (n, 4) and of the population: from the fits, or from all pixels' cumulants.
+
+    Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.
+    """
+    mean, k = _cumulants(pixels)
+    centre = _centre_of(mean, k.mean(axis=1))
+    start = np.tile(centre, (mean.size, 1))
+    start[:, 2] = mean - np.exp(centre[0] + centre[1])
+    known = np.asarray(np.isfinite(parameters).all(axis=1))
+    if known.any() and mistaken <= _MANY:
+        fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
+        return fits, _first_guess(fits[known])
+    rng = np.random.default_rng(k.shape[1])
+    again = [
+        _centre_of(mean, k[:, rng.integers(k.shape[1], size=k.shape[1])].mean(axis=1)) for _ in range(_AGAIN)
+    ]
+    off = np.clip(np.array(again) - centre, -_LARGEST_ERROR, _LARGEST_ERROR)
+    # mu follows H and 1/g: their product is known far better than both
+    off[:, 2] = np.exp(centre[0] + centre[1]) * -np.expm1(off[:, 0] + off[:, 1])
+    scatter = np.diag(np.maximum(_ALIKE, [0, 0, mean.std(), 0]) ** 2)
+    return start, Population(centre, scatter, off.T @ off / len(off))
+
+
+def _centre_of(mean: FloatArray, k: FloatArray) -> FloatArray:
+    """Return theta of pixels that are alike, of their means (n,) and mean cumulants 2 to 4, DN^j.
+
+    ``k_2 = sigma^2 + H / g^2, k_3 = H / g^3, k_4 = H / g^4``.
+    """
+    k2, k3, k4 = np.maximum(k, 1e-3)
+    step = k4 / k3
+    electrons = k3 / step**3
+    variance = max(k2 - QUANTISATION_VARIANCE - k3 / step, 0.02 * k2)
+    return np.array([np.log(electrons), np.log(step), np.median(mean) - electrons * step, np.log(variance)])
+
+
+def _cumulants(pixels: _Pixels) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of each pixel (n,), and the cumulants 2 to 4 of those that do not stand out, (3, m)."""
+    codes = pixels.origin[:, None] + np.arange(pixels.counts.shape[1])
+    seen = pixels.counts.astype(np.float64)
+    total = np.maximum(seen.sum(axis=1), 1.0)
+    mean = (seen * codes).sum(axis=1) / total
+    off = codes - mean[:, None]
+    m2, m3, m4 = ((seen * off**j).sum(axis=1) / total for j in (2, 3, 4))
+    n = np.maximum(total, 5.0)
+    # Fisher's k-statistics, which are unbiased
+    k = np.stack(
+        [
+            m2 * n / (n - 1.0),
+            m3 * n**2 / ((n - 1.0) * (n - 2.0)),
+            n**2 * ((n + 1.0) * m4 - 3.0 * (n - 1.0) * m2**2) / ((n - 1.0) * (n - 2.0) * (n - 3.0)),
+        ]
+    )
+    apart = np.abs(k - np.median(k, axis=1)[:, None])
+    usual = (apart <= _OUTLYING * np.median(apart, axis=1)[:, None]).all(axis=0)
+    return mean, k[:, usual]
+
+
+def _first_guess(theta: FloatArray) -> Population:
+    """Return centre and scatter of the fits by robust figures, along the axes."""
+    centre = np.median(theta, axis=0)
+    scatter = _MAD * np.median(np.abs(theta - centre), axis=0)
+    return Population(centre, np.diag(np.maximum(scatter, 5.0 * _LEAST_SCATTER) ** 2))
+
+
+def _shifted(theta: FloatArray, electrons: int) -> FloatArray:
+    """Return theta with the bias so many electrons higher, and the mean as it was."""
+    found = theta.copy()
+    h = np.exp(theta[:, 0])
+    moved = np.maximum(h - electrons, 0.2 * h)
+    found[:, 0] = np.log(moved)
+    found[:, 2] = theta[:, 2] + (h - moved) * np.exp(theta[:, 1])
+    return found

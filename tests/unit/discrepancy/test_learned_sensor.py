@@ -1,0 +1,119 @@
+"""Sensors for simulations: their pixels scatter as the true parameters do, not as fitted ones."""
+
+import numpy as np
+import pytest
+from helpers.plain_camera import PlainCamera
+
+from pchem_pipeline.discrepancy.by_simulation.maps import Refit, learn_sensor
+from pchem_pipeline.discrepancy.by_simulation.population import posterior_of_estimates, to_theta
+from pchem_pipeline.discrepancy.by_simulation.replicate import (
+    Acquisition,
+    Replicate,
+    by_part,
+    simulate_frames,
+    truth_of,
+)
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+SPREAD = (0.25, 0.015, 0.06, 3.0)
+
+
+def logs(maps, some):
+    every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    return to_theta(np.stack([values[some] for values in every], axis=1))
+
+
+def learnt(camera, seed):
+    """Return the truth (n, 4), the fits' evidence, and the sensor learnt from the same frames."""
+    exposure, step, bias, noise = camera.maps(np.random.default_rng(seed))
+    truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
+    frames = camera.frames(seed)
+    seen = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=50)
+    fit = Refit(seen.maps, {}, seen.covariance)
+    return truth, seen, learn_sensor(frames, np.arange(len(frames)), fit, (), seen.ambiguous)
+
+
+def test_pixels_of_a_noisy_sensor_scatter_as_the_true_ones():
+    """At 0.5 e- and 600 frames the fits scatter several times as much in gain and noise as the truth does."""
+    truth, seen, sensor = learnt(PlainCamera(0.5, 1.5, 12.0, (24, 24), 600, SPREAD), 3)
+    every = sensor.drawn
+    fits = logs(seen.maps, seen.maps.usable)
+    drawn = logs(sensor.draw(1), every)
+    spread, real = drawn.std(axis=0), truth[every].std(axis=0)
+    assert (fits.std(axis=0) > 3 * real)[[1, 3]].all()
+    assert (spread > 0.6 * real).all()
+    assert (spread < np.minimum(4 * real, fits.std(axis=0))).all()
+    # the middle of all pixels lies within its error
+    far = sensor.posterior.population.centre - np.median(truth[every], axis=0)
+    assert (np.abs(far) < 4 * np.sqrt(np.diag(sensor.posterior.population.uncertainty))).all()
+    # and it is the same pixel that is bright or has a high bias
+    assert np.corrcoef(drawn[:, 0], truth[every][:, 0])[0, 1] > 0.7
+    assert np.corrcoef(drawn[:, 2], truth[every][:, 2])[0, 1] > 0.7
+
+
+def test_pixels_of_a_sharp_sensor_stay_what_they_are():
+    _, seen, sensor = learnt(PlainCamera(0.22, 1.5, 12.0, (16, 16), 1500, SPREAD), 4)
+    some = seen.maps.usable
+    error = np.sqrt(np.diagonal(seen.covariance[some], axis1=1, axis2=2))
+    off = (sensor.draw(1).bias - seen.maps.bias)[some] / error[:, 2]
+    assert abs(off.mean()) < 5 / np.sqrt(off.size)
+    # drawn within the error of the fit
+    assert 0.7 < off.std() < 1.3
+    assert (sensor.usual(1).usable == some).all()
+
+
+def test_errors_of_estimates_are_taken_off():
+    rng = np.random.default_rng(5)
+    n, size = 3000, np.array([0.1, 0.03, 0.5, 0.1])
+    truth = np.array([0.5, 2.4, 100.0, 2.5]) + np.array([0.3, 0.02, 0.5, 0.1]) * rng.standard_normal((n, 4))
+    scale = rng.uniform(0.5, 1.5, n)
+    theta = truth + scale[:, None] * size * rng.standard_normal((n, 4))
+    parameters = np.stack(
+        [np.exp(theta[:, 0]), np.exp(-theta[:, 1]), theta[:, 2], np.sqrt(np.exp(theta[:, 3]) + 1 / 12)],
+        axis=1,
+    )
+    slope = np.stack([parameters[:, 0], -parameters[:, 1], np.ones(n), 0.5 * parameters[:, 3]], axis=1)
+    covariance = np.einsum("na,ab->nab", (scale[:, None] * size * slope) ** 2, np.eye(4))
+    drawn = to_theta(posterior_of_estimates(parameters, covariance).draw(rng))
+    # the variance of C = T + E scatters by sqrt(2/n) of itself, and E is taken off
+    limit = 5 * np.sqrt(2 / n) * theta.var(axis=0)
+    assert (np.abs(drawn.var(axis=0) - truth.var(axis=0)) < limit).all()
+    assert (np.abs(theta.var(axis=0) - truth.var(axis=0)) > limit)[1:].all()
+
+
+def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
+    """Begun at the truth, hardly a fit is an electron off; treated as the data are, as many as of frames."""
+    rng = np.random.default_rng(5)
+    shape = (32, 32)
+    ones = np.ones(shape)
+    maps = PixelMaps(2.7 * ones, ones / 11, 100 + rng.standard_normal(shape), 0.41 * 11 * ones, ones > 0)
+    numbers = np.arange(600)
+    known = Acquisition(numbers, 1200, 50, 12)
+    anew = Acquisition(numbers, 1200, 50, 12, other=np.arange(600, 1200))
+    truth = truth_of(maps).bias
+
+    def mistaken(taken, seed):
+        found = Replicate("x", maps, (), seed, taken).evidence()[0].maps
+        return np.mean(np.abs(found.bias - truth)[found.usable] > 0.5 * 11)
+
+    assert mistaken(known, 1) < 0.005
+    first, second = mistaken(anew, 1), mistaken(anew, 2)
+    assert first > 0.03
+    # two binomial shares
+    assert abs(first - second) < 5 * np.sqrt(2 * first * (1 - first) / maps.usable.sum())
+    # the frames of a split do not depend on what else is simulated
+    both = simulate_frames(maps, (), 1, Acquisition(np.arange(1200), 1200, 50, 12))
+    assert (simulate_frames(maps, (), 1, known) == both[:600]).all()
+
+
+def test_a_replicate_of_two_parts_has_the_statistics_of_both():
+    ones = np.ones((16, 16))
+    maps = PixelMaps(1.5 * ones, ones / 10, 100 * ones, 3.0 * ones, ones > 0)
+    taken = Acquisition(np.arange(200), 400, 20, 12, other=np.arange(200, 400))
+    found = by_part(Replicate("x", maps, (), 1, taken)())
+    assert len(found) == 2
+    assert found[0].keys() == found[1].keys()
+    assert found[0]["shape.C2.mean"] != pytest.approx(found[1]["shape.C2.mean"])
+    [alone] = by_part(Replicate("x", maps, (), 1, Acquisition(np.arange(200), 400, 20, 12))())
+    assert alone.keys() == found[0].keys()
