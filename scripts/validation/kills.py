@@ -1,0 +1,241 @@
+#!/usr/bin/env python3
+"""Kill commands at random moments (SIGKILL, with their workers), resume them, compare with what they do in peace.
+
+``.venv/bin/python scripts/validation/kills.py --kills 200`` kills `run`, `discrepancy`, `joint`, `electrons`,
+`report` and `ingest --append` in turn, each of a small sensor, up to three times before it may end, and
+compares every array of the store bit by bit, the verdict, and the numbers of the report (but for times and
+paths). It prints a line for each command that was killed, and ends with 1 where one of them differs or cannot
+go on.
+"""
+
+import argparse
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+PCHEM = str(Path(sys.executable).with_name("pchem"))
+
+CAMERA = """
+run: {{store: {name}.zarr, tile: 8}}
+compute: {{backend: {backend}, workers: 2}}
+simulate:
+  shape: [16, 16]
+  n_frames: 900
+  seed: {seed}
+  sensor_seed: 3
+  output: {name}_frames
+  format: npy
+  frames_per_file: 300
+  integration_time: {time}
+  effects: [{{tag: row_noise, row_noise_dn: 1.2}}]
+discrepancy: {{replicates: 8, extended_replicates: 4, candidates: [row_noise]}}
+report: {{figure_formats: [], dpi: 72}}
+"""
+
+JOINT = """
+run: {store: joint.zarr, tile: 8}
+compute: {backend: threads, workers: 2}
+input: {samples: [{run: a.yaml}, {run: b.yaml}]}
+report: {figure_formats: [], dpi: 72}
+"""
+
+#: numbers that tell when and how long, or where
+_PASSING = re.compile(
+    r"second|time|date|rss|cpu|started|path|version|elapsed|host|base_dir|config$|memory", re.I
+)
+
+
+@dataclass(frozen=True)
+class Work:
+    """A command that is killed.
+
+    Attributes:
+        name: what it is called here.
+        command: arguments of ``pchem``.
+        before: commands that bring about what it begins with.
+        store: what it changes.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    before: tuple[tuple[str, ...], ...]
+    store: str
+
+
+WORKS = (
+    Work("run", ("run", "a.yaml"), (("simulate", "a.yaml"),), "a.zarr"),
+    Work("discrepancy", ("discrepancy", "a.yaml"), (("run", "a.yaml", "--until", "ensemble"),), "a.zarr"),
+    Work("joint", ("run", "joint.yaml"), (("simulate", "a.yaml"), ("simulate", "b.yaml")), "joint.zarr"),
+    Work("electrons", ("electrons", "a.yaml"), (("run", "a.yaml", "--until", "ensemble"),), "a.zarr"),
+    Work("report", ("report", "a.yaml"), (("run", "a.yaml", "--until", "ensemble"),), "a.zarr"),
+    Work("append", ("ingest", "a.yaml", "--append"), (("run", "part.yaml", "--until", "maps"),), "a.zarr"),
+)
+
+
+class Bench:
+    """A folder in which commands run, and copies of its states."""
+
+    def __init__(self, folder: Path, backend: str) -> None:
+        self.folder, self.case = folder, folder / "case"
+        self._backend = backend
+        self._states: dict[tuple[Any, ...], Path] = {}
+
+    def pchem(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start a command in a process group of its own."""
+        return subprocess.Popen(
+            [PCHEM, *arguments, "--quiet"],
+            cwd=self.case,
+            text=True,
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+
+    def ok(self, *arguments: str) -> float:
+        """Run a command to its end, which must be good; return its seconds."""
+        start = time.perf_counter()
+        _, words = (process := self.pchem(*arguments)).communicate()
+        if process.returncode not in (0, 3):  # 3: a verdict with something to say
+            raise AssertionError(f"pchem {' '.join(arguments)}: {process.returncode}: {words[-400:]}")
+        return time.perf_counter() - start
+
+    def begin(self, work: Work) -> None:
+        """Bring the folder to the state in which a command begins."""
+        if work.before not in self._states:
+            self._start_anew()
+            for command in work.before:
+                if command[1] == "part.yaml":
+                    self._first_files_only()
+                self.ok(*command)
+            saved = self.folder / f"state{len(self._states)}"
+            shutil.copytree(self.case, saved)
+            self._states[work.before] = saved
+        shutil.rmtree(self.case, ignore_errors=True)
+        shutil.copytree(self._states[work.before], self.case)
+
+    def _start_anew(self) -> None:
+        shutil.rmtree(self.case, ignore_errors=True)
+        self.case.mkdir(parents=True)
+        for seed, (name, seconds) in enumerate((("a", 2.0), ("b", 6.0))):
+            text = CAMERA.format(name=name, seed=seed, time=seconds, backend=self._backend)
+            (self.case / f"{name}.yaml").write_text(text)
+        (self.case / "joint.yaml").write_text(JOINT)
+        self.ok("simulate", "a.yaml")
+
+    def _first_files_only(self) -> None:
+        """Write the YAML of the first two of three files, which `append` goes on from."""
+        files = sorted(path.name for path in (self.case / "a_frames").glob("*.npy"))
+        shown = ", ".join(f"a_frames/{name}" for name in files)
+        first = ", ".join(f"a_frames/{name}" for name in files[:-1])
+        text = (self.case / "a.yaml").read_text()
+        text = re.sub(r"simulate:\n(  .*\n)*", "input: {{files: [{}], integration_time: 2.0}}\n", text)
+        (self.case / "part.yaml").write_text(text.format(first))
+        (self.case / "a.yaml").write_text(text.format(shown))
+
+
+def results(store: Path) -> dict[str, Any]:
+    """Return all arrays of a run, its verdict, and the numbers of its report."""
+    found: dict[str, Any] = {}
+    for path in sorted(store.rglob("zarr.json")):
+        record = json.loads(path.read_text())
+        if record["node_type"] == "array":
+            found[str(path.parent.relative_to(store))] = zarr.open_array(path.parent, mode="r")[...]
+    for path in (*store.glob("*.json"), *store.glob("model/*.json")):
+        if path.name != "zarr.json":
+            found[str(path.relative_to(store))] = lasting(json.loads(path.read_text()))
+    return found
+
+
+def lasting(content: Any) -> Any:
+    """Return JSON data without what tells when, how long and where."""
+    if isinstance(content, dict):
+        return {key: lasting(value) for key, value in content.items() if not _PASSING.search(key)}
+    return [lasting(each) for each in content] if isinstance(content, list) else content
+
+
+def differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """Return the names of what is not the same to the bit."""
+    names = found.keys() ^ expected.keys()
+    for name in found.keys() & expected.keys():
+        one, other = found[name], expected[name]
+        if isinstance(one, np.ndarray):
+            same = one.shape == other.shape and one.dtype == other.dtype and one.tobytes() == other.tobytes()
+        else:
+            same = one == other
+        names |= set() if same else {name}
+    return sorted(names)
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    """Kill a command with its workers."""
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--backend", default="threads", choices=["threads", "processes"])
+    parser.add_argument("--only", help="names of commands, with commas")
+    options = parser.parse_args()
+    rng = random.Random(options.seed)
+    bench = Bench(Path(tempfile.mkdtemp(prefix="kills_")), options.backend)
+    works = [work for work in WORKS if options.only is None or work.name in options.only.split(",")]
+    expected, seconds = {}, {}
+    for work in works:
+        bench.begin(work)
+        seconds[work.name] = bench.ok(*work.command)
+        expected[work.name] = results(bench.case / work.store)
+        print(
+            f"{work.name}: {seconds[work.name]:.1f} s in peace, {len(expected[work.name])} results",
+            flush=True,
+        )
+    kills: Counter[str] = Counter()
+    wrong: list[str] = []
+    while sum(kills.values()) < options.kills:
+        work = works[sum(kills.values()) % len(works)]
+        bench.begin(work)
+        moments = []
+        for _ in range(rng.randint(1, 3)):
+            process = bench.pchem(*work.command)
+            moments.append(rng.uniform(0.0, seconds[work.name]))
+            try:
+                process.wait(timeout=moments[-1])
+            except subprocess.TimeoutExpired:
+                kill(process)
+                kills[work.name] += 1
+                continue
+            process.communicate()
+            break
+        try:
+            bench.ok(*work.command)
+            other = differences(results(bench.case / work.store), expected[work.name])
+            words = f"differs: {', '.join(other[:8])}" if other else "same"
+        except AssertionError as error:
+            words = f"cannot go on: {error}"
+        if words != "same":
+            wrong.append(f"{work.name} {words}")
+            shutil.copytree(bench.case, bench.folder / f"wrong{len(wrong)}")
+        shown = " ".join(f"{moment:.2f}" for moment in moments)
+        print(f"{sum(kills.values()):4d} {work.name}: stopped at {shown} s: {words}", flush=True)
+    print(f"{sum(kills.values())} kills ({dict(kills)}), {len(wrong)} wrong; in {bench.folder}")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
