@@ -226,11 +226,19 @@ def _address(scheduler: str) -> dict[str, str]:
 def _cluster_class(name: str) -> Any:
     import importlib
 
+    from distributed.deploy.cluster import Cluster
+
     module, _, attribute = name.rpartition(".")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"compute.cluster.class: cannot import {name} ({error})") from error
+    # the YAML may be somebody else's: it must not call just anything
+    if not (isinstance(found, type) and issubclass(found, Cluster)):
+        raise ConfigError(
+            f"compute.cluster.class: {name} is no cluster of dask; name one, such as distributed.LocalCluster"
+        )
+    return found
 
 
 def library_versions() -> dict[str, str]:

@@ -71,6 +71,8 @@ def write_atomic(path: Path, data: bytes, *, sync: bool | Callable[[Path], None]
         StoreError: the file system, or the object storage, refused.
     """
     if isinstance(path, RemotePath):
+        if callable(sync):
+            sync(path)
         path.write_bytes(data)
         return
     before, after = (disk.sync_file, disk.sync_folder) if sync is True else (sync or None, None)
@@ -215,5 +217,5 @@ def read_json(path: Path) -> Any | None:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
         return None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged ({error}); delete it and run the stage again") from error

@@ -13,6 +13,7 @@ import functools
 import hashlib
 import re
 from collections.abc import Callable, Generator
+from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
@@ -30,7 +31,13 @@ _URL = re.compile(r"^([a-z][a-z0-9+.-]+):/+(.*)$", re.DOTALL)
 class RemoteError(StoreError, OSError):
     """The object storage refused, or did not answer."""
 
-    __str__ = Exception.__str__
+    __str__ = StoreError.__str__
+
+
+class UndefinedError(StoreError, AttributeError):
+    """A method of paths that an object storage has not."""
+
+    __str__ = StoreError.__str__
 
 
 def refused(where: object, error: BaseException) -> RemoteError:
@@ -55,7 +62,7 @@ def _asked(method: F) -> F:
     def ask(self: RemotePath, *args: Any, **kwargs: Any) -> Any:
         try:
             return method(self, *args, **kwargs)
-        except (FileNotFoundError, StoreError, MissingDependencyError):
+        except (FileNotFoundError, FileExistsError, StoreError, MissingDependencyError):
             raise
         except Exception as error:  # each kind of storage has errors of its own
             raise refused(self, error) from error
@@ -149,6 +156,38 @@ class RemotePath(_Pure):
         content = bytes(data)
         self.storage.pipe_file(str(self), content)
         return len(content)
+
+    @_asked
+    def create_bytes(self, data: bytes) -> None:
+        """Put an object where there is none, which of several that try at once only one can.
+
+        Raises:
+            FileExistsError: there is one.
+        """
+        try:
+            self.storage.pipe_file(str(self), data, mode="create")
+        except Exception as error:
+            if "NotImplemented" not in f"{type(error).__name__} {error}":
+                raise
+            if self.exists():  # a server that knows no conditions
+                raise FileExistsError(str(self)) from error
+            self.write_bytes(data)
+
+    @_asked
+    def modified(self) -> datetime:
+        """Return when the object was put, by the clock of the storage."""
+        found: datetime = self.storage.modified(str(self))
+        return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+    def __getattr__(self, name: str) -> NoReturn:
+        """Refuse what a disk can do and an object storage cannot.
+
+        Raises:
+            UndefinedError: always.
+        """
+        if not name.startswith("_") and hasattr(Path, name):
+            raise UndefinedError(f"{self}: an object storage cannot do that ({name}); use a store on a disk")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def write_text(self, data: str, encoding: str | None = None, *unused: Any, **more: Any) -> int:
         """Put a text in the place of an older one."""

@@ -10,8 +10,8 @@ run.zarr/
                          progress.json while a command works on it
 ```
 
-The same objects make a run on an object storage, whose path is a URL; there the lock holds on one machine
-only.
+The same objects make a run on an object storage, whose path is a URL; there ``lock.json`` is the lock for all
+machines, beside one of this machine in the user's cache.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,6 +32,7 @@ from pchem_pipeline.base.errors import LockedError, PchEmError, StoreError, quot
 from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import is_blank, remove_file, remove_folder, storage_error, write_atomic
+from pchem_pipeline.store.lease import check_lease, leased
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused
 
@@ -178,13 +179,24 @@ class RunStore:
         """
         import zarr
 
+        from pchem_pipeline.store.zarr_store import foreign_codecs
+
         try:
             with _one_line(self.path, f"{self.path}: {name}"):
                 found = self._root[name]
         except KeyError as error:
             raise StoreError(f"{self.path} has no {name}; run the stage that writes it") from error
+        except (ValueError, TypeError) as error:
+            raise StoreError(
+                f"{self.path}: {name} is damaged ({error}); redo the stage that writes it with --force"
+            ) from error
         if not isinstance(found, zarr.Array):
             raise StoreError(f"{self.path}: {name} is not an array; start the run again")
+        if foreign := foreign_codecs(found):
+            raise StoreError(
+                f"{self.path}: {name} is coded by {', '.join(foreign)}, which this program never writes and "
+                "which may run code; do not use this store"
+            )
         return found
 
     def read(self, name: str, region: _Region | None = None) -> NDArray[Any]:
@@ -266,6 +278,7 @@ class RunStore:
             StoreError: the disk could not take them.
         """
         if isinstance(self.path, RemotePath):  # an object that was put is stored
+            check_lease(self.path)
             return
         try:
             unsynced = disk.unsynced(self.path)
@@ -297,10 +310,17 @@ class RunStore:
         except OSError as error:
             raise storage_error(error, private) from error
         try:
-            self._remove_unfinished()
-            yield
+            with self._leased():
+                self._remove_unfinished()
+                yield
         finally:
             lock.release()
+
+    def _leased(self) -> AbstractContextManager[None]:
+        """Return the lock for all machines that an object storage needs; a lock of files is one."""
+        if not isinstance(self.path, RemotePath):
+            return nullcontext()
+        return leased(self.path / _PRIVATE / "lock.json", self.path)
 
     def _remove_unfinished(self) -> None:
         """Remove what a killed process left, and descriptions of arrays that a power cut left empty.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,17 @@ from zarr.storage import FsspecStore, LocalStore
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = ["DiskStore", "zarr_store"]
+__all__ = ["DiskStore", "foreign_codecs", "zarr_store"]
+
+#: codecs that only turn bytes into numbers; others (pickle, ...) may run code of whoever wrote them
+_PLAIN = frozenset(
+    {
+        *("bytes", "transpose", "sharding_indexed"),
+        *("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd"),
+        *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),
+        *("delta", "shuffle", "bitround", "fixedscaleoffset", "quantize", "packbits", "astype"),
+    }
+)
 
 
 class DiskStore(LocalStore):
@@ -50,6 +61,22 @@ class DiskStore(LocalStore):
     async def delete_dir(self, prefix: str) -> None:
         """Remove all values below a name."""
         await self.delete(prefix)
+
+
+def foreign_codecs(array: Any) -> list[str]:
+    """Return the names of an array's codecs that may do more than turn bytes into numbers."""
+    content = array.metadata.to_dict()
+    coded = [content.get("compressor"), *(content.get("filters") or ()), *(content.get("codecs") or ())]
+    names: list[str] = []
+    while coded:
+        codec = coded.pop()
+        if isinstance(codec, Mapping):
+            names.append(str(codec.get("name", codec.get("id"))).removeprefix("numcodecs."))
+            inside = codec.get("configuration") or {}
+            coded += [*inside.get("codecs", ()), *inside.get("index_codecs", ())]
+        elif codec is not None:  # an object of the library, with its own description
+            coded.append(codec.get_config() if hasattr(codec, "get_config") else codec.to_dict())
+    return sorted(set(names) - _PLAIN - {name for name in names if name.startswith("imagecodecs_")})
 
 
 def zarr_store(path: Path, *, writable: bool) -> Store:

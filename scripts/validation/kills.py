@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Kill commands at random moments (SIGKILL, with their workers), resume them, compare with what they do in peace.
+"""Kill commands at random moments (SIGKILL, with their workers), resume them, compare with undisturbed ones.
 
 ``.venv/bin/python scripts/validation/kills.py --kills 200`` kills `run`, `discrepancy`, `joint`, `electrons`,
 `report` and `ingest --append` in turn, each of a small sensor, up to three times before it may end, and
@@ -42,7 +42,7 @@ simulate:
   frames_per_file: 300
   integration_time: {time}
   effects: [{{tag: row_noise, row_noise_dn: 1.2}}]
-discrepancy: {{replicates: 8, extended_replicates: 4, candidates: [row_noise]}}
+discrepancy: {{replicates: 20, extended_replicates: 12, candidates: [row_noise]}}
 report: {{figure_formats: [], dpi: 72}}
 """
 
@@ -142,9 +142,9 @@ class Bench:
         shown = ", ".join(f"a_frames/{name}" for name in files)
         first = ", ".join(f"a_frames/{name}" for name in files[:-1])
         text = (self.case / "a.yaml").read_text()
-        text = re.sub(r"simulate:\n(  .*\n)*", "input: {{files: [{}], integration_time: 2.0}}\n", text)
-        (self.case / "part.yaml").write_text(text.format(first))
-        (self.case / "a.yaml").write_text(text.format(shown))
+        text = re.sub(r"simulate:\n(  .*\n)*", "input: {files: [FILES], integration_time: 2.0}\n", text)
+        (self.case / "part.yaml").write_text(text.replace("FILES", first))
+        (self.case / "a.yaml").write_text(text.replace("FILES", shown))
 
 
 def results(store: Path) -> dict[str, Any]:
@@ -156,15 +156,17 @@ def results(store: Path) -> dict[str, Any]:
             found[str(path.parent.relative_to(store))] = zarr.open_array(path.parent, mode="r")[...]
     for path in (*store.glob("*.json"), *store.glob("model/*.json")):
         if path.name != "zarr.json":
-            found[str(path.relative_to(store))] = lasting(json.loads(path.read_text()))
+            found |= lasting(str(path.relative_to(store)), json.loads(path.read_text()))
     return found
 
 
-def lasting(content: Any) -> Any:
-    """Return JSON data without what tells when, how long and where."""
-    if isinstance(content, dict):
-        return {key: lasting(value) for key, value in content.items() if not _PASSING.search(key)}
-    return [lasting(each) for each in content] if isinstance(content, list) else content
+def lasting(name: str, content: Any) -> dict[str, Any]:
+    """Return the values of JSON data by their places, without those that tell when, how long and where."""
+    if not isinstance(content, (dict, list)):
+        return {name: content}
+    pairs = content.items() if isinstance(content, dict) else enumerate(content)
+    kept = [(key, value) for key, value in pairs if not _PASSING.search(str(key))]
+    return {place: each for key, value in kept for place, each in lasting(f"{name}/{key}", value).items()}
 
 
 def differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
@@ -225,7 +227,7 @@ def main() -> int:
         try:
             bench.ok(*work.command)
             other = differences(results(bench.case / work.store), expected[work.name])
-            words = f"differs: {', '.join(other[:8])}" if other else "same"
+            words = f"differs: {len(other)}: {', '.join(other[:8])}" if other else "same"
         except AssertionError as error:
             words = f"cannot go on: {error}"
         if words != "same":

@@ -14,12 +14,16 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from helpers.commands import RUN, arrays_of
+from helpers.flaky_proxy import FlakyProxy
 
 from pchem_pipeline.store.remote_path import lock_folder, place_of
 
 pytestmark = pytest.mark.skipif(
     find_spec("moto") is None or find_spec("s3fs") is None, reason='pip install ".[dev]" brings moto and s3fs'
 )
+
+
+SECRET = b"wJalrXUtnFEMI"
 
 
 def ask(url, data=None, method="GET"):
@@ -62,7 +66,7 @@ def cloud(shell, server, tmp_path):
     shell.environment |= {
         "AWS_ENDPOINT_URL": server,
         "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_SECRET_ACCESS_KEY": SECRET.decode(),
         "AWS_DEFAULT_REGION": "us-east-1",
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }
@@ -187,6 +191,57 @@ def test_a_store_on_s3_is_locked_on_this_machine(cloud, frames, monkeypatch):
         result = cloud("ingest", "run.yaml")
     assert result.code == 75
     assert "s3://lab/night/run.zarr is in use" in result.last
+
+
+def test_a_store_on_s3_is_locked_for_all_machines(cloud, server, frames):
+    (cloud.folder / "run.yaml").write_text(STORED)
+    cloud.ok("ingest", "run.yaml")
+    lock = f"{server}/lab/night/run.zarr/.pchem/lock.json"
+    put(lock, b'{"token": "x", "host": "far", "machine": "far 1", "pid": 7}')
+    result = cloud("ingest", "run.yaml")
+    assert result.code == 75
+    assert "s3://lab/night/run.zarr is in use by pchem on far (process 7, last sign of life" in result.last
+    assert result.last.endswith("where that process is gone, remove s3://lab/night/run.zarr/.pchem/lock.json")
+    ask(lock, method="DELETE")
+    cloud.ok("ingest", "run.yaml")
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        ask(lock)
+
+
+def one_in_seven(number, method, path):
+    return "ok" if number % 7 else ("500", "503", "slow", "cut", "lost")[number // 7 % 5]
+
+
+def test_a_storage_that_fails_now_and_then_changes_nothing(cloud, server, frames, finished, tmp_path):
+    (cloud.folder / "run.yaml").write_text(STORED)
+    proxy = FlakyProxy(server, one_in_seven)
+    cloud.environment["AWS_ENDPOINT_URL"] = proxy.address
+    cloud.ok("run", "run.yaml", "--until", "histogram", "--log-json", "log.jsonl")
+    proxy.end()
+    assert_same(fetched(server, tmp_path / "first"), finished, ("histogram", "summary"))
+    assert min(proxy.fates[fate] for fate in ("500", "503", "cut", "lost")) > 3
+    assert sum(proxy.requests.values()) < 700  # seen: 570, 80 of them again; a tile, some 20 arrays
+    everything = [path for path in (*cloud.folder.rglob("*"), *tmp_path.rglob("*")) if path.is_file()]
+    assert len(everything) > 40
+    assert not [path for path in everything if SECRET in path.read_bytes()]
+
+
+@pytest.mark.parametrize(
+    "fate", ["503", *(pytest.param(fate, marks=pytest.mark.long) for fate in ("500", "cut", "lost"))]
+)
+def test_a_storage_that_fails_for_good_is_one_line(cloud, server, frames, fate):
+    (cloud.folder / "run.yaml").write_text(STORED)
+    proxy = FlakyProxy(server, lambda number, method, path: fate if number > 30 else "ok")
+    cloud.environment["AWS_ENDPOINT_URL"] = proxy.address
+    start = time.monotonic()
+    result = cloud("ingest", "run.yaml")
+    proxy.end()
+    assert result.code == 4
+    assert result.stderr.count("Traceback") == 0
+    assert result.last.startswith("pchem: s3://lab/night/run.zarr")
+    assert "check address, keys and network" in result.last
+    assert SECRET.decode() not in result.stderr
+    assert time.monotonic() - start < 120
 
 
 def test_a_store_on_a_server_that_does_not_answer_is_one_line(cloud, frames):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -17,6 +18,7 @@ from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
+from pchem_pipeline.store.zarr_store import foreign_codecs
 
 __all__ = ["ZarrReader", "write_frames"]
 
@@ -47,6 +49,7 @@ class ZarrReader(FrameReader):
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         import zarr
 
+        _check_links(path)
         node = zarr.open(path, mode="r")
         if isinstance(node, zarr.Array):
             array: Any = node
@@ -57,6 +60,11 @@ class ZarrReader(FrameReader):
             )
             array = node[self._name]
             attributes = {**node.attrs, **array.attrs}
+        if foreign := foreign_codecs(array):
+            raise InputError(
+                f"{path}: {self._name or 'the array'} is coded by {', '.join(foreign)}, which may run code; "
+                "write it again with blosc, gzip or zstd"
+            )
         self._signed = check_samples(path, np.dtype(array.dtype), settings)
         self.paths = (path,)
         self.shape = stack_shape(path, array.shape, f"array {self._name}".strip())
@@ -103,6 +111,22 @@ class ZarrReader(FrameReader):
             self._array = node[self._name] if self._name else node
         except Exception as error:
             raise changed(self.paths[0], "the store vanished or broke") from error
+
+
+def _check_links(path: Path) -> None:
+    """Refuse a store whose files are not in its folder.
+
+    Raises:
+        InputError: a link leads out of it.
+    """
+    home = path.resolve()
+    for folder, folders, names in os.walk(path):
+        for name in (*folders, *names):
+            part = Path(folder) / name
+            if part.is_symlink() and home not in part.resolve().parents:
+                raise InputError(
+                    f"{path}: {part.relative_to(path)} is a link out of the store; copy its files into it"
+                )
 
 
 def _full_resolution(group: Any, settings: InputSettings) -> str | None:

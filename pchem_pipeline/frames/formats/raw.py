@@ -72,7 +72,7 @@ def _read_sidecar(path: Path) -> _Sidecar:
         raise InputError(
             f"{path}: sidecar {found.name}: {where}: {first['msg']}; correct the sidecar"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: sidecar {found.name} cannot be read ({error}); correct the sidecar"
         ) from error

@@ -90,7 +90,7 @@ def _shaped(file: Any) -> dict[str, Any]:
         return {}
     try:
         record = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return record if isinstance(record, dict) else {}
 
