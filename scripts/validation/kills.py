@@ -55,7 +55,7 @@ report: {figure_formats: [], dpi: 72}
 
 #: numbers that tell when and how long, or where
 _PASSING = re.compile(
-    r"second|time|date|rss|cpu|started|path|version|elapsed|host|base_dir|config$|memory", re.I
+    r"second|time|date|made|rss|cpu|started|path|version|elapsed|host|base_dir|config$|memory", re.I
 )
 
 

@@ -80,6 +80,7 @@ class Hdf5Reader(ContiguousReader):
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
             self.notes = _missing_chunks(path, dataset)
+            _check_chunk_sizes(path, dataset)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
             layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
@@ -149,6 +150,23 @@ def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
         f"{path.name}: {missing} of {wanted} chunks were never written; they are read as {dataset.fillvalue}"
     )
     return (words,) if missing > 0 else ()
+
+
+def _check_chunk_sizes(path: Path, dataset: Any) -> None:
+    """Refuse plain chunks of another size than their shape: the library reads beyond them, and crashes.
+
+    Raises:
+        InputError: there is one.
+    """
+    if dataset.id.get_create_plist().get_nfilters() or not hasattr(dataset.id, "chunk_iter"):
+        return
+    size = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    sizes: set[int] = set()
+    dataset.id.chunk_iter(lambda chunk: sizes.add(chunk.size))
+    if sizes - {size}:
+        raise InputError(
+            f"{path}: damaged: a chunk of {min(sizes - {size})} bytes, where {size} are needed; copy it again"
+        )
 
 
 def _plain_offsets(
