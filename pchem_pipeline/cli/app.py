@@ -19,6 +19,7 @@ from pchem_pipeline.cli.apply import apply
 from pchem_pipeline.cli.methods import methods
 from pchem_pipeline.cli.options import Progress, Quiet, Strict, Target, Workers, region_of, takes_command
 from pchem_pipeline.cli.plan import plan
+from pchem_pipeline.cli.twin import twin
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
 if TYPE_CHECKING:
@@ -208,6 +209,7 @@ def joint(
 
 
 app.command()(apply)
+app.command()(twin)
 app.command()(methods)
 app.command()(plan)
 

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.report.style.style import Drawing
+    from pchem_pipeline.use.twin import Twin
 
 __all__ = ["Pixel", "Run", "open_run"]
 
@@ -203,6 +204,55 @@ class Run:
     def truth(self) -> xr.Dataset:
         """The true parameters of a simulated camera."""
         return self.group("truth")
+
+    # -- what is done with the sensor ---------------------------------------------------------
+
+    def apply(
+        self,
+        frames: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        output: str | os.PathLike[str],
+        *,
+        what: str = "all",
+        prior: str = "frames",
+        force: bool = False,
+    ) -> xr.Dataset:
+        """Calibrate other frames of the sensor, as ``pchem apply`` does, and return the result, lazily.
+
+        Args:
+            frames: camera files, globs or folders.
+            output: zarr store to write; one that holds the same already is only opened.
+            what: electrons, numbers, exposure, separated by commas, or all.
+            prior: exposure that the electron numbers are expected to have, as on the command line.
+            force: replace calibrated frames that are there.
+
+        Raises:
+            InputError: the frames do not fit the run.
+            ConfigError: the output is something else.
+        """
+        import xarray as xr
+
+        from pchem_pipeline.commands.apply.apply import apply_to_frames
+        from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
+        from pchem_pipeline.run.session import Command
+        from pchem_pipeline.run.stage import Options
+
+        files = [frames] if isinstance(frames, (str, os.PathLike)) else list(frames)
+        command = Command(Options(force=force), quiet=True, progress="off")
+        wanted = ApplySettings(kinds_of(what), prior)
+        [place] = apply_to_frames(self._target, [str(f) for f in files], Path(output), wanted, command)
+        found: xr.Dataset = xr.open_zarr(str(place), group="applied", consolidated=False, chunks=None)
+        return found
+
+    def twin(self, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:
+        """Return the camera as it was measured, to simulate with: ``run.twin().frames(scene, n)``.
+
+        Args:
+            redraw: seed with which the maps are drawn within their errors; None: the estimates themselves.
+            shape: rows and columns of another sensor of this make; None: this one.
+        """
+        from pchem_pipeline.commands.twin import twin_of
+
+        return twin_of(self._target, redraw=redraw, shape=shape)
 
     # -- pixels -------------------------------------------------------------------------------
 

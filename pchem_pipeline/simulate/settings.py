@@ -190,6 +190,16 @@ class SimulateSettings(Section):
     truth_frames: int = Field(
         default=250, ge=0, description="number of first frames whose true electron numbers are kept"
     )
+    sensor: Path | None = Field(
+        default=None,
+        description="npz file with the maps of a sensor, as `pchem twin` writes it, instead of `parameters`",
+    )
+    scene: str | None = Field(
+        default=None,
+        description="exposure of the pixels instead of their own: a number, e- per frame, or a file with an "
+        "image or a sequence of images in e- per frame (npy, TIFF, FITS); after its last one a sequence "
+        "begins anew",
+    )
     parameters: ParameterSettings = Field(default=ParameterSettings(), description="parameters of the pixels")
     effects: EffectList = Field(
         default=(), description="effects beyond the PCD, in the order in which they act inside a plane"

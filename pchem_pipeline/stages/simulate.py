@@ -13,7 +13,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from zipfile import BadZipFile
@@ -21,10 +21,13 @@ from zipfile import BadZipFile
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.frames.formats.map_files import read_image
+from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.writing import WRITERS, write_frames
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
+from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 from pchem_pipeline.store.files import storage_error, write_atomic
@@ -80,7 +83,8 @@ def run(context: StageContext) -> None:
     if settings is None:
         raise ConfigError("the configuration has no section simulate; add one, or run: pchem ingest")
     folder = context.base_dir / settings.output
-    truth = draw_truth(settings)
+    settings = _with_places(settings, context.base_dir)
+    truth = _sensor(settings.model_dump_json())[0]
     files = _files(settings)
     if context.fresh:
         _prepare(folder, settings)
@@ -116,7 +120,7 @@ def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int,
 def _do(
     unit: SimulateUnit, *, settings: SimulateSettings, folder: Path, store: Path, workers: int, alone: bool
 ) -> dict[str, Any]:
-    truth = _truth(settings.model_dump_json())
+    truth, settings = _sensor(settings.model_dump_json())
     if unit.kind == "electrons":
         _, electrons = simulate_block(truth, settings, (unit.start, unit.stop))
         region = (slice(unit.start, unit.stop), slice(None), slice(None))
@@ -138,10 +142,63 @@ def _do(
     return {"files": len(unit.files)}
 
 
+def scene_identity(context: StageContext) -> dict[str, Any] | None:
+    """Return the content hashes of the files that a simulation reads; None where it reads none."""
+    settings = context.config.simulate
+    if settings is None:
+        return None
+    settings = _with_places(settings, context.base_dir)
+    places = [settings.sensor, None if settings.scene is None else Path(settings.scene)]
+    files = [place for place in places if place is not None and place.is_file()]
+    return content_identity(files) if files else None
+
+
+def _with_places(settings: SimulateSettings, folder: Path) -> SimulateSettings:
+    """Return the settings with the whole paths of what they read."""
+    changes: dict[str, Any] = {}
+    if settings.sensor is not None:
+        changes["sensor"] = folder.resolve() / settings.sensor
+    if settings.scene is not None and not _is_number(settings.scene):
+        changes["scene"] = str(folder.resolve() / settings.scene)
+    return settings.model_copy(update=changes)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 @functools.lru_cache(maxsize=2)
-def _truth(settings: str) -> TruthMaps:
-    """Return the maps, drawn once per process; drawing is cheaper than sending them."""
-    return draw_truth(SimulateSettings.model_validate_json(settings))
+def _sensor(content: str) -> tuple[TruthMaps, SimulateSettings]:
+    """Return maps and settings, made once per process; that is cheaper than sending them.
+
+    Raises:
+        ConfigError: a file is not that of a sensor, or of an image that fits it.
+    """
+    settings = SimulateSettings.model_validate_json(content)
+    truth = draw_truth(settings) if settings.sensor is None else _stored_sensor(settings)
+    if settings.scene is None:
+        return truth, settings
+    scene = float(settings.scene) if _is_number(settings.scene) else read_image(Path(settings.scene))
+    return with_scene(truth, settings, scene)
+
+
+def _stored_sensor(settings: SimulateSettings) -> TruthMaps:
+    assert settings.sensor is not None
+    try:
+        with np.load(settings.sensor, allow_pickle=False) as stored:
+            truth = TruthMaps(**{field.name: stored[field.name] for field in fields(TruthMaps)})
+    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        raise ConfigError(
+            f"simulate.sensor: {settings.sensor} holds no maps of a sensor ({error}); write it "
+            "with: pchem twin"
+        ) from error
+    if truth.shape != settings.shape:
+        raise ConfigError(f"simulate.sensor has {truth.shape} pixels, simulate.shape is {settings.shape}")
+    return truth
 
 
 def _in_order(

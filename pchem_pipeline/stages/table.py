@@ -53,6 +53,7 @@ _ALL = (
         reads=(),
         writes=("truth",),
         run=f"{_HERE}.simulate:run",
+        identity=f"{_HERE}.simulate:scene_identity",
         summary="Write a simulated camera's frames, and its truth.",
         applies=_is_simulated,
     ),

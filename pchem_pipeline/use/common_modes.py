@@ -20,6 +20,16 @@ __all__ = ["CommonModes", "Offsets", "estimate_offsets", "scene_of"]
 
 FRAME, ROW, COLUMN = range(3)
 _LEAST_SCENE = 0.02  # e-
+#: Effects that shift many pixels alike.
+_OFFSETS = (
+    "frame_noise",
+    "row_noise",
+    "column_noise",
+    "bias_drift",
+    "bias_jumps",
+    "readout_alternation",
+    "periodic_pickup",
+)
 
 
 @dataclass(frozen=True)
@@ -39,19 +49,22 @@ class CommonModes:
     @classmethod
     def of_model(cls, effects: Sequence[Effect]) -> CommonModes:
         """Return those of the effects of a model."""
-        removed, left, variances = [], [], [0.0, 0.0, 0.0]
-        for effect in effects:
-            place, variance = _mode(effect)
-            if place is None:
-                left += [effect.tag] if effect.tag in ("bias_jumps", "periodic_pickup") else []
-            else:
-                removed.append(effect.tag)
+        found = [(effect.tag, *_mode(effect)) for effect in effects]
+        # of a tag that is there several times, all or none
+        left = dict.fromkeys(tag for tag, place, _ in found if place is None)
+        variances = [0.0, 0.0, 0.0]
+        for tag, place, variance in found:
+            if place is not None and tag not in left:
                 variances[place] += variance
-        return cls(tuple(removed), (variances[0], variances[1], variances[2]), tuple(left))
+        removed = dict.fromkeys(tag for tag, _, _ in found if tag not in left)
+        modes = tuple(tag for tag in left if tag in _OFFSETS)
+        return cls(tuple(removed), (variances[0], variances[1], variances[2]), modes)
 
 
 def _mode(effect: Effect) -> tuple[int | None, float]:
     """Return which offset an effect is, and its variance, DN^2; None where it is none."""
+    if effect.region is not None or effect.when is not None:
+        return None, 0.0
     values: dict[str, Any] = effect.model_dump()
     match effect.tag:
         case "frame_noise":

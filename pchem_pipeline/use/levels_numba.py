@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.cells_numba import Cells, Law, cells_of, component, resolve
+from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cells_of, component, resolve
 from pchem_pipeline.model.law.electron_laws_numba import FARTHEST, electron_number, normal_tail
 from pchem_pipeline.model.law.mass_numba import _make_room, _theta_of
 from pchem_pipeline.model.law.pixel_numba import FIRST, N_BINS, OWN, SHARE, SHARE_SLOPE, Pixel
@@ -33,7 +33,7 @@ _LEAST_EXPOSURE = 1e-7  # e-; less is none
 _LEAST_MASS = 1e-300
 _MOST_STEPS = 200
 _PRECISION = 1e-9
-_OUTSIDE = 0.2  # part of a standard error by which a parameter is moved to find its slope
+_OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
 _TOP_REACH = 12.0
 
 
@@ -98,6 +98,22 @@ def _tail_between(lower: float, upper: float, mean: float, sd: float, table: Flo
 
 
 @kernel
+def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
+    """Add the mass of whole codes, each of whose edges is that of the next one."""
+    inverse = 1.0 / part.sd
+    before = (cells.edges[low] - part.mean) * inverse if low < high else 0.0
+    below, _ = normal_tail(before, cells.table)
+    for i in range(low, high):
+        z = (cells.edges[i + 1] - part.mean) * inverse
+        above, _ = normal_tail(z, cells.table)
+        inside = above - below
+        if before <= 0.0 < z:
+            inside += 1.0
+        share[i - low] += weight * inside
+        before, below = z, above
+
+
+@kernel
 def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
     """Return what each electron number gives to the codes of a pixel."""
     last = codes.first + (codes.n - 1) / codes.parts
@@ -128,6 +144,9 @@ def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
             if weight == 0.0:
                 continue
             part = component(float(k), peak, theta, cells, _REACH)
+            if codes.parts == 1:
+                _add_whole(cells, part, weight, low, high, share[place:])
+                continue
             for i in range(low, high):
                 value = codes.first + i / codes.parts
                 whole = math.floor(value + 0.5)
@@ -310,14 +329,15 @@ def estimate_exposures(
             continue
         out[index, 1] = 1.0 / math.sqrt(curvature)
         out[index, 2] = _from_calibration(
-            near, curvature, parameters[index], covariance[index], satellites[index, 1], codes, pixel, theta,
-            moved, seen, sums,
+            near, score / near, curvature, parameters[index], covariance[index], satellites[index, 1],
+            codes, pixel, theta, moved, seen, sums,
         )  # fmt: skip
 
 
 @kernel
 def _from_calibration(
     exposure: float,
+    score: float,
     curvature: float,
     parameters: FloatArray,
     covariance: FloatArray,
@@ -337,13 +357,11 @@ def _from_calibration(
             if step == 0.0:
                 continue
             return math.nan
-        difference = 0.0
-        for side in (-1.0, 1.0):
-            for i in range(4):
-                moved[i] = parameters[i]
-            moved[1 + j] += side * step
-            difference += side * _score_at(exposure, moved, weight, codes, pixel, theta, counts, sums)
-        slopes[j] = difference / (2.0 * step * curvature)
+        for i in range(4):
+            moved[i] = parameters[i]
+        moved[1 + j] += step
+        ahead = _score_at(exposure, moved, weight, codes, pixel, theta, counts, sums)
+        slopes[j] = (ahead - score) / (step * curvature)
     variance = 0.0
     for i in range(3):
         for j in range(3):

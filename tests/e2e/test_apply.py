@@ -269,3 +269,46 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monk
     assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
     assert "row_offset" in found
     assert "row_offset" not in kept
+
+
+def test_a_twin_is_the_camera_that_was_measured(lab, night):
+    """Fitted again, the twin's frames give the run's parameters within the errors of that fit."""
+    from pchem_pipeline import open_run
+
+    said = lab.ok("twin", "run.zarr", "--output", "camera.yaml", "--frames", "2000", "--seed", "9")
+    assert said.stdout.split() == ["camera.yaml", "camera_maps.npz"]
+    assert lab("twin", "run.zarr", "--output", "camera.yaml").code == 2
+    lab.ok("run", "camera.yaml", "--until", "maps", "--quiet")
+    first, again = (open_run(lab.folder / name) for name in ("run.zarr", "camera.zarr"))
+    good = (first.good & again.good).values
+    assert good.sum() > 0.9 * N
+    for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn"):
+        pulls = (again.maps[name] - first.maps[name]).values[good] / again.maps[f"{name}_stderr"].values[good]
+        assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size) + 0.05
+        assert abs(pulls.std() - 1) < 5 / np.sqrt(2 * pulls.size) + 0.05
+        # the run's own errors are as large: other frames of the first camera would differ by more
+    with np.load(lab.folder / "camera_maps.npz") as maps:
+        assert maps["defect"][3, 5] == 3
+
+
+def test_a_twin_looks_at_a_scene_and_is_calibrated_again(lab, night):
+    from pchem_pipeline import open_run
+
+    run = open_run(lab.folder / "run.zarr")
+    image = np.linspace(0.2, 1.5, N).reshape(SHAPE)
+    np.save(lab.folder / "scene.npy", image)
+    lab.ok("twin", "run.zarr", "--output", "scene.yaml", "--scene", "scene.npy", "--frames", "600")
+    lab.ok("simulate", "scene.yaml", "--quiet")
+    found = run.apply(lab.folder / "scene_frames", lab.folder / "scene_applied.zarr", what="exposure")
+    good = found.quality.values == 0
+    z = ((found.exposure - image) / found.exposure_stderr_counting).values[good]  # maps and twin are the same
+    assert abs(z.mean()) < 5 / np.sqrt(z.size) + 0.1
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size) + 0.02
+    frames = run.twin().frames(image, 50)
+    assert frames.shape == (50, *SHAPE)
+    assert run.twin(shape=(8, 70)).frames(1.0, 5).shape == (5, 8, 70)
+    np.save(lab.folder / "small.npy", np.ones((3, 3)))
+    for wrong in (["--scene", "small.npy"], ["--scene", "no.npy"], ["--size", "8"], ["--scene", "-1"]):
+        refused = lab("twin", "run.zarr", "--output", "no.yaml", *wrong)
+        assert refused.code in (2, 4)
+        assert refused.stderr.count("\n") == 1

@@ -55,7 +55,6 @@ _SEGMENT_SAMPLES = 1 << 27
 _SCENE_FRAMES, _PARTS = 256, 4
 #: Bytes that a code of a pixel takes while numbers are looked up.
 _BYTES_OF_CODE = 12
-_MAPS = ("electrons_stderr_read", "electrons_stderr_calibration", "mean_signal")
 _EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
 
 
@@ -306,8 +305,10 @@ def _create_counted(context: StageContext, job: Job) -> None:
     _, ny, nx = job.source.shape
     rows = _chunks(job.source.shape)[1]
     context.create("applied_parts/range", (2, ny, nx), chunks=(2, rows, nx))
-    for name in _EXPOSURE if job.estimates else ():
-        context.create(f"applied/{name}", (ny, nx), chunks=(rows, nx))
+    names = [f"applied/{name}" for name in _EXPOSURE]
+    names = names if "exposure" in job.kinds else ["applied_parts/prior"]
+    for name in names if job.estimates else ():
+        context.create(name, (ny, nx), chunks=(rows, nx))
 
 
 # -- the work --------------------------------------------------------------------------------------

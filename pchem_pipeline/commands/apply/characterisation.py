@@ -10,7 +10,7 @@ import numpy as np
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
-from pchem_pipeline.stages.fit.fitted_model import fitted_added_exposure, fitted_effects
+from pchem_pipeline.stages.fit.fitted_model import fitted_added_exposure, fitted_effects, pixel_places
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
 if TYPE_CHECKING:
@@ -63,7 +63,12 @@ def read_calibration(
     stderr = np.stack([store.read(f"fit/{name}_stderr", region) for name in PARAMETERS])
     covariance = covariance_of(stderr, store.read("fit/correlation", region))
     added = fitted_added_exposure(store, region)
-    law = sample_law(remaining_effects(store, removed), pixel_maps(maps, np.ones(maps[0].shape, bool)), added)
+    law = sample_law(
+        remaining_effects(store, removed),
+        pixel_maps(maps, np.ones(maps[0].shape, bool)),
+        added,
+        pixel_places(store, region),
+    )
     if extra_variance > 0.0:
         law = law.with_variance(dn2=extra_variance)
     if top is not None:

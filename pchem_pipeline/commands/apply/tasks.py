@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,11 @@ def _write_exposure(
 ) -> None:
     """Write the exposure of some rows and its errors."""
     origin = found.origin.astype(np.int64) - job.lift * job.parts
+    if "exposure" not in job.kinds:  # a prior needs no errors from the calibration
+        calibration = replace(calibration, covariance=np.zeros_like(calibration.covariance))
+        maps = estimate_exposure(found.counts, origin, calibration, job.parts)
+        output.write("applied_parts/prior", (rows, _WHOLE), maps.exposure)
+        return
     maps = estimate_exposure(found.counts, origin, calibration, job.parts)
     values = {
         "exposure": maps.exposure,
@@ -149,7 +155,8 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
     if job.prior_map is not None:
         prior = job.prior_map[rows]
     elif job.prior == "frames":
-        prior = output.read("applied/exposure", (rows, _WHOLE))
+        place = "applied/exposure" if "exposure" in job.kinds else "applied_parts/prior"
+        prior = output.read(place, (rows, _WHOLE))
     elif job.prior == "run":
         prior = calibration.quanta_exposure
     return number_tables(ends[0], ends[1], prior, calibration, dtype=job.number_type, parts=job.parts)

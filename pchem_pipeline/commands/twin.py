@@ -1,0 +1,138 @@
+"""``pchem twin``: the camera of a run as a simulated one, a YAML with its maps beside it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
+from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.frames.formats.map_files import read_image
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.simulate.scene import with_scene
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.stages.fit.fitted_model import fitted_effects
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.use.twin import Twin, extrapolated, redrawn, twin_maps
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.target import Target
+
+__all__ = ["TWIN_FRAMES", "twin_of", "write_twin"]
+
+#: Bits of the ADC where the run does not say, and frames where nothing else is asked for.
+_BIT_DEPTH, TWIN_FRAMES = 16, 1000
+
+
+def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:
+    """Return the camera of a run.
+
+    Args:
+        target: the run.
+        redraw: seed with which the maps are drawn within their errors; None: the estimates themselves.
+        shape: rows and columns of another sensor of the same make; None: this one.
+
+    Raises:
+        StoreError: the run is not finished as far as its fit.
+        ConfigError: no pixel has a fit, or the run has no frames.
+    """
+    store = RunStore.open(target.store)
+    check_run(store)
+    sensor = SensorInfo.read(store)
+    if sensor.kind == "histograms":
+        raise ConfigError(f"{target.store} was made from ready-made histograms: channels are no sensor")
+    calibration = read_calibration(store)
+    usable = calibration.usable & (calibration.quanta_exposure >= 0.0)
+    if not usable.any():
+        raise ConfigError(f"{target.store} has no pixel with a fit: there is nothing to simulate")
+    maps = tuple(store.read(f"fit/{name}") for name in PARAMETERS)
+    if redraw is not None:
+        stderr = np.stack([store.read(f"fit/{name}_stderr") for name in PARAMETERS])
+        maps = redrawn(maps, stderr, store.read("fit/correlation"), redraw)
+    truth = twin_maps(maps, usable, _usual_level(store, sensor))
+    if shape is not None:
+        truth = extrapolated(truth, shape, 0 if redraw is None else redraw)
+    time = target.config.input.integration_time or sensor.integration_time
+    depth = target.config.input.bit_depth or sensor.bit_depth
+    settings = SimulateSettings(
+        shape=truth.shape,
+        n_frames=max(1, sensor.n_frames),
+        bit_depth=depth or _BIT_DEPTH,
+        effects=fitted_effects(store),
+    )
+    return Twin(truth, settings if time is None else settings.model_copy(update={"integration_time": time}))
+
+
+def _usual_level(store: RunStore, sensor: SensorInfo) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Return the middle of the range of each pixel, DN; 0 where it is not stored."""
+    if not store.has("histogram/minimum"):
+        return np.zeros(sensor.shape)
+    ends = [store.read(f"histogram/{name}").astype(np.float64) for name in ("minimum", "maximum")]
+    return np.asarray(np.maximum(np.rint((ends[0] + ends[1]) / 2.0), 0.0))
+
+
+def write_twin(
+    target: Target,
+    output: Path,
+    *,
+    scene: str | None = None,
+    frames: int | None = None,
+    seed: int = 1,
+    redraw: int | None = None,
+    shape: tuple[int, int] | None = None,
+    force: bool = False,
+) -> list[Path]:
+    """Write a YAML for ``pchem simulate`` and the maps beside it.
+
+    Args:
+        target: the run.
+        output: the YAML.
+        scene: a number, e- per frame, or a file with an image or a sequence; None: what the run saw.
+        frames: number of frames; None: as many as the run has.
+        seed: of the frames.
+        redraw: see `twin_of`.
+        shape: see `twin_of`.
+        force: replace files that are there.
+
+    Raises:
+        ConfigError: a file exists, or the scene does not fit.
+        InputError: the scene cannot be read.
+    """
+    if output.suffix.lower() not in (".yaml", ".yml"):
+        raise ConfigError(f"--output {output}: a YAML file is written; give it the suffix .yaml")
+    maps = output.with_name(f"{output.stem}_maps.npz")
+    for path in (output, maps):
+        if path.exists() and not force:
+            raise ConfigError(f"{path} exists; choose another --output, or replace it with --force")
+    twin = twin_of(target, redraw=redraw, shape=shape)
+    place = None if scene is None else _scene_place(scene, twin)
+    given = twin.settings.model_dump(mode="json") | {
+        "sensor": maps.name,
+        "scene": place,
+        "seed": seed,
+        "output": f"{output.stem}_frames",
+        "n_frames": frames or twin.settings.n_frames,
+    }
+    config = make_config({"run": {"store": f"{output.stem}.zarr"}, "simulate": given}, "the twin")
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **twin.truth.arrays())
+    write_atomic(maps, buffer.getvalue())
+    write_atomic(output, dump_config(config).encode())
+    return [output, maps]
+
+
+def _scene_place(scene: str, twin: Twin) -> str:
+    """Return a scene as the YAML has it, once it was tried."""
+    try:
+        value = float(scene)
+    except ValueError:
+        with_scene(twin.truth, twin.settings, read_image(Path(scene)))
+        return str(Path(scene).resolve())
+    with_scene(twin.truth, twin.settings, value)
+    return scene
