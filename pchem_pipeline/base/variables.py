@@ -140,6 +140,8 @@ def _discrepancy() -> list[Variable]:
         ("score", ("score", *_MAP), "float32", "1", "efficient scores of each pixel, N(0, 1) by chance"),
         ("block_spread", ("channel", *_MAP), "float32", "1", "scatter of the block means, normal quantile"),
         ("lag1", ("channel", *_MAP), "float32", "1", "autocorrelation at lag 1 over its standard error"),
+        ("trend", ("channel", *_MAP), "float32", "1", "rise of the block means, N(0, 1) by chance"),
+        ("neighbour", ("pair", *_MAP), "float32", "1", "covariance with the next pixel, N(0, 1) by chance"),
         ("tail", ("side", *_MAP), "uint32", "1", "samples beyond all that the pixel's PCD allows"),
         ("code_dn", ("code",), "int32", "DN", "digital number of the code axis"),
         ("code_observed", ("code",), "float64", "1", "samples at each DN, all usable pixels"),
@@ -421,7 +423,7 @@ _ALL: list[Variable] = [
         "electrons/electron_number", ("frame", "y", "x"), "uint16", "e-", "estimated electron number", "k"
     ),
     # where the model and the data disagree; axes: `score` as effects.evidence.SCORES, `channel` charge and
-    # readout, `side` below and above, `statistic` as discrepancy.catalogue.STATISTICS
+    # readout, `side` below and above, `pair` x.kk to y.rk, `statistic` as discrepancy.catalogue.STATISTICS
     *_discrepancy(),
     # of each version of the run's model, in a group of its own: model/0002/added_exposure
     Variable(

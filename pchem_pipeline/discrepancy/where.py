@@ -16,6 +16,7 @@ from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
 __all__ = [
+    "PAIRS",
     "frame_series",
     "locate",
     "map_of",
@@ -27,6 +28,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
+#: Maps of neighbours, along x and along y: charge with charge, readout with readout, one with the other.
+PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")
 _FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
 _MOST_PLACES = 20

@@ -104,6 +104,11 @@ def time_series(
         repeated=np.empty(0, np.int64),
         repeated_rows=0,
         hits=np.empty((0, 4), np.int64),
+        neighbour_maps={
+            f"{axis}.{pair}": rng.standard_normal(shape).astype(np.float32)
+            for axis in "xy"
+            for pair in ("kk", "rr", "rk")
+        },
     )
 
 

@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.where import PAIRS, map_of
 from pchem_pipeline.effects.framework.evidence import SCORES
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.maps import is_strip
@@ -30,9 +33,10 @@ _LEAST, _MOST = 4.0, 12.0
 _STANDS_OUT, _MOST_RINGS = 5.0, 60
 
 _MAPS_CAPTION = (
-    "Goodness of fit, and the quantities of the pixels that are farthest from chance. Below each map: its"
-    " histogram (gray) and that of chance (line). A shift of the whole histogram is an effect of all "
-    "pixels, long tails are one of few; these are ringed in the map where they are few."
+    "The quantities of the pixels in which a part of the sensor stands out (outlined), then goodness of fit "
+    "and those farthest from chance. Below each map: its histogram (gray), that of the outlined part (red) "
+    "and that of chance (line). A shift of the whole histogram is an effect of all pixels, long tails are "
+    "one of few; these are ringed in the map where they are few."
 )
 _LINES_CAPTION = (
     "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
@@ -51,13 +55,23 @@ _SCORE_WORDS = {
     "He3C1": "skew grows with k (He3C1)",
 }
 
+_PAIR_WORDS = {
+    f"{axis}.{pair}": f"{words}, along {axis}"
+    for axis in ("x", "y")
+    for pair, words in (
+        ("kk", "charge: neighbours alike"),
+        ("rr", "readout: neighbours alike"),
+        ("rk", "readout follows the neighbour's charge"),
+    )
+}
+
 #: How the means of rows and columns are called, by name of their array.
 LINE_WORDS = {"row": "rows", "column": "columns"}
 
 
 def sensor_figures(data: DiscrepancyData) -> list[Figure]:
     """Return the maps of what each pixel shows."""
-    maps = [each for each in largest_maps(data.arrays) if finite(each.z).size]
+    maps = [each for each in largest_maps(data.arrays, regions_of(data)) if finite(each.z).size]
     if not maps:
         return []
     origin = data.found.examined.origin
@@ -68,6 +82,7 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
         words.append(
             f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} (by chance 0 "
             f"and 1), {count(each.outliers, 'pixel')} beyond 5"
+            + (f", most in {each.region.words()}" if each.region is not None else "")
         )
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
@@ -157,52 +172,79 @@ class PixelMap:
         far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
             the mean square, and of the number of pixels beyond 5.
         outliers: pixels beyond 5.
+        region: part of the sensor where it stands out; None: everywhere alike.
     """
 
     title: str
     z: FloatArray
     far: float
     outliers: int
+    region: Region | None = None
 
 
-def largest_maps(arrays: Mapping[str, NDArray[Any]], most: int = 3) -> list[PixelMap]:
-    """Return the maps that are farthest from chance, goodness of fit first whatever it shows.
+def regions_of(data: DiscrepancyData) -> dict[str, Region]:
+    """Return by the name of a map the region that the verdict has for it, the most significant map first."""
+    placed = [each for each in data.found.where if each.region is not None and map_of(each.statistic)]
+    placed.sort(key=lambda each: each.region_p)
+    found: dict[str, Region] = {}
+    for each in placed:
+        found.setdefault(map_of(each.statistic) or "", Region.model_validate(each.region))
+    return found
+
+
+def largest_maps(
+    arrays: Mapping[str, NDArray[Any]], regions: Mapping[str, Region] | None = None, most: int = 3
+) -> list[PixelMap]:
+    """Return the maps with a place, then goodness of fit whatever it shows, then those farthest from chance.
 
     Args:
         arrays: group ``discrepancy`` of the store.
+        regions: of maps that stand out in a part of the sensor.
         most: at most so many.
     """
-    first = [_pixel_map("goodness of fit (large: poor)", arrays["goodness"])] if "goodness" in arrays else []
-    others: list[PixelMap] = []
-    if "score" in arrays:
-        others += [
-            _pixel_map(_SCORE_WORDS.get(name, name), values)
-            for name, values in zip(SCORES, arrays["score"], strict=False)
-        ]
-    for name, words in (("block_spread", "block means wander"), ("lag1", "successive frames correlated")):
-        if name in arrays:
-            others += [
-                _pixel_map(f"{channel}: {words}", values)
-                for channel, values in zip(CHANNELS, arrays[name], strict=False)
-            ]
-    others = sorted((each for each in others if np.isfinite(each.far)), key=lambda each: -each.far)
-    return (first + others)[:most]
+    regions = regions or {}
+    named = _named_maps(arrays)
+    maps = {name: _pixel_map(words, values, regions.get(name)) for name, (words, values) in named.items()}
+    placed = [maps.pop(name) for name in regions if name in maps]
+    first = [maps.pop("goodness")] if "goodness" in maps else []
+    # of neighbours only what has a place: where they all are alike, rows and columns show it better
+    others = [each for name, each in maps.items() if np.isfinite(each.far) and name not in PAIRS]
+    return (placed + first + sorted(others, key=lambda each: -each.far))[:most]
 
 
-def _pixel_map(words: str, values: NDArray[Any]) -> PixelMap:
+def _named_maps(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, NDArray[Any]]]:
+    """Return words and values of all maps, by the names that :mod:`pchem_pipeline.discrepancy.where` has."""
+    found: dict[str, tuple[str, NDArray[Any]]] = {}
+    if "goodness" in arrays:
+        found["goodness"] = ("goodness of fit (large: poor)", arrays["goodness"])
+    for name, values in zip(SCORES, arrays.get("score", ()), strict=False):
+        found[f"score.{name}"] = (_SCORE_WORDS.get(name, name), values)
+    for array, short, words in (
+        ("block_spread", "spread", "block means wander"),
+        ("trend", "trend", "block means rise"),
+        ("lag1", "lag", "successive frames correlated"),
+    ):
+        for channel, values in zip(CHANNELS, arrays.get(array, ()), strict=False):
+            found[f"{short}.{channel}"] = (f"{channel}: {words}", values)
+    for name, values in zip(PAIRS, arrays.get("neighbour", ()), strict=False):
+        found[name] = (_PAIR_WORDS[name], values)
+    return found
+
+
+def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -> PixelMap:
     z = np.asarray(values, dtype=np.float64)
     known = finite(z)
     n = max(known.size, 1)
     outliers = int((np.abs(known) > _STANDS_OUT).sum())
     if known.size == 0:
-        return PixelMap(words, z, float("nan"), 0)
+        return PixelMap(words, z, float("nan"), 0, region)
     # beyond 5, chance puts less than one pixel in a million: each counts fully
     departures = (
         abs(float(known.mean())) * np.sqrt(n),
         abs(float((np.clip(known, -8, 8) ** 2).mean()) - 1.0) * np.sqrt(n / 2.0),
         6.0 * np.sqrt(outliers),
     )
-    return PixelMap(words, z, float(max(departures)), outliers)
+    return PixelMap(words, z, float(max(departures)), outliers, region)
 
 
 @styled
@@ -244,7 +286,7 @@ def draw_sensor(
             _draw_line(top, each)
         else:
             _draw_map(figure, top, each, limit, flagged, origin)
-        _draw_distribution(bottom, each)
+        _draw_distribution(bottom, each, _inside(each, origin))
         top.set_title(textwrap.fill(each.title, 26), fontsize=7.0)
     return figure
 
@@ -265,6 +307,9 @@ def _draw_map(
         each.z, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest", origin="upper",
         extent=extent, aspect="equal" if 0.25 <= ny / nx <= 4.0 else "auto",
     )  # fmt: skip
+    inside = _inside(each, origin)
+    if inside is not None:
+        _outline(axes, inside, origin)
     rings = {(y, x) for y, x in flagged if y0 <= y < y0 + ny and x0 <= x < x0 + nx}
     beyond = np.argwhere(np.abs(np.nan_to_num(each.z)) > _STANDS_OUT)
     if len(beyond) <= _MOST_RINGS:
@@ -288,6 +333,25 @@ def _draw_map(
     bar.set_label("sd of chance")
 
 
+def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """Return the pixels of a map that its region holds, (y, x); None without a region."""
+    if each.region is None:
+        return None
+    ny, nx = each.z.shape
+    return each.region.mask((origin[0] + ny, origin[1] + nx))[origin[0] :, origin[1] :]
+
+
+def _outline(axes: Axes, inside: NDArray[np.bool_], origin: tuple[int, int]) -> None:
+    """Draw the edges of a set of pixels."""
+    padded = np.pad(inside, 1)
+    across, down = padded[:, 1:] != padded[:, :-1], padded[1:] != padded[:-1]
+    y, x = origin
+    # each edge of a pixel that parts inside from outside is a line of its own
+    lines = [[(x + j - 0.5, y + i - 1.5), (x + j - 0.5, y + i - 0.5)] for i, j in np.argwhere(across)]
+    lines += [[(x + j - 1.5, y + i - 0.5), (x + j - 0.5, y + i - 0.5)] for i, j in np.argwhere(down)]
+    axes.add_collection(LineCollection(lines, colors=colours_of(axes).ink, linewidths=1.1))
+
+
 def _draw_line(axes: Axes, each: PixelMap) -> None:
     """Draw a line of channels."""
     colours = colours_of(axes)
@@ -298,12 +362,15 @@ def _draw_line(axes: Axes, each: PixelMap) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
 
 
-def _draw_distribution(axes: Axes, each: PixelMap) -> None:
+def _draw_distribution(axes: Axes, each: PixelMap, inside: NDArray[np.bool_] | None = None) -> None:
     colours = colours_of(axes)
     known = finite(each.z)
     edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
     edges = np.linspace(-edge, edge, 61)
     axes.stairs(np.histogram(np.clip(known, -edge, edge), edges)[0], edges, fill=True, color=colours.bars)
+    if inside is not None:
+        part = np.clip(finite(each.z[inside]), -edge, edge)
+        axes.stairs(np.histogram(part, edges)[0], edges, color=colours.vermilion, linewidth=0.9)
     x = np.linspace(-edge, edge, 301)
     chance = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     axes.plot(x, chance, color=colours.blue, linewidth=0.9)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.where import PAIRS, pixel_maps
 from pchem_pipeline.effects.framework.evidence import SCORES
 
 if TYPE_CHECKING:
@@ -100,6 +101,11 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
         "lag1": _single(np.stack([time.lag_charge[0], time.lag_readout[0]]) * np.sqrt(time.n_pairs)),
         "block_spread": _block_spread(evidence, time),
     }
+    maps = pixel_maps(evidence)
+    found["trend"] = _single(np.stack([maps["trend.charge"], maps["trend.readout"]]))
+    if time.neighbour_maps:
+        nothing = np.full(usable.shape, np.nan)
+        found["neighbour"] = _single(np.stack([maps.get(name, nothing) for name in PAIRS]))
     lines = {"row": (1, time.row_charge, time.row_readout), "column": (0, time.column_charge,
              time.column_readout)}  # fmt: skip
     for line, (axis, charge, readout) in lines.items():

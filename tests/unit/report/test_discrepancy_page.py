@@ -14,19 +14,20 @@ import numpy as np
 import pytest
 from helpers.discrepancy_material import UNTESTABLE, VERDICTS, discrepancy_data, evidence, result, verdict_of
 from helpers.report_material import report_data
+from matplotlib.collections import LineCollection
 
 from pchem_pipeline.base.variables import variables_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.verdict import Verdict
+from pchem_pipeline.discrepancy.verdict import Place, Verdict
 from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.report.data import DiscrepancyData, ReportData
 from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_series
 from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, discrepancy_figures
 from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
-from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps
+from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
-from pchem_pipeline.report.pages.discrepancy import discrepancy_tables, remarks
+from pchem_pipeline.report.pages.discrepancy import discrepancy_tables, place_text, remarks
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags
@@ -274,6 +275,24 @@ def test_the_path_of_a_drift_is_what_the_frames_show() -> None:
     assert slope == pytest.approx(0.02 * share, rel=1e-6)
     assert path_arrays(seen, [effect_class("row_noise")(row_noise_dn=0.3)]) == {}
     assert path_arrays(replace(seen, time=None), [effect_class("exposure_drift")(drift=0.02)]) == {}
+
+
+def test_a_map_with_a_place_comes_first_with_its_outline() -> None:
+    data = discrepancy_data("named")
+    place = Place.of("space.x.rr", 20.0, region={"columns": [[3, 7]]}, region_p=1e-30)
+    origin = data.found.examined.origin
+    moved = place.model_copy(update={"region": {"columns": [[origin[1] + 3, origin[1] + 7]]}})
+    found = data.found.model_copy(update={"where": (moved, *data.found.where)})
+    placed = replace(data, found=found)
+    first = largest_maps(placed.arrays, regions_of(placed))[0]
+    assert first.title == "readout: neighbours alike, along x"
+    figure = next(each for each in discrepancy_figures(placed) if each.name == "discrepancy_maps")
+    assert f"most in columns {origin[1] + 3} to {origin[1] + 6}" in figure.alt
+    drawing = figure.draw(Look(180.0))
+    outlines = [a for axes in drawing.axes for a in axes.collections if isinstance(a, LineCollection)]
+    # two edges of each row and two of each column; colour bars have lines of their own
+    assert 2 * first.z.shape[0] + 2 * 4 in [len(lines.get_segments()) for lines in outlines]
+    assert place_text(moved) == f"columns {origin[1] + 3} to {origin[1] + 6}"
 
 
 def test_the_largest_maps_are_those_with_structure() -> None:
