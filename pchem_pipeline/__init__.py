@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pchem_pipeline.base.errors import PchEmError
+    from pchem_pipeline.commands.characterise import characterise, fit_counts
     from pchem_pipeline.commands.notebook import open_run
     from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.result import FitResult
@@ -34,6 +35,8 @@ __all__ = [
     "PchEmError",
     "RunStore",
     "__version__",
+    "characterise",
+    "fit_counts",
     "fit_histograms",
     "open_run",
 ]
@@ -46,6 +49,8 @@ _HOMES = {
     "FitStatus": "model.fit.status",
     "PchEmError": "base.errors",
     "RunStore": "store.run_store",
+    "characterise": "commands.characterise",
+    "fit_counts": "commands.characterise",
     "fit_histograms": "model.fit.api",
     "open_run": "commands.notebook",
 }

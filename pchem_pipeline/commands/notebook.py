@@ -8,10 +8,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, Stor
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.figures import gather_run
 from pchem_pipeline.commands.notebook_plots import Plots, width_of
+from pchem_pipeline.model.fit.result import html_table
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
 from pchem_pipeline.report.data import PixelFit, ReportData
@@ -57,11 +60,20 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         ConfigError: the path is neither a YAML file nor a store.
         StoreError: there is no run, or it is damaged.
     """
+    require_xarray("open_run")
+    return Run(find_run(Path(path)))
+
+
+def require_xarray(what: str) -> None:
+    """Check that xarray can be imported.
+
+    Raises:
+        MissingDependencyError: it cannot.
+    """
     try:
         import xarray as _  # noqa: F401
     except ImportError as error:
-        raise MissingDependencyError(f"open_run needs another library: {install_hint('notebook')}") from error
-    return Run(find_run(Path(path)))
+        raise MissingDependencyError(f"{what} needs another library: {install_hint('notebook')}") from error
 
 
 class Run:
@@ -89,6 +101,21 @@ class Run:
     def __repr__(self) -> str:
         states = ", ".join(f"{state.stage} {state.state}" for state in run_status(self._target))
         return f"<Run {self.path.name}: {self._size()}; {states}>"
+
+    def _repr_html_(self) -> str:
+        """Return what the first screen of the report says, for a notebook."""
+        path = self.path / "report.json"
+        states = ", ".join(f"{name} {words}" for name, words in self.status().items())
+        head = f"<b>{escape(self.path.name)}</b>: {escape(self._size())}"
+        if not path.exists():
+            return f"<p>{head}<br>{escape(states)}</p>"
+        found = json.loads(path.read_text(encoding="utf-8"))
+        answers = "".join(
+            f"<p>{escape(each['question'])} <b>{escape(each['word'])}</b>. {escape(each['text'])}</p>"
+            for each in found["answers"]
+        )
+        rows = [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
+        return f"<p>{head}</p>{answers}{html_table(('median', 'value', ''), rows)}"
 
     def _size(self) -> str:
         ny, nx = self.shape
@@ -313,6 +340,15 @@ class Pixel:
         for name, value in self.parameters.items():
             words.append(f"{name} = {measured(value, self.stderr.get(name, float('nan')), symbol(name)[2])}")
         return f"<Pixel y = {self.y}, x = {self.x}: {', '.join(words)}; {self.status or 'good fit'}>"
+
+    def _repr_html_(self) -> str:
+        """Return the parameters as a table, for a notebook."""
+        rows = []
+        for name, value in self.parameters.items():
+            _, words, unit = symbol(name)
+            rows.append((words, measured(value, self.stderr.get(name, float("nan")), unit)))
+        head = f"pixel y = {self.y}, x = {self.x}: {self.status or 'good fit'}"
+        return f"<p>{escape(head)}</p>{html_table(('parameter', 'value'), rows)}"
 
     @property
     def y(self) -> int:

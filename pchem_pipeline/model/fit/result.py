@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FitResult"]
+from pchem_pipeline.model.fit.status import describe
+
+__all__ = ["FitResult", "html_table"]
 
 FloatArray = NDArray[np.float64]
+
+
+#: Fits that a notebook shows.
+_SHOWN = 10
+
+
+def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in HTML; every cell is text."""
+    cells = [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(cells)}</tbody></table>"
 
 
 @dataclass(frozen=True)
@@ -85,6 +100,20 @@ class FitResult:
         n = self.bias.size
         shared = [each.reshape(n, 1) for each in (self.conversion_gain, self.bias, self.read_noise_dn)]
         return np.concatenate([self.quanta_exposure.reshape(n, -1), *shared], axis=1)
+
+    def _repr_html_(self) -> str:
+        """Return the first fits as a table, for a notebook."""
+        n = self.columns.shape[1] - 3
+        names = [f"H{j + 1 if n > 1 else ''}, e-" for j in range(n)]
+        head = ("", *names, "g, e-/DN", "mu, DN", "sigma, DN", "status")
+        errors = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        rows = []
+        for i in range(min(self.bias.size, _SHOWN)):
+            values = zip(self.columns[i], errors[i], strict=True)
+            numbers = [f"{value:.5g} ± {error:.2g}" for value, error in values]
+            rows.append((str(i), *numbers, describe(int(self.fit_status[i]))))
+        more = self.bias.size - len(rows)
+        return html_table(head, rows) + (f"<p>and {more:,} more</p>" if more else "")
 
     def with_pixels(self, pixels: NDArray[np.intp], part: FitResult) -> FitResult:
         """Return a copy with the fit of some pixels in their places."""

@@ -1,0 +1,199 @@
+"""From arrays in memory to a run: what ``pchem run`` does for files.
+
+>>> import numpy as np
+>>> from pchem_pipeline import characterise
+>>> frames = np.load("frames.npy")                           # doctest: +SKIP
+>>> run = characterise(frames, integration_time=4.87)        # doctest: +SKIP
+>>> run.maps.read_noise_e.where(run.good).median()           # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.commands.new_run import other_settings
+from pchem_pipeline.commands.notebook import open_run, require_xarray
+from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.frames.writing import write_frames
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.run.session import Command, run_stages, up_to
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.stages.table import pipeline_of
+from pchem_pipeline.store.files import write_atomic
+
+if TYPE_CHECKING:
+    from pchem_pipeline.commands.notebook import Run
+    from pchem_pipeline.model.fit.result import FitResult
+    from pchem_pipeline.run.progress import ProgressMode
+
+__all__ = ["characterise", "fit_counts"]
+
+_BLOCK_BYTES = 64 << 20
+
+
+def characterise(
+    frames: Any,
+    *,
+    store: str | os.PathLike[str] | None = None,
+    integration_time: float | None = None,
+    bit_depth: int | None = None,
+    kind: Literal["dark", "light", "unknown"] = "unknown",
+    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    until: str = "report",
+    workers: int | None = None,
+    progress: ProgressMode = "off",
+) -> Run:
+    """Characterise a stack of frames in memory, and return its run as :func:`open_run` does.
+
+    The frames are written once, as ``<store>-frames.npy`` beside the store, and the run refers to them there;
+    it is a run like any other (``pchem status``, ``compare``, ``discrepancy`` ...). With the same frames and
+    settings nothing is done again.
+
+    Args:
+        frames: whole DN, shape (frame, y, x): a numpy array, a dask array (computed block by block) or
+            anything whose slices along the frames become one.
+        store: folder of the run, such as ``"night.zarr"``; None: a temporary one that goes with the run.
+        integration_time: of a frame, s.
+        bit_depth: bits of the ADC.
+        kind: what made the charge.
+        settings: sections of the YAML, such as ``{"fit": {"likelihood": "auto"}}``.
+        until: last stage to be done.
+        workers: number of workers; None: as many as there are processors.
+        progress: auto, on or off.
+
+    Raises:
+        MissingDependencyError: xarray is not installed.
+        ConfigError: the frames are no whole DN of three dimensions, a setting is wrong, or the store is of a
+            run with other settings.
+        IncompleteRunError: more pixels have no value than the settings allow; the store has the run.
+    """
+    require_xarray("characterise")
+    _check(frames)
+    temporary = None if store is not None else Path(tempfile.mkdtemp(prefix="pchem-"))
+    try:
+        place = (Path(store) if store is not None else temporary / "run.zarr").resolve()  # type: ignore[operator]
+        given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind}
+        target = _target(place, given, settings or {})
+        _write(target, frames)
+        stages = up_to(until, pipeline_of(target.config))
+        run_stages(target, stages, Command(workers=workers, progress=progress, quiet=progress == "off"))
+        run = open_run(place)
+    except BaseException:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    if temporary is not None:
+        weakref.finalize(run, shutil.rmtree, temporary, ignore_errors=True)
+    return run
+
+
+def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: Any) -> FitResult:
+    """Fit plain histograms: one, or those of many pixels.
+
+    Args:
+        counts: number of samples at each DN, shape (bin,), (n, bin) or (y, x, bin).
+        origin: DN of bin 0; one for all, or one for each histogram.
+        **options: of :func:`fit_histograms`.
+
+    Returns:
+        The estimates, one for each histogram, in order.
+
+    Raises:
+        ValueError: counts are negative or not whole, or the shapes disagree.
+    """
+    array = np.asarray(counts)
+    if array.ndim < 1 or not np.issubdtype(array.dtype, np.number) or (array < 0).any() or (array % 1).any():
+        raise ValueError("counts: give whole numbers, none below 0, along the last axis")
+    flat = np.ascontiguousarray(array.reshape(-1, array.shape[-1]), dtype=np.uint32)
+    first = np.broadcast_to(np.asarray(origin), array.shape[:-1]).reshape(-1).astype(np.int32)
+    return fit_histograms(flat, first, **options)
+
+
+def _check(frames: Any) -> None:
+    """Refuse what is no stack of whole DN.
+
+    Raises:
+        ConfigError: the message says what it should be.
+    """
+    shape, dtype = getattr(frames, "shape", ()), np.dtype(getattr(frames, "dtype", object))
+    if len(shape) != 3:
+        raise ConfigError(f"frames of shape {tuple(shape)}: give an array (frame, y, x)")
+    if dtype.kind not in "ui":
+        raise ConfigError(f"frames of {dtype}: PCH-EM needs the whole DN that the ADC gave; give integers")
+
+
+def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mapping[str, Any]]) -> Target:
+    """Return the run, its YAML beside the store.
+
+    Raises:
+        ConfigError: a setting is wrong, or the YAML is there with others.
+    """
+    path = place.with_suffix(".yaml")
+    content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
+    content["run"] = {**content.get("run", {}), "store": place.name}
+    known = {"files": [f"{place.stem}-frames.npy"], "mode": "reference", **given}
+    content["input"] = {**known, **content.get("input", {})}
+    config = make_config(content, "characterise")
+    text = dump_config(config)
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        raise ConfigError(other_settings(path, config, "run"))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, text.encode())
+    return Target(config, path.parent, place, path)
+
+
+def _write(target: Target, frames: Any) -> None:
+    """Write the frames beside the store; the same ones are left alone, so that nothing becomes stale."""
+    path = target.base_dir / target.config.input.files[0]
+    n, rows, columns = frames.shape
+    dtype = _stored_type(frames)
+    if path.exists() and _same(path, frames, dtype):
+        return
+    write_frames("npy", path, (block.astype(dtype) for block in _blocks(frames)), (n, rows, columns), dtype)
+
+
+def _stored_type(frames: Any) -> np.dtype[Any]:
+    """Return the unsigned type that holds the frames.
+
+    Raises:
+        ConfigError: a DN is negative or too large.
+    """
+    dtype = np.dtype(frames.dtype)
+    if dtype.kind == "u" and dtype.itemsize <= 4:
+        return np.dtype(f"u{dtype.itemsize}")
+    low = min(int(block.min()) for block in _blocks(frames))
+    high = max(int(block.max()) for block in _blocks(frames))
+    if low < 0 or high >= 2**32:
+        raise ConfigError(f"frames from {low} to {high} DN: give DN from 0 to 2^32 - 1")
+    return np.dtype(np.uint16 if high < 2**16 else np.uint32)
+
+
+def _blocks(frames: Any) -> Iterator[NDArray[Any]]:
+    """Yield the frames in blocks that fit into memory."""
+    n, rows, columns = frames.shape
+    size = max(1, _BLOCK_BYTES // max(1, rows * columns * np.dtype(frames.dtype).itemsize))
+    for first in range(0, n, size):
+        yield np.asarray(frames[first : first + size])
+
+
+def _same(path: Path, frames: Any, dtype: np.dtype[Any]) -> bool:
+    """Tell whether a file holds these frames."""
+    there = np.load(path, mmap_mode="r")
+    if there.shape != tuple(frames.shape) or there.dtype != dtype:
+        return False
+    first = 0
+    for block in _blocks(frames):
+        if not np.array_equal(there[first : first + len(block)], block):
+            return False
+        first += len(block)
+    return True
