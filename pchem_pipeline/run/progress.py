@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
@@ -89,8 +90,12 @@ class Reporter:
         """Write one JSON line to the log file, if there is one."""
         if self._log is not None:
             stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
-            self._log.write(json.dumps({"time": stamp, "event": kind, **fields}, default=str) + "\n")
-            self._log.flush()
+            try:
+                self._log.write(json.dumps({"time": stamp, "event": kind, **fields}, default=str) + "\n")
+                self._log.flush()
+            except OSError as error:  # it is no result
+                self._end_log()
+                self._line(f"warning: --log-json ends here: {error.strerror or error}")
 
     @contextmanager
     def progress(
@@ -139,8 +144,13 @@ class Reporter:
         """Close the log file, and take back what others could see."""
         if self._file is not None:
             self._file.remove()
-        if self._log is not None:
-            self._log.close()
+        self._end_log()
+
+    def _end_log(self) -> None:
+        log, self._log = self._log, None
+        if log is not None:
+            with contextlib.suppress(OSError):  # what could not be written is tried once more
+                log.close()
 
     def _line(self, message: str) -> None:
         from tqdm import tqdm

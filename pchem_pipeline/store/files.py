@@ -6,6 +6,8 @@ import contextlib
 import errno
 import json
 import math
+import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,12 +41,14 @@ _CURES = {
     errno.EPERM: "no permission to write there: choose another place for the store",
 }
 
+_ERRNO = re.compile(r"errno = (\d+)")
+
 
 def storage_error(error: OSError, path: object) -> StoreError:
     """Translate an error of the file system into one line with its cure; one that is such a line stays."""
     if isinstance(error, StoreError):
         return error
-    cure = _CURES.get(error.errno or 0, "check the disk and the permissions")
+    cure = _CURES.get(error.errno or 0, "check the disk: its free space, quota and permissions")
     return StoreError(f"cannot use {path}: {error.strerror or error}; {cure}")
 
 
@@ -118,6 +122,10 @@ def _put_in_place(
             after(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
+    except RuntimeError as error:  # of HDF5, which hides the number in its words
+        if (number := _ERRNO.search(str(error))) is None:
+            raise
+        raise storage_error(OSError(int(number[1]), os.strerror(int(number[1]))), path) from error
     finally:
         _remove(aside)
 

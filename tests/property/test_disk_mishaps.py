@@ -2,6 +2,8 @@
 
 import errno
 import functools
+import threading
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -163,3 +165,40 @@ def test_the_power_cut_would_be_seen(tmp_path, monkeypatch):
         except (AssertionError, StoreError):
             wrong += 1
     assert wrong > 3
+
+
+def test_readers_while_a_writer_works(tmp_path):
+    """Whoever reads meanwhile finds a finished tile whole, or is told in one line that there is nothing."""
+    path = tmp_path / "run.zarr"
+    run(path)
+    seen, wrong, ended = Counter(), [], threading.Event()
+
+    def read():
+        while not ended.is_set():
+            try:
+                store = RunStore.open(path)
+                record = store.records.read("maps")
+                for key in store.records.done("maps", record.fingerprint) if record else ():
+                    column = 8 * int(key.partition(".")[2])
+                    bias, double = (
+                        store.read(name, (slice(0, 8), slice(column, column + 8)))
+                        for name in ("fit/bias", "maps/bias")
+                    )
+                    whole = all(np.unique(each).size == 1 for each in (bias, double))
+                    seen["whole" if whole else "torn"] += 1
+            except StoreError as error:
+                seen["refused" if "\n" not in str(error) else "lines"] += 1
+            except Exception as error:
+                wrong.append(error)
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for i in range(4):
+        run(path, 0.25 + 0.25 * (i % 2))
+    ended.set()
+    for reader in readers:
+        reader.join()
+    assert wrong == []
+    assert seen["whole"] > 5
+    assert seen["lines"] == 0

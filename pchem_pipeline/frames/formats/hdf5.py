@@ -146,9 +146,7 @@ def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
     pairs = zip(dataset.shape, dataset.chunks, strict=True)
     wanted = math.prod(-(-length // chunk) for length, chunk in pairs)
     missing = wanted - dataset.id.get_num_chunks()
-    words = (
-        f"{path.name}: {missing} of {wanted} chunks were never written; they are read as {dataset.fillvalue}"
-    )
+    words = f"{path.name}: {missing} of {wanted} chunks were never written; they are read as its fill value"
     return (words,) if missing > 0 else ()
 
 

@@ -81,3 +81,11 @@ def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     ProgressFile(tmp_path / "file").show({"stage": "fit"})
     ProgressFile(tmp_path / "file").remove()
+
+
+def test_a_log_that_cannot_be_written_stops_nothing(capsys):
+    reporter = Reporter("off", log=Path("/dev/full"))
+    reporter.event("start")
+    reporter.event("end")
+    reporter.close()
+    assert capsys.readouterr().err.count("warning: --log-json ends here: No space left on device") == 1

@@ -1,3 +1,4 @@
+import ast
 import copy
 import os
 import pickle
@@ -7,6 +8,7 @@ import fsspec
 import numpy as np
 import pytest
 
+import pchem_pipeline
 from pchem_pipeline.base.errors import MissingDependencyError, StoreError
 from pchem_pipeline.store.remote_path import RemoteError, RemotePath, place_of, refused
 from pchem_pipeline.store.run_store import RunStore
@@ -149,3 +151,36 @@ def test_no_method_touches_the_local_disk(tmp_path, monkeypatch):
     path.write_text("far away")
     path.unlink()
     assert (tmp_path / "memory:" / "lab" / "night" / "a").read_text() == "of the disk"
+
+
+#: modules whose paths are of this machine: camera files, YAML files, logs, the package itself
+OF_THE_DISK = {
+    "base/kernel_cache.py", "commands/append.py", "commands/compile_kernels.py", "config/edit.py",
+    "effects/framework/pixel_sets.py", "frames/histogram_files.py", "frames/identity.py",
+    "frames/registry.py", "frames/resolve.py", "run/compilation.py", "run/progress.py", "stages/simulate.py",
+    "store/disk.py", "store/files.py",
+}  # fmt: skip
+#: what other objects have, too
+OF_OTHERS = {"Image.open", "self.group", "path.group", "reader_class(entry.format).open"}
+
+
+def test_methods_that_an_object_storage_has_not_are_used_where_paths_are_of_the_disk():
+    root = Path(pchem_pipeline.__file__).parent
+    undefined = {name for name in dir(Path) if not name.startswith("_") and not hasattr(RemotePath, name)}
+    assert {"open", "stat", "rename", "replace", "rglob", "touch"} <= undefined
+    found = set()
+    for file in sorted(root.rglob("*.py")):
+        module = file.relative_to(root).as_posix()
+        for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute)):
+                continue
+            of_text = call.func.attr == "replace" and (len(call.args) != 1 or call.keywords)
+            of_class = isinstance(call.func.value, ast.Name) and call.func.value.id in (
+                "Path", "RunStore", "fits", "zarr", "os", "webbrowser", "tifffile", "cls", "bz2",
+            )  # fmt: skip
+            words = ast.unparse(call.func)
+            if call.func.attr in undefined and not (of_text or of_class) and words not in OF_OTHERS:
+                found.add((module, words))
+    strange = {(m, w) for m, w in found if m not in OF_THE_DISK and not m.startswith("frames/formats/")}
+    assert strange == set(), "is that path never a RemotePath? then add its module to OF_THE_DISK"
+    assert ("store/disk.py", "source.replace") in found  # it looks
