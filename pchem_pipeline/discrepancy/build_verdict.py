@@ -59,6 +59,7 @@ class Addition:
             way; None where there is none.
         pulls: the statistics that moved most.
         moved: change of each parameter map by its refit with the effect.
+        described: whether it is measured where no known effect explains the data, and not understood.
     """
 
     effect: Effect
@@ -72,11 +73,19 @@ class Addition:
     placebo: Rival | None
     pulls: tuple[Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    described: bool = False
 
     @property
     def named(self) -> bool:
         """Whether the verdict names it."""
-        return self.alone and self.fits
+        return self.alone and self.fits and not self.described
+
+    @property
+    def verdict(self) -> State:
+        """The verdict of it alone."""
+        if self.described:
+            return "described"
+        return "unexplained" if not self.fits else "named" if self.alone else "ambiguous"
 
     def step(self) -> Step:
         """Return it as ``discrepancy.json`` holds it."""
@@ -84,7 +93,7 @@ class Addition:
         separate = dict(type(self.effect).separate)
         return Step(
             effect=self.effect.tag if self.named else None,
-            verdict="unexplained" if not self.fits else "named" if self.alone else "ambiguous",
+            verdict=self.verdict,
             candidates=self.candidates,
             parameters=parameters_of(self.effect, self.strength_stderr),
             gap_before=self.before.value,
@@ -163,6 +172,8 @@ class Findings:
             return "unexplained" if self.still else "consistent"
         if self.added.unfinished or any(not each.fits for each in additions):
             return "unexplained"
+        if any(each.described for each in additions):
+            return "described"
         return "ambiguous" if any(not each.named for each in additions) else "named"
 
     @property
@@ -171,13 +182,14 @@ class Findings:
         return tuple(each.effect for each in self.added.additions if each.named)
 
     def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the model without the effects that were added but are not named.
+        """Return the model without the effects that were added but are neither named nor described.
 
         Args:
             present: effects that it had before the search.
             extended: the same, and all that were added.
         """
-        tags = {effect.tag for effect in (*present, *self.named)}
+        described = [a.effect for a in self.added.additions if a.described and self.state == "described"]
+        tags = {effect.tag for effect in (*present, *self.named, *described)}
         return tuple(effect for effect in extended if effect.tag in tags)
 
 
@@ -271,6 +283,8 @@ def _sentence(found: Findings) -> str:
         return f"The {data} agree with the model in every statistic tested."
     if state == "unexplained":
         return f"The {data} disagree with the model{_unexplained(found, titles)}{_left(added)}."
+    if state == "described":
+        return _described(found, titles)
     if state == "ambiguous":
         sets = [" or ".join(c.effect for c in each.candidates) for each in added.additions if not each.named]
         also = f"{_and(titles)} is missing, and " if titles else ""
@@ -282,6 +296,16 @@ def _sentence(found: Findings) -> str:
     them = "them" if len(titles) > 1 else "it"
     closed = f"{_gaps(found)}{_rest(found)}{_left(added)}"
     return f"The model was missing {_and(titles)}; with {them} the gap on unseen {data} went {closed}."
+
+
+def _described(found: Findings, titles: Sequence[str]) -> str:
+    """Return what is known of a disagreement that was measured and is not understood."""
+    words = _and([each.effect.words() for each in found.added.additions if each.described])
+    besides = f" besides {_and(titles)}" if titles else ""
+    return (
+        f"No known effect explains the {found.samples}{besides}, but what they hold is measured: {words}; "
+        f"with it the gap on unseen {found.samples} went {_gaps(found)}{_rest(found)}."
+    )
 
 
 def _unexplained(found: Findings, titles: Sequence[str]) -> str:

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import EXACT
 
 __all__ = [
     "Measured",
     "NullModel",
     "as_matrix",
-    "contradicted",
     "disagrees",
     "look_elsewhere",
     "misfits",
@@ -41,8 +40,6 @@ _SMALLEST_STD = 0.6
 _MOVED = 4.0
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
 _SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
-# of what an effect does to its strongest statistic, the most that may remain in statistics of that kind
-_LARGEST_CONTRADICTION = 0.3
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
 
 
@@ -234,23 +231,6 @@ def misfits(
     smallest = float(_p_values(null, z, tolerance)[signature].min())
     tests = min(null.effective_tests, float(signature.sum()))
     return look_elsewhere(smallest, tests) < significance
-
-
-def contradicted(null: NullModel, shift: FloatArray, rest: FloatArray) -> bool:
-    """Tell whether much of what an effect claims to explain is still there, in statistics of the same kind.
-
-    The nearest relative of an effect that is no candidate moves the right statistics in wrong proportions.
-
-    Args:
-        null: of the model without the effect.
-        shift: by how much the effect moves the statistics, shape (m,).
-        rest: pulls of the mean of two splits that the whole model leaves, shape (m,).
-    """
-    own = np.abs(shift / null.std) * np.sqrt(2.0)
-    kinds = [(STATISTICS[name].family, STATISTICS[name].channel) for name in null.names]
-    strongest = int(own.argmax())
-    same = [kind == kinds[strongest] for kind in kinds]
-    return bool(np.abs(rest[same]).max() > _LARGEST_CONTRADICTION * own[strongest])
 
 
 def _p_values(null: NullModel, z: Measured, tolerance: FloatArray | float) -> FloatArray:

@@ -1,4 +1,6 @@
-"""The way of a search for missing effects: split, null, gap, disagree, explain, add, close, verdict.
+"""The way of a search for missing effects: from the split of the samples to the verdict.
+
+Split, null, gap, disagree, explain, add, describe, close, verdict.
 
 It is the same for frames and for ready-made histograms; what differs is how effects are told apart. With
 frames, effects are simulated and compared by what they do to many statistics (:mod:`.by_simulation`); with
@@ -71,6 +73,10 @@ class Explainer(Protocol[Explanation]):
         """Put effects into the model and draw replicates of it; None where no effect is established."""
         ...
 
+    def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
+        """Put what no effect explains into the model as it is measured; None where that does not help."""
+        ...
+
     def tolerance(self) -> NDArray[np.float64] | float:
         """Return the deviations that are not held against the added effects, shape (m,)."""
         ...
@@ -102,6 +108,9 @@ def search(by: Explainer[Explanation]) -> Discrepancy:
             break
         null, rounds = extended, rounds + 1
         wanted = still = disagrees(null, z, significance, by.tolerance())
+    described = by.describe(before, null, z) if still else None
+    if described is not None:
+        null, still = described, disagrees(described, z, significance, by.tolerance())
     added = by.close(before, null, z, still)
     found = Findings(by.samples, z, first, null, before, places, still, added)
     model = found.model(present, by.model)

@@ -52,7 +52,7 @@ SCHEMA_VERSION = 2
 #: File of the verdict in the folder of a run.
 VERDICT_FILE = "discrepancy.json"
 
-State = Literal["named", "ambiguous", "unexplained", "consistent"]
+State = Literal["named", "ambiguous", "described", "unexplained", "consistent"]
 
 _NAN = float("nan")
 
@@ -314,7 +314,7 @@ class Verdict(_Part):
     """The content of ``discrepancy.json``.
 
     Attributes:
-        verdict: named, ambiguous, unexplained or consistent.
+        verdict: named, ambiguous, described (measured, not understood), unexplained or consistent.
         sentence: the same for people.
         effects: tags of the named effects.
         model_effects: all effects that the model has afterwards, as the YAML holds them.

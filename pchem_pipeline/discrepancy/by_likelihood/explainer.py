@@ -216,6 +216,10 @@ class HistogramExplainer:
         vectors = self._drawn(self._with_effects(explanation))
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors))
 
+    def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
+        """Leave what no effect explains to the codes that are told: nothing is measured of it here."""
+        return None
+
     def tolerance(self) -> float:
         """Return 0: the likelihood fits the effects themselves."""
         return 0.0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Contender,
@@ -20,7 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     tolerance,
 )
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, contradicted, misfits
+from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival
 
@@ -29,6 +29,9 @@ __all__ = ["AddedRounds", "Round"]
 FloatArray = NDArray[np.float64]
 
 _CLEAR_MARGIN = 50.0  # nats
+_REST_OF_NAMED = 0.1  # of the gap that an effect closes, the most that may be left where it gets a name
+_LEFT = 4.0  # deviations that are left of a statistic
+_MOVED = 2.0  # standard deviations by which an effect moves it
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,14 @@ class AddedRounds:
         gaps: in the statistics of the model before the first.
         z: statistics of the data.
         settings: the section ``discrepancy``.
+        allowed: relative error of what the effects do that is not held against them.
     """
 
     rounds: Sequence[Round]
     gaps: StatisticsGap
     z: Measured
     settings: DiscrepancySettings
+    allowed: float
 
     def close(self, before: Gap, last: NullModel, still: bool) -> Added:
         """Return the added effects, the weightiest of a round first, and what is left.
@@ -84,9 +89,8 @@ class AddedRounds:
             still: whether the data disagree with that.
         """
         after = self.gaps.gap(self.z.final, last.mean, last.replicates)
-        unfinished = still and after.value > max(after.floor, LARGEST_REST * before.value)
-        # the pulls that remain, where they are too many to call the model complete
-        rest = last.pulls(self.z.both, splits=2) if unfinished else None
+        unfinished = not after.at_floor and (still or after.value > _REST_OF_NAMED * before.value)
+        rest = self._rest(last) if unfinished and self.rounds else None
         additions: list[Addition] = []
         gap = before
         for index, this in enumerate(self.rounds):
@@ -101,21 +105,29 @@ class AddedRounds:
                 else:
                     now = after
                 stands = rest is None or (
-                    gap.value - now.value > after.value and not contradicted(this.null, parts[member], rest)
+                    after.value < _REST_OF_NAMED * (gap.value - now.value)
+                    and not _implicated(parts[member], rest, this.null)
                 )
                 additions.append(self._addition(this, int(member), (gap, now), stands))
                 gap = now
         return Added(tuple(additions), after, unfinished)
 
+    def _rest(self, last: NullModel) -> FloatArray:
+        """Return what the final model leaves of each statistic, in what it may leave, shape (m,)."""
+        allowed = tolerance(np.concatenate([this.added.parts for this in self.rounds]), self.allowed)
+        chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
+        return np.asarray((self.z.both - last.mean) / np.hypot(chance, allowed))
+
     def _addition(self, this: Round, member: int, gaps: tuple[Gap, Gap], stands: bool) -> Addition:
         added, parts = this.added.hypotheses[member], this.added.parts
         rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.settings.certainty)
-        allowed = tolerance(parts, self.settings.model_error)
+        allowed = tolerance(parts, self.allowed)
         fits = stands and not misfits(
             this.extended, self.z, parts[member], self.settings.significance, allowed
         )
         named = len(kept) == 1 and fits
+        described = type(added.effect).measured_only
         compared = [
             (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)
             for r in (rivals if named else kept)
@@ -125,7 +137,8 @@ class AddedRounds:
         return Addition(
             effect=added.effect if named else compared[0][0],
             alone=len(kept) == 1,
-            fits=fits,
+            fits=fits or described,
+            described=described,
             candidates=tuple(Candidate.of(e, r.score, r.stderr, r.probability) for e, r in compared),
             strength_stderr=_stderr(added, float(this.added.stderr[member])),
             before=gaps[0],
@@ -155,6 +168,14 @@ class AddedRounds:
         mean = this.null.mean + fit.parts.sum(axis=0)
         gap = self.gaps.gap(self.z.final, mean, this.null.replicates)
         return Rival(effect=rival.tag, gap_after=gap.value)
+
+
+def _implicated(part: FloatArray, rest: FloatArray, null: NullModel) -> bool:
+    """Tell whether an effect moves statistics that the whole model does not account for.
+
+    Whatever is missing besides, it is then not known that this effect has the right name.
+    """
+    return bool(np.any((np.abs(rest) > _LEFT) & (np.abs(part) > _MOVED * null.std)))
 
 
 def _weight(part: FloatArray, null: NullModel) -> float:

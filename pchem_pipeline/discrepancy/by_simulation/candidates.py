@@ -65,7 +65,11 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
             f"discrepancy.candidates: unknown effects {', '.join(unknown)}; known are {', '.join(known)}"
             + (f" (left out: {broken})" if broken else "")
         )
-    return {tag: known[tag] for tag in wanted if tag not in settings.exclude and not known[tag].untestable}
+    return {
+        tag: known[tag]
+        for tag in wanted
+        if tag not in settings.exclude and not known[tag].untestable and not known[tag].measured_only
+    }
 
 
 def placebo_for(guesses: Sequence[Effect], classes: Mapping[str, type[Effect]]) -> list[Effect]:

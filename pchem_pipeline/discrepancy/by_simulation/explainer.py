@@ -25,6 +25,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     serial,
 )
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
+from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
@@ -67,6 +68,8 @@ _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no s
 # standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 # than a single one would by chance
 _ESTABLISHED = 4.5
+_DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
+_MEASUREMENTS = 2  # of its shifts: the pixels are refitted with the first ones
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
 
 
@@ -265,10 +268,35 @@ class FrameExplainer:
         while found is not None and added is not None:
             kept = self._established(added, z)
             if len(kept) == len(added.hypotheses):
-                return self._put(found, added, explanation, null)
+                return self._put(found, added, explanation.hypotheses, null)
             if not kept or {h.tag for h in kept} <= {h.tag for h in held}:
                 break
             added = refitter.sharpened(refitter.refined(kept), self.settings.extended_replicates)
+        return None
+
+    def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
+        """Measure what no effect explains as shifts of the samples, and put it into the model.
+
+        First without the effects that were added, since one that merely mimics has no place beside it; with
+        them where that does not close the gap. None where it closes less than half of what is left.
+        """
+        left = self.gaps.gap(z.final, null.mean, null.replicates)
+        if left.at_floor:
+            return None
+        rounds, model = self.rounds, self.model
+        held = tuple(h for this in rounds for h in this.added.hypotheses)
+        for kept in [(), held] if held else [()]:
+            found = self._described(z, kept)
+            if found is None:
+                continue
+            gap = self.gaps.gap(z.final, found.mean, found.vectors)
+            if gap.at_floor or gap.value < _DESCRIBED * (
+                left.value if kept else min(left.value, before.value)
+            ):
+                self.rounds = [*rounds] if kept else []
+                tags = {h.tag for h in held} - found.tags
+                self.model = tuple(e for e in model if e.tag not in tags)
+                return self._put(Comparison(found, (found,)), found, (), null if kept else self.first)
         return None
 
     def tolerance(self) -> FloatArray | float:
@@ -276,11 +304,18 @@ class FrameExplainer:
         if not self.rounds:
             return 0.0
         parts = np.concatenate([this.added.parts for this in self.rounds])
-        return tolerance(parts, self.settings.model_error)
+        return tolerance(parts, self._allowed)
+
+    @property
+    def _allowed(self) -> float:
+        """Relative error of what effects do at their best fit: their details are never quite the sensor's."""
+        return self.settings.model_error / 2.0
 
     def close(self, before: Gap, null: NullModel, z: Measured, disagrees: bool) -> Added:
         """Measure the gap on the final frames after each effect, and with rivals in its place."""
-        return AddedRounds(self.rounds, self.gaps, z, self.settings).close(before, null, disagrees)
+        return AddedRounds(self.rounds, self.gaps, z, self.settings, self._allowed).close(
+            before, null, disagrees
+        )
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the maps under the model, with that taken out of H which effects add to single pixels.
@@ -356,6 +391,27 @@ class FrameExplainer:
         events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
         return Noise(covariance, self.settings.model_error, events)
 
+    def _described(self, z: Measured, kept: tuple[Hypothesis, ...]) -> Refitted | None:
+        """Return effects with measured shifts beside them at their best fit; None where there are none."""
+        refitter = self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses))
+        seen, effects = self.frames.stack[self.frames.seen], tuple(h.effect for h in kept)
+        found: Refitted | None = None
+        for _ in range(_MEASUREMENTS):
+            present = refitter.model(found.effects if found else effects)
+            fit = self._mapped(present)[0]
+            measured = measured_shifts(seen, fit.maps, refitter.model(effects))
+            if measured is None:
+                return None
+            _, vectors = refitter.draw((*effects, measured), self.settings.extended_replicates)
+            shift = vectors.mean(axis=0) - self.first.mean - sum(h.fingerprint for h in kept)
+            found = refitter.refined((*kept, Hypothesis(measured, shift)))
+            kept = found.hypotheses[:-1]
+            effects = found.effects[:-1]
+        assert found is not None
+        found = refitter.sharpened(found, self.settings.extended_replicates)
+        proven = {h.tag for h in self._established(found, z)}
+        return found if proven == found.tags else None
+
     def _refitter(self, z: Measured, held: tuple[Hypothesis, ...]) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""
         found = {h.tag for h in held}
@@ -373,7 +429,7 @@ class FrameExplainer:
             return fit, as_matrix(self.first.names, vectors[:count])
 
         events = np.asarray(self._noise(self.first, 2).events)
-        return Refitter(draw, self.first, z.both, events)
+        return Refitter(draw, self.first, z.both, events, present)
 
     def _established(self, added: Refitted, z: Measured) -> tuple[Hypothesis, ...]:
         """Return the effects of which the data have certainly some, the final frames too.
@@ -392,7 +448,7 @@ class FrameExplainer:
         )
 
     def _put(
-        self, found: Comparison, added: Refitted, explanation: _Explanation, null: NullModel
+        self, found: Comparison, added: Refitted, hypotheses: tuple[Hypothesis, ...], null: NullModel
     ) -> NullModel:
         """Put a set into the model, at the strengths to which its replicates correct it."""
         change = np.where(np.abs(added.change) < _NEAR, np.expm1(added.change), 0.0)
@@ -414,7 +470,7 @@ class FrameExplainer:
         fit = SetFit(
             new, np.ones(len(new)), np.array([errors[h.tag] for h in new]), np.zeros(len(new), np.bool_)
         )
-        self.rounds.append(Round(found, fit, explanation.hypotheses, null, extended, self.fit.moved))
+        self.rounds.append(Round(found, fit, hypotheses, null, extended, self.fit.moved))
         return extended
 
 

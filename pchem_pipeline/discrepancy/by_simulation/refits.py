@@ -99,13 +99,16 @@ class Refitter:
         null: of the model without them.
         target: mean of the statistics of ``splits`` parts of the data, shape (m,).
         events: see :class:`~.fingerprints.Noise`.
+        present: effects that the model has besides.
         splits: number of parts.
+        steps: corrections of the strengths, at most.
     """
 
     draw: Callable[[tuple[Effect, ...], int], tuple[Refit, FloatArray]]
     null: NullModel
     target: FloatArray
     events: FloatArray
+    present: tuple[Effect, ...] = ()
     splits: int = 2
     steps: int = _MOST_STEPS
 
@@ -138,6 +141,10 @@ class Refitter:
             else:
                 break
         return best
+
+    def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+        """Return the model with effects."""
+        return (*self.present, *effects)
 
     @property
     def nothing(self) -> float:

@@ -73,6 +73,7 @@ class Effect(Section):
         erratic: whether its time profile is drawn anew in every simulation, so that a fingerprint is one of
             many and another effect outdoes it only by a clear margin.
         untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
+        measured_only: whether it is no hypothesis, but what is measured where all of those have failed.
     """
 
     tag: str
@@ -85,6 +86,7 @@ class Effect(Section):
     separate: ClassVar[Mapping[str, str]] = {}
     erratic: ClassVar[bool] = False
     untestable: ClassVar[str] = ""
+    measured_only: ClassVar[bool] = False
     region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
     when: When | None = Field(default=None, description="in which frames it acts; null: in all")
 
@@ -155,6 +157,10 @@ class Effect(Section):
         values = self.model_dump()
         values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
         return type(self).model_validate(values)
+
+    def words(self) -> str:
+        """Return what is known of it, for people."""
+        return self.title or self.tag
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of the pixels' samples with this effect: its place in the fit.

@@ -28,6 +28,7 @@ _IMMATERIAL = 0.2
 VERDICT_WORDS: dict[str, tuple[Level, str]] = {
     "named": ("note", "Named"),
     "ambiguous": ("caution", "Ambiguous"),
+    "described": ("caution", "Described"),
     "unexplained": ("serious", "Unexplained"),
     "consistent": ("good", "Consistent"),
 }

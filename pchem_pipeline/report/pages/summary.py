@@ -284,7 +284,12 @@ def _discrepancy(data: ReportData) -> list[Flag]:
     if data.discrepancy is None:
         return []
     found = data.discrepancy.found
-    levels: dict[str, Level] = {"consistent": "good", "ambiguous": "caution", "unexplained": "serious"}
+    levels: dict[str, Level] = {
+        "consistent": "good",
+        "ambiguous": "caution",
+        "described": "caution",
+        "unexplained": "serious",
+    }
     return [Flag(levels.get(found.verdict, "note"), _as_sentence(found.sentence.replace(" -> ", " → ")))]
 
 
