@@ -37,7 +37,7 @@ _SINGULAR = 1e-6
 _SMALLEST = 1e-10  # of the damping matrix: less is lost in rounding
 
 
-@kernel
+@kernel(borrows=True)
 def cholesky(matrix: FloatArray, held: NDArray[np.bool_], first: int, size: int, lower: FloatArray) -> bool:
     """Factor the rows 1 ... size - 1 of a matrix; False unless positive definite.
 
@@ -67,7 +67,7 @@ def cholesky(matrix: FloatArray, held: NDArray[np.bool_], first: int, size: int,
     return True
 
 
-@kernel
+@kernel(borrows=True)
 def back_substitute(lower: FloatArray, size: int, vector: FloatArray) -> float:
     """Solve ``L L' x = vector`` in rows 1 ... size - 1 in place; return ``vector' x``, squared decrement."""
     squared = 0.0
@@ -83,7 +83,7 @@ def back_substitute(lower: FloatArray, size: int, vector: FloatArray) -> float:
     return squared
 
 
-@kernel
+@kernel(borrows=True)
 def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
     """Solve for the step with the information and a share of the damping matrix.
 

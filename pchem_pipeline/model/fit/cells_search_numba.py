@@ -132,7 +132,7 @@ def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray)
     theta[n + SATELLITE] = 0.0
 
 
-@kernel
+@kernel(borrows=True)
 def _better(
     pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, heights: tuple[float, float]
 ) -> tuple[float, float, int]:

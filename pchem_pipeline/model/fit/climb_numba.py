@@ -127,7 +127,7 @@ class Goal(NamedTuple):
     tied: bool | np.bool_
 
 
-@kernel
+@kernel(borrows=True)
 def min_log_variance(a: float, cells: bool) -> float:
     """Return the lower bound of v for a step a: rounding, or little, and a floor in e-."""
     if cells:
@@ -143,7 +143,7 @@ def floor_in_electrons(a: float, cells: bool) -> bool:
     return 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
 
 
-@kernel
+@kernel(borrows=True)
 def keep_inside(theta: FloatArray, limits: Limits) -> None:
     """Move ``theta`` to the nearest allowed values."""
     n = theta.size - N_BLOCK + 1
@@ -153,7 +153,7 @@ def keep_inside(theta: FloatArray, limits: Limits) -> None:
     theta[n + SATELLITE] = min(max(theta[n + SATELLITE], 0.0), MOST_SATELLITE)
 
 
-@kernel
+@kernel(borrows=True)
 def brightest(theta: FloatArray) -> float:
     """Return the largest log H."""
     most: float = theta[0]
@@ -162,7 +162,7 @@ def brightest(theta: FloatArray) -> float:
     return most
 
 
-@kernel
+@kernel(borrows=True)
 def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
     """Tell whether the parameters are in the range in which they can be told from those of Gaussians."""
     n = theta.size - N_BLOCK + 1
@@ -173,7 +173,7 @@ def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
     return bool(inside and brightest(theta) < MAX_LOG_EXPOSURE)
 
 
-@kernel
+@kernel(borrows=True)
 def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
     """Tell whether two points belong to one maximum.
 
@@ -188,7 +188,7 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
     return bool(near and abs(a - right[n + STEP]) * most < 0.3 * a)
 
 
-@kernel
+@kernel(borrows=True)
 def find_held(
     theta: FloatArray, at: FloatArray, fixed: NDArray[np.bool_], limits: Limits, held: NDArray[np.bool_]
 ) -> None:
@@ -243,7 +243,7 @@ def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out
     return True
 
 
-@kernel
+@kernel(borrows=True)
 def newton_step(
     at: FloatArray, share: float, least: float, scratch: Scratch, step: FloatArray
 ) -> tuple[float, float]:
@@ -263,7 +263,7 @@ def newton_step(
     return 0.5 * squared, share
 
 
-@kernel
+@kernel(borrows=True)
 def _take_step(theta: FloatArray, step: FloatArray, tied: float, limits: Limits, out: FloatArray) -> float:
     """Take a Newton step, shortened to stay where the quadratic can be trusted; return the factor.
 

@@ -51,13 +51,13 @@ def _search_arguments() -> tuple[Any, ...]:
 @functools.cache
 def climb() -> Any:
     """Return the climb to the nearest maximum, :func:`.climb_numba.climb`."""
-    return callback(climb_numba.climb, _OUTCOME, _climb_arguments())
+    return callback(climb_numba.climb, _OUTCOME, _climb_arguments(), borrows=True)
 
 
 @functools.cache
 def density_search() -> Any:
     """Return the search with the density, :func:`.search_numba.search_density`."""
-    return callback(search_numba.search_density, _FOUND, _search_arguments())
+    return callback(search_numba.search_density, _FOUND, _search_arguments(), borrows=True)
 
 
 @functools.cache

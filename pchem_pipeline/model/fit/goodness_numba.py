@@ -14,7 +14,7 @@ SMALLEST_EXPECTATION = 5.0
 FITTED_PARAMETERS = 4
 
 
-@kernel
+@kernel(borrows=True)
 def pearson(
     weights: NDArray[np.float64], expectations: NDArray[np.float64], n_bins: int, n: float
 ) -> tuple[float, int]:
@@ -46,7 +46,7 @@ def pearson(
     return chi2, freedom
 
 
-@kernel
+@kernel(borrows=True)
 def normal_score(chi2: float, freedom: int) -> float:
     """Return the chi-square as a standard normal deviate (Wilson and Hilferty 1931); 0 without freedom."""
     if freedom <= 0:
@@ -56,7 +56,7 @@ def normal_score(chi2: float, freedom: int) -> float:
     return deviate
 
 
-@kernel
+@kernel(borrows=True)
 def goodness(pixel: Pixel) -> tuple[float, int]:
     """Return Pearson's chi-square of all samples, from the counts expected, and its degrees of freedom.
 
@@ -76,7 +76,7 @@ def goodness(pixel: Pixel) -> tuple[float, int]:
     return chi2, freedom
 
 
-@kernel
+@kernel(borrows=True)
 def outlying(pixel: Pixel, floor: float) -> float:
     """Return how many samples lie at DN of which fewer than ``floor`` are expected."""
     found = 0.0

@@ -58,7 +58,7 @@ _LEAST_MASS = 1e-9  # of a sample that must not decide between starts
 _ROW = SLOPES + 1 + SATELLITE  # of the slopes in the weight
 
 
-@kernel
+@kernel(borrows=True)
 def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
     """Fill mass and slopes of the cells of all samples, only as far out as most samples lie."""
     own = scratch.small[OWN]
@@ -67,7 +67,7 @@ def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
         fill_masses(own, cells_of(pixel, j), np.int64(CORE), scratch.numbers, scratch.cells[j])
 
 
-@kernel
+@kernel(borrows=True)
 def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tuple[float, int]:
     """Climb with the weight of the satellites free; return log-likelihood, or -inf, and evaluations."""
     goal = Goal(np.bool_(True), to_beat, math.inf, np.bool_(False))
@@ -75,7 +75,7 @@ def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tup
     return (loglik if outcome == CONVERGED else -math.inf), used
 
 
-@kernel
+@kernel(borrows=True)
 def _weight(pixel: Pixel, scratch: Scratch) -> tuple[float, float]:
     """Return the likeliest weight of the free satellites, and the rise of the log-likelihood.
 

@@ -81,7 +81,7 @@ class Tools(NamedTuple):
     scratch: Scratch
 
 
-@kernel
+@kernel(borrows=True)
 def climb_on(
     pixel: Pixel, tools: Tools, goal: Goal, known: FloatArray, theta: FloatArray
 ) -> tuple[int, float, int]:
@@ -127,7 +127,7 @@ def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> 
     return most > _LEAST_BRIGHT
 
 
-@kernel
+@kernel(borrows=True)
 def climb_neighbours(
     pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: float
 ) -> tuple[float, float, int]:
@@ -173,7 +173,7 @@ def climb_neighbours(
     return best_loglik, runner_up, used
 
 
-@kernel
+@kernel(borrows=True)
 def loglik_without_gain(pixel: Pixel) -> float:
     """Return the log-likelihood of Gaussians of one width, each at the mean of its sample: g to infinity."""
     n = square = 0.0
@@ -212,7 +212,7 @@ def expected_gap(n: float, theta: FloatArray) -> float:
     return gap
 
 
-@kernel
+@kernel(borrows=True)
 def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> tuple[float, int, float]:
     """Evaluate at a maximum; return log-likelihood, degrees of freedom and score of the goodness of fit.
 
@@ -225,7 +225,7 @@ def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> t
     return loglik, freedom, normal_score(out[CHI2], freedom)
 
 
-@kernel
+@kernel(borrows=True)
 def judge(pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, gap: float) -> int:
     """Return the status word of a converged pixel.
 

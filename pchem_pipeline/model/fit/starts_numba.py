@@ -38,6 +38,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     N_FRAMES,
     N_KEPT,
     OCCUPIED,
+    OTHER,
     SATELLITE,
     STEP,
     VARIANCE,
@@ -91,7 +92,7 @@ def regression_basis() -> NDArray[np.float64]:
     return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / satellite[None, :]))
 
 
-@kernel
+@kernel(borrows=True)
 def ecf_power(
     histogram: Histogram,
     step: float,
@@ -128,7 +129,7 @@ def ecf_power(
         store_lanes(work, 0, m + 2 * LANES, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
 
 
-@kernel
+@kernel(borrows=True)
 def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
     weights = histogram.weights
@@ -209,7 +210,7 @@ def _regress(
     return satellite, best_exposure
 
 
-@kernel
+@kernel(borrows=True)
 def assemble(
     histogram: Histogram,
     a: float,
@@ -251,7 +252,7 @@ def assemble(
     return True, clear
 
 
-@kernel
+@kernel(borrows=True)
 def start_regression(
     histogram: Histogram,
     basis: NDArray[np.float64],
@@ -274,7 +275,7 @@ def start_regression(
     return answer
 
 
-@kernel
+@kernel(borrows=True)
 def start_peak(
     histogram: Histogram,
     work: NDArray[np.float64],
@@ -304,7 +305,7 @@ def start_peak(
     return found
 
 
-@kernel
+@kernel(borrows=True)
 def start_cumulants(
     histogram: Histogram,
     theta: NDArray[np.float64],
@@ -339,7 +340,7 @@ def n_attempts(n_samples: int) -> int:
     return _N_ATTEMPTS_SINGLE if n_samples == 1 else _N_ATTEMPTS_JOINT
 
 
-@kernel
+@kernel(borrows=True)
 def _likeliest(
     pixel: Pixel, evaluate: Any, scratch: Scratch, height: float, theta: NDArray[np.float64]
 ) -> float:
@@ -391,7 +392,7 @@ def _scan_gains(pixel: Pixel, evaluate: Any, scratch: Scratch, theta: NDArray[np
     return best > -math.inf
 
 
-@kernel
+@kernel(borrows=True)
 def scaled_start(
     histogram: Histogram,
     best: NDArray[np.float64],
@@ -451,7 +452,7 @@ def _other_start(
     return found
 
 
-@kernel
+@kernel(borrows=True)
 def fill_theta(
     pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, theta: NDArray[np.float64]
 ) -> bool:
@@ -556,7 +557,7 @@ def _closed_start(
     facts = pixel.facts
     if facts[j, DARK] > 0.0 or facts[j, OCCUPIED] < 3:
         return False, False
-    own = np.empty(4)
+    own = scratch.small[OTHER]
     histogram = histogram_of(pixel, j)
     clear = False
     if which == 0:
@@ -576,7 +577,7 @@ def _closed_start(
     return fill_theta(pixel, own[1], bias, noise2, np.bool_(False), theta), clear
 
 
-@kernel
+@kernel(borrows=True)
 def _keep(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
     """Put the start `HERE` among the likeliest, which lie apart; return 1 if it was evaluated."""
     trial, kept, heights = scratch.small[HERE], scratch.small[KEPT_STARTS:HEIGHTS], scratch.small[HEIGHTS]
@@ -651,7 +652,7 @@ def fill_starts(
     return any_clear, used
 
 
-@kernel
+@kernel(borrows=True)
 def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, scratch: Scratch) -> int:
     """Put starts on the line of variance against mean among the likeliest; return the evaluations."""
     line, used, trial = variance_line(pixel), 0, scratch.small[HERE]

@@ -60,6 +60,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     PER_ELECTRON,
     PER_ELECTRON2,
     RATIO,
+    RIGHT,
     SATELLITE,
     SCORE,
     SHARE,
@@ -195,7 +196,7 @@ def _row(values: NDArray[np.float64], index: int) -> int:
     return index if values.shape[1] > 1 else 0
 
 
-@kernel
+@kernel(borrows=True)
 def set_peaks(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     """Fill the levels of the noise of a pixel, those of free satellites (e-; 0: none) beside each."""
     n_sides = law.pattern.shape[0] if amplitude != 0.0 else 0
@@ -219,7 +220,7 @@ def set_peaks(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
         pixel.facts[j, N_PEAKS] = float(count)
 
 
-@kernel
+@kernel(borrows=True)
 def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     """Fill what the law says of a pixel: facts, mixtures, edges of the cells, levels of the noise.
 
@@ -262,7 +263,7 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     set_peaks(law, index, amplitude, pixel)
 
 
-@kernel
+@kernel(inline=True)
 def cells_of(pixel: Pixel, j: int) -> Cells:
     """Return one sample as the loops below take it."""
     bins, facts = pixel.bins[j], pixel.facts[j]
@@ -301,7 +302,7 @@ def _level(k: float, cells: Cells) -> float:
     return cells.level_scale * k * (1.0 + 0.5 * cells.curvature * (k - 1.0)) + cells.level_shift
 
 
-@kernel
+@kernel(borrows=True)
 def component(k: float, peak: int, theta: NDArray[np.float64], cells: Cells, reach: float) -> Component:
     """Return one electron number at one level; ``low >= high`` where it does not reach the cells."""
     a, analog2 = theta[_STEP], math.exp(theta[_VARIANCE])
@@ -336,7 +337,11 @@ def _list_numbers(
         farthest = max(farthest, shift + abs(cells.peaks[SHIFT_SIGMA, peak]) * math.sqrt(analog2))
     from_below, to_above = cells.bottom >= 0, cells.top <= cells.n_bins
     last = cells.first + cells.n_bins + cells.margin
-    most = exposure * np.max(cells.mixtures[EXPOSURE_FACTOR]) + np.max(cells.mixtures[ADDED_EXPOSURE])
+    factor = added = 0.0
+    for i in range(cells.mixtures.shape[1]):
+        factor = max(factor, cells.mixtures[EXPOSURE_FACTOR, i])
+        added = max(added, cells.mixtures[ADDED_EXPOSURE, i])
+    most = exposure * factor + added
     count, previous = 0, -math.inf
     k = 0.0
     while count < numbers.shape[0]:
@@ -361,7 +366,7 @@ def _list_numbers(
     return count
 
 
-@kernel
+@kernel(borrows=True)
 def _fill_edges(
     edges: NDArray[np.float64], part: Component, table: NDArray[np.float64], out: NDArray[np.float64]
 ) -> int:
@@ -379,7 +384,7 @@ def _fill_edges(
     return middle
 
 
-@kernel
+@kernel(borrows=True)
 def fill_masses(
     theta: NDArray[np.float64],
     cells: Cells,
@@ -441,7 +446,7 @@ def fill_masses(
     return count
 
 
-@kernel
+@kernel(borrows=True)
 def fill_far_enough(
     theta: NDArray[np.float64], cells: Cells, numbers: NDArray[np.float64], room: NDArray[np.float64]
 ) -> tuple[int, float]:
@@ -464,7 +469,9 @@ def fill_far_enough(
 
 
 @kernel(inline=True)
-def _sum_up(cells: Cells, room: NDArray[np.float64], out: NDArray[np.float64]) -> float:
+def _sum_up(
+    cells: Cells, room: NDArray[np.float64], change: NDArray[np.float64], out: NDArray[np.float64]
+) -> float:
     """Return the log-likelihood of the masses in the room; fill score, squared scores and ratios.
 
     Given that a sample is in a code that is not set aside, its score is less by that of their whole mass.
@@ -488,7 +495,7 @@ def _sum_up(cells: Cells, room: NDArray[np.float64], out: NDArray[np.float64]) -
                 for j in range(i + 1):
                     out[DAMPING + i, j] += ratio * slopes[i, cell] * (slopes[j, cell] / own)
     if cells.conditional:
-        loglik += _condition(cells, room, out)
+        loglik += _condition(cells, room, change, out)
     for i in range(N_BLOCK):
         for j in range(i + 1):
             out[INFORMATION + i, j] += out[DAMPING + i, j]
@@ -496,7 +503,9 @@ def _sum_up(cells: Cells, room: NDArray[np.float64], out: NDArray[np.float64]) -
 
 
 @kernel(inline=True)
-def _condition(cells: Cells, room: NDArray[np.float64], out: NDArray[np.float64]) -> float:
+def _condition(
+    cells: Cells, room: NDArray[np.float64], change: NDArray[np.float64], out: NDArray[np.float64]
+) -> float:
     """Take off what all kept codes together give; return the change of the log-likelihood.
 
     With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean,
@@ -505,7 +514,8 @@ def _condition(cells: Cells, room: NDArray[np.float64], out: NDArray[np.float64]
     mass, slopes, ratios = room[MASS], room[SLOPES:AT_EDGES], room[RATIO]
     n, rest = cells.frames, 1.0 - cells.outlier_share
     inside = 0.0
-    change = np.zeros(N_BLOCK)
+    for i in range(N_BLOCK):
+        change[i] = 0.0
     for cell in range(cells.n_bins):
         inside += cells.kept[cell] * mass[cell]
         for i in range(N_BLOCK):
@@ -603,7 +613,7 @@ def _subtract_curvature(
             information[3, 3] -= w * (f_mm * mv * mv + 2.0 * f_mq * mv * qv + f_qq * qv * qv + bend)
 
 
-@kernel
+@kernel(borrows=True)
 def own_theta(pixel: Pixel, j: int, theta: NDArray[np.float64], own: NDArray[np.float64]) -> None:
     """Fill a sample's own parameters from those of its pixel."""
     n = pixel.facts.shape[0]
@@ -647,7 +657,7 @@ def evaluate_cells(
         own_theta(pixel, j, theta, own)
         cells, room = cells_of(pixel, j), scratch.cells[j]
         count, reach = fill_far_enough(own, cells, scratch.numbers, room)
-        loglik += _sum_up(cells, room, out[j])
+        loglik += _sum_up(cells, room, scratch.small[RIGHT], out[j])
         _subtract_curvature(own, cells, reach, scratch.numbers[:count], room, out[j])
         if expect:
             _expect(pixel, j, cells, room)

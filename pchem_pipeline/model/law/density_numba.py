@@ -90,7 +90,7 @@ LOG_2PI = math.log(2.0 * math.pi)
 def _table_kernel(width: int) -> Callable[..., Any]:
     """Make the loop over the columns for a fixed number of components (0: given at run time)."""
 
-    @kernel
+    @kernel(borrows=True)
     def table_sums(
         table: NDArray[np.float64],
         columns: int,
@@ -224,7 +224,7 @@ def _fill_coefficients(
             store_lanes(table, _COEFFICIENT + place - step, filled + i, coefficient)
 
 
-@kernel
+@kernel(borrows=True)
 def _sum_table(
     table: NDArray[np.float64],
     filled: int,
@@ -337,7 +337,7 @@ def _finish(
     out[INFORMATION + 3, 3] = 0.5 * sum_ee * inverse - cov33
 
 
-@kernel
+@kernel(borrows=True)
 def _fill_complete(n: float, of_exposure: float, inverse: float, out: NDArray[np.float64]) -> None:
     """Fill the complete-data information, of parameters whose electron numbers are known; lower triangle."""
     sums = out[SUMS]

@@ -17,7 +17,7 @@ STEPS = 128
 FARTHEST = 38.0
 
 
-@kernel
+@kernel(borrows=True)
 def _log_rising(dispersion: float, k: float) -> float:
     """Return ``sum_{j<k} log(1 + j a)``; a sum of logarithms where those of gamma functions would cancel."""
     total = 0.0
@@ -30,7 +30,7 @@ def _log_rising(dispersion: float, k: float) -> float:
     return total
 
 
-@kernel
+@kernel(borrows=True)
 def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[float, float, float]:
     """Return log P(k) at mean ``exposure`` and its first two derivatives in log exposure."""
     log_factorial = math.lgamma(k + 1.0)
@@ -53,7 +53,7 @@ def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[fl
     return k * math.log(exposure) - exposure - log_factorial, k - exposure, -exposure
 
 
-@kernel
+@kernel(borrows=True)
 def electron_number(
     law: int,
     dispersion: float,
@@ -92,7 +92,7 @@ def electron_number(
     return mass, slope, bend
 
 
-@kernel
+@kernel(borrows=True)
 def fill_normal_table(table: NDArray[np.float64]) -> None:
     """Fill the upper tail and the density of the normal law at z = 0, 1/STEPS, ..., shape (n, 2)."""
     for j in range(table.shape[0]):

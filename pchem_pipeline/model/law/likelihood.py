@@ -27,10 +27,10 @@ def evaluation_arguments() -> tuple[Any, ...]:
 @functools.cache
 def density_likelihood() -> Any:
     """Return the likelihood of the density at whole DN, :func:`.density_numba.evaluate_density`."""
-    return callback(density_numba.evaluate_density, numba.types.float64, evaluation_arguments())
+    return callback(density_numba.evaluate_density, numba.types.float64, evaluation_arguments(), borrows=True)
 
 
 @functools.cache
 def cells_likelihood() -> Any:
     """Return the likelihood of the cells, integrated, :func:`.cells_numba.evaluate_cells`."""
-    return callback(cells_numba.evaluate_cells, numba.types.float64, evaluation_arguments())
+    return callback(cells_numba.evaluate_cells, numba.types.float64, evaluation_arguments(), borrows=True)

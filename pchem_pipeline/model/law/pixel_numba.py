@@ -204,14 +204,14 @@ def make_pixel(
     )
 
 
-@kernel
+@kernel(borrows=True)
 def copy(source: FloatArray, target: FloatArray) -> None:
     """Copy a vector; a plain loop, since slice assignment compiles slowly."""
     for i in range(source.size):
         target[i] = source[i]
 
 
-@kernel
+@kernel(borrows=True)
 def copy_evaluation(source: FloatArray, target: FloatArray) -> None:
     """Copy an evaluation."""
     for j in range(source.shape[0]):
@@ -220,7 +220,7 @@ def copy_evaluation(source: FloatArray, target: FloatArray) -> None:
                 target[j, row, column] = source[j, row, column]
 
 
-@kernel
+@kernel(borrows=True)
 def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray, facts: FloatArray) -> int:
     """Fill the histogram of one sample without its empty ends, and sum it up.
 
@@ -274,7 +274,7 @@ def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray,
     return int(low + middle)
 
 
-@kernel
+@kernel(inline=True)
 def histogram_of(pixel: Pixel, j: int) -> Histogram:
     """Return one sample's histogram, counted from its own centre."""
     facts = pixel.facts[j]

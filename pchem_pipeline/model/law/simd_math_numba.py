@@ -26,7 +26,7 @@ _EXP = (
 )
 
 
-@kernel
+@kernel(borrows=True)
 def artanh_series(z: Lanes) -> Lanes:
     """Return ``artanh(q) / q`` of ``z = q^2``."""
     top, rest = _ARTANH
@@ -34,7 +34,7 @@ def artanh_series(z: Lanes) -> Lanes:
     return fused(z, fused(z, fused(z, fused(z, series, rest[0]), rest[1]), rest[2]), rest[3])
 
 
-@kernel
+@kernel(borrows=True)
 def lanes_log(x: Lanes) -> Lanes:
     """Return log(x) of positive normal numbers.
 
@@ -46,7 +46,7 @@ def lanes_log(x: Lanes) -> Lanes:
     return fused(exponent, LN2, 2.0 * q * artanh_series(q * q))
 
 
-@kernel
+@kernel(borrows=True)
 def lanes_exp(x: Lanes) -> Lanes:
     """Return exp(x) of numbers between -700 and 700: ``2^n`` and a polynomial for the rest."""
     top, middle, rest = _EXP
