@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["read_sums", "run_quick_look"]
 
 #: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
-_MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 23, 1 << 23
+_MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22
 #: Pixels whose codes are looked at, in so many pieces of the sensor, and the fewest that say anything.
 _PIXELS, _PIECES, _FEWEST = 1024, 8, 16
 

@@ -148,9 +148,24 @@ def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     for check in checks:
         place = places.get(_MAP_OF.get(check.name, ""))
         found.append(check if place is None else _placed(check, place, sums))
+    for noise, neighbours in (("row_noise", "neighbours_x"), ("column_noise", "neighbours_y")):
+        found = _told_once(found, noise, neighbours)
     if "spread" in maps:
         found.append(_local_drift(sums, places["spread"]))
     return found
+
+
+def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
+    """Return checks in which neighbours that noise of their line makes alike say so: one place, one cause."""
+    first = next((check for check in checks if check.name == noise), None)
+    if first is None or first.region is None or first.p > SIGNIFICANCE / len(checks):
+        return checks
+    return [
+        replace(check, advice="as the noise that they share there makes them")
+        if check.name == neighbours and check.region == first.region
+        else check
+        for check in checks
+    ]
 
 
 def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:

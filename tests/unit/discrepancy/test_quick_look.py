@@ -137,9 +137,11 @@ def test_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
         dn[:, :, 24:] += 0.8 * SIGMA * rng.standard_normal(dn.shape[:2])[:, :, None]
         return dn
 
-    check = by_name(looked(stack(rng, SHAPE, moved)))["row_noise"]
+    checks = by_name(looked(stack(rng, SHAPE, moved)))
+    check = checks["row_noise"]
     assert check.found
     assert check.region == {"columns": [[24, 32]]}
+    assert checks["neighbours_x"].advice == "as the noise that they share there makes them"
     assert check.where == "columns 24 to 31"
     assert check.size == pytest.approx(0.8 * SIGMA, rel=0.1)
     assert check.level == "serious"
