@@ -256,7 +256,10 @@ def export(
     target: Target,
     output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("export"),
     formats: Annotated[
-        str, typer.Option("--format", help="fits, tiff, npz and csv (summary), separated by commas")
+        str,
+        typer.Option(
+            "--format", help="fits, tiff, npz, csv (summary) and emva (a table in the words of EMVA 1288)"
+        ),
     ] = "fits,csv",
 ) -> None:
     """Write maps as FITS, TIFF or npz, and a CSV summary."""

@@ -10,6 +10,8 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.base.variables import Variable, variables_of
+from pchem_pipeline.commands.emva import COLUMNS as EMVA_COLUMNS
+from pchem_pipeline.commands.emva import emva_rows
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.run.progress import Reporter
@@ -21,8 +23,8 @@ from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["FORMATS", "export_run"]
 
-#: Formats that maps can be exported to, and their CSV summary.
-FORMATS = ("fits", "tiff", "npz", "csv")
+#: Formats that maps can be exported to, their CSV summary, and a table in the words of EMVA 1288.
+FORMATS = ("fits", "tiff", "npz", "csv", "emva")
 
 _FROM_FIT = ("fit_status", "likelihood_gap", "goodness_p")
 _COLUMNS = (
@@ -69,7 +71,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     except OSError as error:
         raise storage_error(error, folder) from error
     written: list[Path] = []
-    images = _images(store) if set(formats) - {"csv"} else []
+    images = _images(store) if set(formats) - {"csv", "emva"} else []
     for name in dict.fromkeys(formats):
         if name == "fits":
             written += write_fits(folder / "maps.fits", images, _header(target, store))
@@ -77,6 +79,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
             written += write_tiff(folder, images)
         elif name == "npz":
             written += write_npz(folder / "maps.npz", images)
+        elif name == "emva":
+            written.append(_write_emva(folder, target, store))
         else:
             written += _write_csv(folder, store)
     return written
@@ -123,6 +127,13 @@ def _write_csv(folder: Path, store: RunStore) -> list[Path]:
     reasons = [["fit_status", "pixels", "meaning"]]
     reasons += [[name, n, meanings.get(name, "")] for name, n in attributes["fit_status"].items()]
     return [_table(folder / "summary.csv", rows), _table(folder / "fit_status.csv", reasons)]
+
+
+def _write_emva(folder: Path, target: Target, store: RunStore) -> Path:
+    """Write what an EMVA 1288 data sheet can take of the run."""
+    config = target.config
+    found = emva_rows(store, config.input.kind, config.maps.outlier_sigmas)
+    return _table(folder / "emva1288.csv", [list(EMVA_COLUMNS), *(row.cells() for row in found)])
 
 
 def _table(path: Path, rows: list[list[Any]]) -> Path:

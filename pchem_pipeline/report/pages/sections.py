@@ -14,6 +14,7 @@ from typing import Any
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import AXES, slope_of
+from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
@@ -264,6 +265,10 @@ def _provenance(material: Material) -> Section:
     return Section("provenance", "Origin of the results", "tables", content)
 
 
+def _cite(material: Material) -> Section:
+    return Section("cite", "How to describe and cite this", "cite", {"citation": citation(material.data)})
+
+
 def _configuration(material: Material) -> Section:
     return Section("configuration", "Configuration", "text", {"text": material.data.config_yaml})
 
@@ -275,6 +280,7 @@ PAGE: tuple[Maker, ...] = (
     *(partial(_figures, row) for row in SECTIONS),
     _discrepancy,
     _tables,
+    _cite,
     _provenance,
     _configuration,
 )

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from helpers.report_material import pixel_fit, report_data, true_maps
 
+from pchem_pipeline import __version__
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.inspector.inspector import script
 from pchem_pipeline.report.pages import report as report_module
+from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags, sentence
@@ -340,6 +342,23 @@ def test_flags_of_the_ensemble(
 ) -> None:
     found = [flag for flag in flags(replace(data, ensemble_facts=change)) if "raw ensemble" in flag.text]
     assert [(flag.level, words in flag.text) for flag in found] == [(level, True)]
+
+
+def test_how_to_cite_has_the_numbers_and_the_papers(page: Page, data: ReportData) -> None:
+    found = citation(data)
+    assert found.text in page.text
+    median = np.nanmedian(np.where(data.flagged, np.nan, data.maps["read_noise_e"]))
+    assert f"read noise {median:.4f}" in found.text
+    assert (
+        f"17,750 frames of {data.shape[0]} × {data.shape[1]} pixels at an integration time of 4.87 s"
+        in found.text
+    )
+    assert f"pchem_pipeline {__version__} with numpy {np.__version__}" in found.text
+    assert "arXiv:2302.14654" in found.bibtex
+    assert "2403.04498" not in found.bibtex  # one exposure
+    together = replace(data, samples=Samples((Sample("a", "exposed", 1.0, 9),), "none", {}))
+    assert "arXiv:2403.04498" in citation(together).bibtex
+    assert found.bibtex.count("{") == found.bibtex.count("}")
 
 
 def test_poor_goodness_of_fit_is_said(data: ReportData) -> None:

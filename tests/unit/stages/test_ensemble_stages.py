@@ -433,7 +433,7 @@ def test_export(finished: StageContext, tmp_path: Path) -> None:
     from tifffile import imread
 
     finished.store.write_config(dump_config(finished.config))
-    written = export_run(finished.store.path, tmp_path / "out", ("fits", "tiff", "npz", "csv"))
+    written = export_run(finished.store.path, tmp_path / "out", ("fits", "tiff", "npz", "csv", "emva"))
     assert all(path.exists() for path in written)
     gain = finished.store.read("maps/conversion_gain")
     with fits.open(tmp_path / "out" / "maps.fits") as file:

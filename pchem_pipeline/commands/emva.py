@@ -1,0 +1,175 @@
+"""The results of a run in the words of EMVA 1288, each with how its definition differs from that one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["COLUMNS", "EmvaRow", "emva_rows"]
+
+COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_here", "where_it_differs")
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EmvaRow:
+    """A quantity of EMVA 1288; ``value`` is None where this run cannot tell it."""
+
+    quantity: str
+    symbol: str
+    value: float | None
+    standard_error: float | None
+    unit: str
+    definition_here: str
+    where_it_differs: str
+
+    def cells(self) -> list[str]:
+        """Return the row as text; what is not known is empty."""
+        numbers = [
+            f"{x:.6g}" if x is not None and np.isfinite(x) else "" for x in (self.value, self.standard_error)
+        ]
+        return [self.quantity, self.symbol, *numbers, self.unit, self.definition_here, self.where_it_differs]
+
+
+def emva_rows(store: RunStore, kind: str, outlier_sigmas: float = 6.0) -> list[EmvaRow]:
+    """Return the table of a run; pixels without a value and flagged ones are left out.
+
+    Args:
+        store: a run with maps.
+        kind: what made the charge: dark, light or unknown.
+        outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
+
+    Raises:
+        StoreError: the run has no maps.
+    """
+    status = store.read("fit/fit_status")
+    kept = (status & int(FAILED | FLAGGED)) == 0
+    names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
+    maps = {name: store.read(f"maps/{name}")[kept] for name in names}
+    errors = {name: store.read(f"maps/{name}_stderr")[kept] for name in names}
+    if not kept.any():
+        maps = {name: np.full(1, np.nan) for name in names}
+        errors = dict(maps)
+    gain = maps["conversion_gain"]
+    rows = [
+        EmvaRow(
+            "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",
+            "EMVA: one slope of temporal variance over mean for the whole sensor, above dark",
+        ),
+        EmvaRow(
+            "temporal dark noise", "sigma_d", *_root_mean_square(maps["read_noise_e"]), "e-",
+            "root mean square over the pixels of the read noise sigma g, quantisation included",
+            "EMVA: of dark frames, so that shot noise of the dark current is in it; here it is not",
+        ),
+        EmvaRow(
+            "temporal dark noise", "sigma_y.dark", *_root_mean_square(maps["read_noise_dn"]), "DN",
+            "root mean square over the pixels of sigma, quantisation included", "as above",
+        ),
+        _dsnu(maps, errors, kind),
+        _prnu(maps, errors, kind),
+        EmvaRow(
+            "non-uniformity of the gain", "", *_relative_spread(gain, errors["conversion_gain"]), "%",
+            "standard deviation of g between the pixels over its mean, without what their errors add",
+            "EMVA has no such quantity: its K is one number; in PRNU gain and sensitivity are together",
+        ),
+        _dark_current(store, kept, kind),
+        EmvaRow(
+            "hot pixels", "", _hot_share(store.read("maps/quanta_exposure"), maps, outlier_sigmas), None, "%",
+            f"pixels whose H is above the median by more than {outlier_sigmas:g} robust standard deviations",
+            "EMVA: defect pixels are by a limit that the application sets, on the logarithmic histogram",
+        ),
+    ]  # fmt: skip
+    missing = "needs calibrated light", "needs exposures up to saturation"
+    rows += [
+        EmvaRow("quantum efficiency", "eta", None, None, "%", "not determined", missing[0]),
+        EmvaRow(
+            "absolute sensitivity threshold", "mu_p.min", None, None, "photons", "not determined", missing[0]
+        ),
+        EmvaRow("saturation capacity", "mu_e.sat", None, None, "e-", "not determined", missing[1]),
+        EmvaRow("dynamic range", "DR", None, None, "", "not determined", missing[1]),
+    ]
+    return rows
+
+
+def _mean(values: FloatArray) -> tuple[float, float]:
+    return float(values.mean()), float(
+        values.std(ddof=1) / np.sqrt(values.size)
+    ) if values.size > 1 else np.nan
+
+
+def _root_mean_square(values: FloatArray) -> tuple[float, float]:
+    square, error = _mean(values**2)
+    return float(np.sqrt(square)), float(error / (2.0 * np.sqrt(square)))
+
+
+def _spread(values: FloatArray, variance: FloatArray) -> tuple[float, float]:
+    """Return the standard deviation between pixels without their own variance, and its standard error."""
+    if values.size < 2:
+        return np.nan, np.nan
+    whole = float(values.var(ddof=1))
+    own = max(whole - float(np.mean(variance)), 0.0)
+    fourth = float(np.mean((values - values.mean()) ** 4))
+    error = np.sqrt(max(fourth - whole**2, 0.0) / values.size)
+    return float(np.sqrt(own)), float(error / (2.0 * np.sqrt(own))) if own > 0 else np.nan
+
+
+def _relative_spread(values: FloatArray, stderr: FloatArray) -> tuple[float, float]:
+    spread, error = _spread(values, stderr**2)
+    scale = 100.0 / float(values.mean())
+    return spread * scale, error * scale
+
+
+def _dsnu(maps: dict[str, FloatArray], errors: dict[str, FloatArray], kind: str) -> EmvaRow:
+    gain = float(np.median(maps["conversion_gain"]))
+    if kind == "dark":
+        mean = maps["bias"] + maps["quanta_exposure"] / maps["conversion_gain"]
+        # the mean of the samples is known far better than bias and H are: its own error is left in
+        value, error = _spread(mean * gain, np.zeros_like(mean))
+        words = "standard deviation between the pixels of mu + H/g, in e- by the median g"
+        differs = "EMVA takes off the temporal noise that is left in the mean; here it is left in"
+    else:
+        value, error = _spread(maps["bias"] * gain, (errors["bias"] * gain) ** 2)
+        words = (
+            "standard deviation between the pixels of the bias, in e- by the median g, without their errors"
+        )
+        differs = (
+            "EMVA: of dark frames, dark current included; here of the bias alone (input.kind is not dark)"
+        )
+    return EmvaRow("dark signal non-uniformity", "DSNU_1288", value, error, "e-", words, differs)
+
+
+def _prnu(maps: dict[str, FloatArray], errors: dict[str, FloatArray], kind: str) -> EmvaRow:
+    value, error = None, None
+    if kind == "light":
+        value, error = _relative_spread(maps["quanta_exposure"], errors["quanta_exposure"])
+    return EmvaRow(
+        "photo response non-uniformity", "PRNU_1288 (like it)", value, error, "%",
+        "standard deviation of H between the pixels over its mean, without their errors (input.kind: light)",
+        "EMVA: at half saturation, dark taken off, trends of the illumination filtered "
+        "out; here none of these",
+    )  # fmt: skip
+
+
+def _dark_current(store: RunStore, kept: NDArray[np.bool_], kind: str) -> EmvaRow:
+    value: float | None = None
+    error: float | None = None
+    if kind == "dark" and store.has("maps/dark_current") and kept.any():
+        value, error = _mean(store.read("maps/dark_current")[kept])
+    return EmvaRow(
+        "dark current from mean", "mu_I.mean", value, error, "e-/px/s",
+        "mean over the pixels of H over the integration time (input.kind: dark), or of its slope",
+        "EMVA: slope of the mean dark signal over six or more exposure times",
+    )  # fmt: skip
+
+
+def _hot_share(exposure: FloatArray, maps: dict[str, FloatArray], outlier_sigmas: float) -> float:
+    centre = float(np.median(maps["quanta_exposure"]))
+    width = 1.4826 * float(np.median(np.abs(maps["quanta_exposure"] - centre)))
+    known = exposure[np.isfinite(exposure)]
+    return float(100.0 * np.mean(known > centre + outlier_sigmas * width)) if known.size else np.nan

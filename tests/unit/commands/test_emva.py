@@ -1,0 +1,88 @@
+"""The table in the words of EMVA 1288, against plain numpy on maps that are drawn here."""
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.commands.emva import COLUMNS, emva_rows
+from pchem_pipeline.model.fit.status import FitStatus
+
+SHAPE = (60, 80)
+
+
+class Maps:
+    """As much of a store as the table reads."""
+
+    def __init__(self):
+        rng = np.random.default_rng(3)
+        self.true = {
+            "quanta_exposure": 2.0 + 0.1 * rng.standard_normal(SHAPE),
+            "conversion_gain": 0.1 * (1 + 0.02 * rng.standard_normal(SHAPE)),
+            "bias": 100 + 3 * rng.standard_normal(SHAPE),
+            "read_noise_dn": 3 + 0.1 * rng.standard_normal(SHAPE),
+            "read_noise_e": 0.3 + 0.01 * rng.standard_normal(SHAPE),
+        }
+        self.true["quanta_exposure"][0, :24] = 30.0  # half a per cent is hot
+        self.arrays = {"fit/fit_status": np.zeros(SHAPE, np.uint16)}
+        for name, values in self.true.items():
+            error = 0.02 * np.median(values)
+            self.arrays[f"maps/{name}"] = values + error * rng.standard_normal(SHAPE)
+            self.arrays[f"maps/{name}_stderr"] = np.full(SHAPE, error)
+        self.arrays["fit/fit_status"][1] = int(FitStatus.BIAS_AMBIGUOUS)
+        self.arrays["maps/bias"][1] += 500
+        self.arrays["fit/fit_status"][2] = int(FitStatus.NO_DATA)
+        self.arrays["maps/dark_current"] = self.arrays["maps/quanta_exposure"] / 4
+        for name in [name for name in self.arrays if name.startswith("maps")]:
+            self.arrays[name][2] = np.nan
+
+    def read(self, path):
+        return self.arrays[path].copy()
+
+    def has(self, path):
+        return path in self.arrays
+
+
+@pytest.fixture(scope="module")
+def store():
+    return Maps()
+
+
+def table(store, kind):
+    return {row.symbol or row.quantity: row for row in emva_rows(store, kind)}
+
+
+def test_spreads_are_those_of_the_sensor_not_of_its_errors(store):
+    found = table(store, "light")
+    kept = np.ones(SHAPE, bool)
+    kept[1:3] = False
+    n = kept.sum()
+    for row, true in (
+        (found["DSNU_1288"], 0.1 * store.true["bias"][kept].std()),
+        (found["non-uniformity of the gain"], 2.0),
+        (found["K"], np.mean(1 / store.true["conversion_gain"][kept])),
+        (found["sigma_d"], 0.3),
+    ):
+        assert abs(row.value - true) < 5 * row.standard_error + 0.001 * true, row
+        assert 0 < row.standard_error < 0.1 * true
+    # it can fail: with the errors of the pixels in it the spread of the gain is 2.8 %
+    gain = store.arrays["maps/conversion_gain"][kept]
+    assert 100 * gain.std() / gain.mean() - 2.0 > 5 * found["non-uniformity of the gain"].standard_error
+    assert found["hot pixels"].value == pytest.approx(100 * 24 / (60 * 80 - 80), rel=0.01)
+    assert n == 58 * 80
+
+
+@pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
+def test_what_needs_dark_or_light_is_empty_without(store, kind):
+    found = table(store, kind)
+    assert (found["mu_I.mean"].value is not None) == (kind == "dark")
+    assert (found["PRNU_1288 (like it)"].value is not None) == (kind == "light")
+    assert found["eta"].cells()[2:4] == ["", ""]
+    assert all(len(row.cells()) == len(COLUMNS) for row in found.values())
+    assert all(row.definition_here and row.where_it_differs for row in found.values())
+    assert ("of the bias alone" in found["DSNU_1288"].where_it_differs) == (kind != "dark")
+
+
+def test_a_sensor_without_a_value_has_an_empty_table(store):
+    lost = Maps()
+    lost.arrays["fit/fit_status"][:] = int(FitStatus.NO_DATA)
+    with np.errstate(all="raise"):
+        assert all(row.cells()[2] == "" for row in emva_rows(lost, "dark") if row.quantity != "hot pixels")
