@@ -9,6 +9,7 @@ import os
 import platform
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -18,8 +19,13 @@ from pchem_pipeline.base.kernel_cache import cache_folder, listening
 from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.store.files import write_atomic
 
-__all__ = ["announced", "compiled_ahead", "mark_path"]
+__all__ = ["announced", "compilation_lines", "compiled_ahead", "known_compilation", "mark_path"]
+
+_PAUSE = 5.0  # seconds between lines
+#: Kernels of a stage and seconds that they take, before anything is known of this machine.
+_GUESS = {"ingest": (7, 6.0), "fit": (8, 40.0), "ensemble": (3, 8.0), "report": (1, 2.0)}
 
 _MODULE = "pchem_pipeline.commands.compile_kernels"
 #: Sections of the configuration that decide which kernels are needed.
@@ -91,17 +97,76 @@ def mark_path(config: RunConfig, stages: Sequence[str]) -> Path:
 
 @contextlib.contextmanager
 def announced(reporter: Reporter, stage: str) -> Iterator[None]:
-    """Say when a stage compiles kernels, or waits for the second process, and how long."""
+    """Say when a stage compiles kernels, or waits for the second process: how many, how long, what is left.
+
+    What is left is what the stage took the last time that it compiled on this machine.
+    """
     seconds: list[float] = []
+    number, total = known_compilation(stage)
+    last = time.monotonic()
 
     def listener(kernel: str, took: float | None) -> None:
+        nonlocal last
         if took is not None:
             seconds.append(took)
+            if time.monotonic() - last > _PAUSE:
+                last = time.monotonic()
+                reporter.info(f"{stage}: {_so_far(seconds, number, total)}")
         elif not seconds:
-            reporter.info(f"{stage}: compiling kernels, once after an installation or a change of them")
-        reporter.event("compiling", stage=stage, kernel=kernel, seconds=took)
+            about = f" (about {total:.0f} s)" if total else ""
+            reporter.info(
+                f"{stage}: compiling kernels{about}, once after an installation or a change of them"
+            )
+        share = min(sum(seconds) / total, 1.0) if total else None
+        reporter.event("compiling", stage=stage, kernel=kernel, seconds=took, share=share)
 
     with listening(listener):
         yield
     if seconds:
         reporter.info(f"{stage}: {len(seconds)} kernels compiled in {sum(seconds):.0f} s")
+        _remember(stage, len(seconds), sum(seconds))
+
+
+def _so_far(seconds: Sequence[float], number: int, total: float) -> str:
+    """Return how many kernels are compiled, and what is left."""
+    done = f"{len(seconds)} of about {max(number, len(seconds))} kernels compiled in {sum(seconds):.0f} s"
+    left = total - sum(seconds)
+    return f"{done}, about {left:.0f} s left" if left > 1 else done
+
+
+def known_compilation(stage: str) -> tuple[int, float]:
+    """Return how many kernels a stage compiles and in how many seconds: as the last time, or a guess."""
+    try:
+        number, seconds = json.loads(_memory(stage).read_text())
+    except (OSError, ValueError, TypeError):
+        return _GUESS.get(stage, (0, 0.0))
+    return int(number), float(seconds)
+
+
+def _remember(stage: str, number: int, seconds: float) -> None:
+    """Keep what compiling took, unless more was compiled another time: then a part was there this time."""
+    if number >= known_compilation(stage)[0] or not _memory(stage).exists():
+        with contextlib.suppress(OSError):
+            write_atomic(_memory(stage), json.dumps([number, round(seconds, 1)]).encode())
+
+
+def _memory(stage: str) -> Path:
+    return cache_folder() / f"compiling-{stage}.json"
+
+
+def compilation_lines(config: RunConfig, todo: Sequence[str], ahead: Sequence[str]) -> list[str]:
+    """Return what compiling will add to the time of stages, where their kernels may be missing; else nothing.
+
+    Args:
+        config: of the run.
+        todo: the stages that are to be done.
+        ahead: of all stages of the run those that are compiled ahead.
+    """
+    if not todo or not ahead or mark_path(config, ahead).exists():
+        return []
+    seconds = sum(known_compilation(stage)[1] for stage in todo)
+    if not seconds:
+        return []
+    return [
+        f"plan: up to {seconds:.0f} s more where kernels are still to be compiled, once after an installation"
+    ]

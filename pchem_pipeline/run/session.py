@@ -10,7 +10,7 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.config.load import dump_config
-from pchem_pipeline.run.compilation import announced, compiled_ahead
+from pchem_pipeline.run.compilation import announced, compilation_lines, compiled_ahead
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
@@ -206,7 +206,9 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
         state = states.get(name, StageState(name, "missing"))
         runs = _is_to_do(states, name, command)
         reporter.info(f"{name}: {state.words()}" + (" -> would run" if runs else " -> nothing to do"))
-    for line in _plan(target, [name for name in stages if _is_to_do(states, name, command)], command):
+    todo = [name for name in stages if _is_to_do(states, name, command)]
+    ahead = [name for name in stages if STAGES[name].compiled_ahead]
+    for line in [*_plan(target, todo, command), *compilation_lines(target.config, todo, ahead)]:
         reporter.info(line)
     return [states.get(name, StageState(name, "missing")) for name in stages]
 

@@ -13,7 +13,13 @@ from pchem_pipeline.base.kernel import _Kernel
 from pchem_pipeline.commands.compile_kernels import compile_kernels
 from pchem_pipeline.config.load import make_config
 from pchem_pipeline.run import compilation
-from pchem_pipeline.run.compilation import announced, compiled_ahead, mark_path
+from pchem_pipeline.run.compilation import (
+    announced,
+    compilation_lines,
+    compiled_ahead,
+    known_compilation,
+    mark_path,
+)
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
@@ -81,18 +87,51 @@ def test_a_process_that_cannot_be_started_stops_nothing(sleeper, monkeypatch):
         pass
 
 
-def test_the_terminal_says_what_is_compiled(capsys):
+def heard(*calls):
+    """Tell the listeners of kernels that begin (None) or are compiled."""
+    for kernel, seconds in calls:
+        for listener in kernel_cache._listeners:
+            listener(kernel, seconds)
+
+
+def test_the_terminal_says_what_is_compiled_and_what_is_left(sleeper, capsys, monkeypatch):
+    def said():
+        return capsys.readouterr().err.splitlines()
+
+    kernel_cache.cache_folder().mkdir()
     with announced(Reporter("off"), "fit"):
         pass
-    assert capsys.readouterr().err == ""
+    assert said() == []
+    _, guess = known_compilation("fit")
     with announced(Reporter("off"), "fit"):
-        for listener in kernel_cache._listeners:
-            for kernel, seconds in (("one", None), ("one", 1.5), ("two", None), ("two", 2.5)):
-                listener(kernel, seconds)
-    assert capsys.readouterr().err.splitlines() == [
-        "fit: compiling kernels, once after an installation or a change of them",
+        heard(("one", None), ("one", 1.5), ("two", None), ("two", 2.5))
+    assert said() == [
+        f"fit: compiling kernels (about {guess:.0f} s), once after an installation or a change of them",
         "fit: 2 kernels compiled in 4 s",
     ]
+    # the next time this is known, and told on the way; a part alone is no new knowledge
+    monkeypatch.setattr(compilation, "_PAUSE", -1.0)
+    assert known_compilation("fit") == (2, 4.0)
+    with announced(Reporter("off"), "fit"):
+        heard(("one", None), ("one", 1.0))
+    assert said()[1:] == [
+        "fit: 1 of about 2 kernels compiled in 1 s, about 3 s left",
+        "fit: 1 kernels compiled in 1 s",
+    ]
+    assert known_compilation("fit") == (2, 4.0)
+
+
+def test_a_dry_run_tells_what_compiling_takes(sleeper):
+    config = make_config(CONFIG, "test")
+    ahead = ["fit", "ensemble"]
+    expected = sum(known_compilation(name)[1] for name in ("fit", "ensemble", "report"))
+    [line] = compilation_lines(config, ["fit", "maps", "ensemble", "report"], ahead)
+    assert line.startswith(f"plan: up to {expected:.0f} s more where kernels are still to be compiled")
+    assert compilation_lines(config, ["maps"], ahead) == []
+    mark = mark_path(config, ahead)
+    mark.parent.mkdir()
+    mark.touch()
+    assert compilation_lines(config, ["fit"], ahead) == []
 
 
 def variants():
