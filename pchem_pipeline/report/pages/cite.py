@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import metadata
 
 import numpy as np
 
-from pchem_pipeline import __version__
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.criteria import map_summary
 from pchem_pipeline.report.pages.summary import pixel_counts
@@ -59,7 +59,7 @@ def citation(data: ReportData) -> Citation:
     """Return what a paper would say of this run, its numbers filled in."""
     versions = data.run.get("versions")
     known: Mapping[str, str] = versions if isinstance(versions, Mapping) else {}
-    version = known.get("pchem-pipeline") or __version__
+    version = known.get("pchem-pipeline") or metadata.version("pchem-pipeline")
     papers = [_VERIFICATION, *([_SEVERAL] if data.samples is not None else [])]
     sentences = [_data_sentence(data), _method_sentence(data, papers), _result_sentence(data), _quality(data)]
     libraries = ", ".join(f"{name} {known[name]}" for name in ("numpy", "numba") if name in known)
