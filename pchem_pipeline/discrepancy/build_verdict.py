@@ -13,6 +13,7 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.verdict import (
+    NEGLIGIBLE_REST,
     Candidate,
     Change,
     Discrepancy,
@@ -41,6 +42,9 @@ LARGEST_REST = 0.2
 _MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
+_CONVINCING_PLACEBO = (
+    0.25  # share of the gap closed by an effect that is no relative, that is worth a warning
+)
 _MICRO = 1e-3  # nats: smaller gaps are said in millionths
 
 
@@ -153,6 +157,7 @@ class Findings:
         places: where the data disagree with the model as it was.
         still: whether they disagree with the final model.
         added: effects, and what is left.
+        doubt: why the pixels are not identified, and what would help; empty where they are.
     """
 
     samples: str
@@ -163,13 +168,16 @@ class Findings:
     places: Sequence[Place]
     still: bool
     added: Added
+    doubt: str = ""
 
     @property
     def state(self) -> State:
         """The verdict in a word."""
         additions = self.added.additions
         if not additions:
-            return "unexplained" if self.still else "consistent"
+            if self.still:
+                return "unexplained"
+            return "cannot_tell" if self.doubt else "consistent"
         if self.added.unfinished or any(not each.fits for each in additions):
             return "unexplained"
         if any(each.described for each in additions):
@@ -222,6 +230,7 @@ def build_verdict(
         verdict=Verdict(
             verdict=found.state,
             sentence=_sentence(found),
+            doubt=found.doubt,
             effects=tuple(effect.tag for effect in found.named),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
             steps=tuple(each.step() for each in found.added.additions),
@@ -281,6 +290,11 @@ def _sentence(found: Findings) -> str:
     titles = [type(effect).title or effect.tag for effect in found.named]
     if state == "consistent":
         return f"The {data} agree with the model in every statistic tested."
+    if state == "cannot_tell":
+        return (
+            f"Nothing in the order of the {data}, between pixels or in the codes disagrees with the model; "
+            f"of what shows in the shape of the histograms this sensor cannot tell: {found.doubt}."
+        )
     if state == "unexplained":
         return f"The {data} disagree with the model{_unexplained(found, titles)}{_left(added)}."
     if state == "described":
@@ -293,8 +307,11 @@ def _sentence(found: Findings) -> str:
     if found.before.at_floor:
         limit = f"{1e6 * found.before.floor:.2g} micronats per sample"
         return f"The model was missing {_and(titles)}; on the final {data} alone its gap is below {limit}."
+    if added.after.value > max(added.after.floor, NEGLIGIBLE_REST * found.before.value):
+        closed = f"{_gaps(found)}{_rest(found)}{_left(added)}{_placebo(added)}"
+        return f"The model was missing {_and(titles)}, which is a part of it: the gap went {closed}."
     them = "them" if len(titles) > 1 else "it"
-    closed = f"{_gaps(found)}{_rest(found)}{_left(added)}"
+    closed = f"{_gaps(found)}{_left(added)}{_placebo(added)}"
     return f"The model was missing {_and(titles)}; with {them} the gap on unseen {data} went {closed}."
 
 
@@ -332,9 +349,24 @@ def _gaps(found: Findings) -> str:
 def _rest(found: Findings) -> str:
     """Return how much of the gap is left above its floor, in words; nothing where it is at it."""
     after = found.added.after
-    if after.at_floor or found.before.value <= 0.0:
+    if after.value <= max(after.floor, NEGLIGIBLE_REST * found.before.value):
         return ""
     return f"; {max(after.value, 0.0) / found.before.value:.0%} of the gap is left unexplained"
+
+
+def _placebo(added: Added) -> str:
+    """Return in words where an effect that is no relative of the named one closes much of its gap, too."""
+    words = []
+    for each in added.additions:
+        closed = each.before.value - each.after.value
+        if not each.named or each.placebo is None or closed <= 0.0:
+            continue
+        share = (each.before.value - each.placebo.gap_after) / closed
+        if share > _CONVINCING_PLACEBO:
+            words.append(
+                f"{each.placebo.effect} in the place of {each.effect.tag} closes {share:.0%} of that"
+            )
+    return f"; but {_and(words)}: take the name with caution" if words else ""
 
 
 def _left(added: Added) -> str:

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.catalogue import EXACT
+from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 
 __all__ = [
     "Measured",
     "NullModel",
     "as_matrix",
     "disagrees",
+    "free_of_parameters",
     "look_elsewhere",
     "misfits",
     "moments",
@@ -29,6 +30,9 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
+
+_OF_ORDER = ("time", "frame", "space")
+_OF_CODES = tuple(f"code.{what}" for what in ("rough", "alternating", "period2", "period4", "largest"))
 
 # of the correlations between statistics; their estimates from few replicates are noise, so pull them to 0
 _SHRINKAGE = 0.6
@@ -183,7 +187,24 @@ class Measured:
         return (self.train + self.test) / 2.0
 
 
-def disagrees(null: NullModel, z: Measured, significance: float, tolerance: FloatArray | float = 0.0) -> bool:
+def free_of_parameters(names: Sequence[str]) -> NDArray[np.bool_]:
+    """Tell of statistics whether they are what they are whatever the pixels' fitted parameters, shape (m,).
+
+    Given the histograms, frames without an effect are in random order: all along time, between pixels and
+    frames follows from that alone. So do codes that differ from their neighbours; the smooth rest of the
+    histograms' shape is what the parameters bend.
+    """
+    kinds = ((STATISTICS[name].family, name) for name in names)
+    return np.array([f in _OF_ORDER or name in _OF_CODES for f, name in kinds], np.bool_)
+
+
+def disagrees(
+    null: NullModel,
+    z: Measured,
+    significance: float,
+    tolerance: FloatArray | float = 0.0,
+    among: NDArray[np.bool_] | None = None,
+) -> bool:
     """Tell whether some statistic deviates more than chance allows, and does so in both splits.
 
     Args:
@@ -192,6 +213,7 @@ def disagrees(null: NullModel, z: Measured, significance: float, tolerance: Floa
         significance: allowed probability of a chance, anywhere among the statistics.
         tolerance: deviation that is not held against the model, shape (m,): effects that it has are never
             known in every detail.
+        among: the statistics that count, shape (m,); None: all.
     """
     p = _p_values(null, z, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
@@ -199,6 +221,8 @@ def disagrees(null: NullModel, z: Measured, significance: float, tolerance: Floa
     alone = [two_sided(pull, null.freedom) < _REPLICATION for pull in pulls]
     same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
+    if among is not None:
+        same &= among
     return bool(np.any(same & (p < limit)))
 
 

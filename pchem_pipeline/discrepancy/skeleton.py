@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
+from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees, free_of_parameters
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.discrepancy.where import locate
@@ -55,6 +55,10 @@ class Explainer(Protocol[Explanation]):
 
     def null(self) -> tuple[NullModel, Measured]:
         """Draw replicates of the model; return their statistics, and those of the data."""
+        ...
+
+    def doubt(self) -> str:
+        """Say why the pixels are not identified and what would help; empty where they are."""
         ...
 
     def gap(self, null: NullModel, z: Measured) -> Gap:
@@ -99,20 +103,23 @@ def search(by: Explainer[Explanation]) -> Discrepancy:
     before = by.gap(first, z)
     places = locate(evidence, first, z.both, significance)
     null, rounds = first, 0
-    still = disagrees(null, z, significance)
-    wanted = still or by.suspects(null, z)
+    doubt = by.doubt()
+    # where the pixels are not identified only what does not rest on their parameters counts
+    among = free_of_parameters(first.names) if doubt else None
+    still = disagrees(null, z, significance, among=among)
+    wanted = still or (not doubt and by.suspects(null, z))
     while wanted and rounds < by.most_rounds:
         explanation = by.explain(null, z, still)
         extended = None if explanation is None else by.add(explanation, null, z)
         if extended is None:
             break
         null, rounds = extended, rounds + 1
-        wanted = still = disagrees(null, z, significance, by.tolerance())
+        wanted = still = disagrees(null, z, significance, by.tolerance(), among)
     described = by.describe(before, null, z) if still else None
     if described is not None:
-        null, still = described, disagrees(described, z, significance, by.tolerance())
+        null, still = described, disagrees(described, z, significance, by.tolerance(), among)
     added = by.close(before, null, z, still)
-    found = Findings(by.samples, z, first, null, before, places, still, added)
+    found = Findings(by.samples, z, first, null, before, places, still, added, doubt)
     model = found.model(present, by.model)
     return build_verdict(
         found,

@@ -12,8 +12,8 @@ from pchem_pipeline.discrepancy.verdict import Examined
 
 __all__ = ["MINIMUM_FRAMES", "Splits", "block_length", "split_frames"]
 
-#: fewer frames leave too few blocks for anything slow, and too few samples for a fit of each third
-MINIMUM_FRAMES = 600
+#: fewer frames leave hardly five blocks to each third
+MINIMUM_FRAMES = 300
 _SHORTEST, _LONGEST, _BLOCKS = 20, 100, 60
 # the order changes from group to group, so that no part is always the earlier one
 _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2))

@@ -26,6 +26,7 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
 
 __all__ = [
+    "NEGLIGIBLE_REST",
     "SCHEMA_VERSION",
     "VERDICT_FILE",
     "Candidate",
@@ -52,7 +53,10 @@ SCHEMA_VERSION = 2
 #: File of the verdict in the folder of a run.
 VERDICT_FILE = "discrepancy.json"
 
-State = Literal["named", "ambiguous", "described", "unexplained", "consistent"]
+#: Share of the gap below which nothing is said to be left, even above the floor.
+NEGLIGIBLE_REST = 0.01
+
+State = Literal["named", "ambiguous", "described", "unexplained", "consistent", "cannot_tell"]
 
 _NAN = float("nan")
 
@@ -314,7 +318,10 @@ class Verdict(_Part):
     """The content of ``discrepancy.json``.
 
     Attributes:
-        verdict: named, ambiguous, described (measured, not understood), unexplained or consistent.
+        verdict: named, ambiguous, described (measured, not understood), unexplained, consistent, or
+            cannot_tell: nothing is found that does not rest on the pixels' parameters, and those are not
+            identified.
+        doubt: why the pixels are not identified, and what would help; empty where they are.
         sentence: the same for people.
         effects: tags of the named effects.
         model_effects: all effects that the model has afterwards, as the YAML holds them.
@@ -335,6 +342,7 @@ class Verdict(_Part):
     schema_version: Literal[2] = 2
     verdict: State
     sentence: str
+    doubt: str = ""
     effects: tuple[str, ...]
     model_effects: tuple[dict[str, Any], ...]
     steps: tuple[Step, ...]
@@ -384,12 +392,21 @@ class Verdict(_Part):
             place = ".".join(str(part) for part in first["loc"])
             raise StoreError(f"{source} is damaged ({place}: {first['msg']}); {cure}") from error
 
+    @property
+    def word(self) -> str:
+        """The verdict in a word or two: effects that leave some of the gap are named in part."""
+        gap = self.gap
+        left = gap.after > max(gap.floor, NEGLIGIBLE_REST * gap.before)
+        if self.verdict == "named" and gap.before > gap.floor and left:
+            return f"named in part, {gap.after / gap.before:.0%} of the gap stays"
+        return self.verdict.replace("_", " ")
+
     def added(self, step: Step) -> str:
         """Return what a step added to the model for its gap: an effect, or the likeliest of several."""
         if step.effect:
             return step.effect
         rivals = list(dict.fromkeys(c.effect for c in step.candidates))[:3]
-        if not rivals or self.verdict == "consistent":
+        if not rivals or self.verdict in ("consistent", "cannot_tell"):
             return ""
         return f"nearest: {rivals[0]}" if self.verdict == "unexplained" else " or ".join(rivals)
 

@@ -8,6 +8,7 @@ longer one takes over what is there. Every beginning of the study is balanced.
     python scripts/bench/bench_discrepancy.py FOLDER --minutes 30    # as far as it gets, and the figures
     python scripts/bench/bench_discrepancy.py FOLDER --report        # the figures of what is there
     python scripts/bench/bench_discrepancy.py FOLDER --command 3     # the installed command, with its cost
+    python scripts/bench/bench_discrepancy.py FOLDER --null-range --minutes 30    # nothing hidden, any sensor
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from typing import Any
 from discrepancy_cases import EFFECTS, Case, Plan, remaining
 from discrepancy_command import run_commands
 from discrepancy_figures import Answer, print_figures
+from discrepancy_null import run_null_range
 from discrepancy_worker import run_case
 
 from pchem_pipeline.compute.environment import prepare_environment
@@ -135,6 +137,12 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--command", type=int, default=0, metavar="N", help="N stacks through the installed command"
     )
+    parser.add_argument(
+        "--null-range", action="store_true", help="nothing hidden, sensors of the whole range, in one process"
+    )
+    parser.add_argument(
+        "--most-samples", type=float, default=3e6, help="frames x pixels of a stack of --null-range"
+    )
     return parser.parse_args()
 
 
@@ -144,6 +152,10 @@ def main() -> None:
     options = parse()
     path = options.folder / RESULTS
     shape = (options.shape[0], options.shape[1], options.shape[2])
+    if options.null_range:
+        results = options.folder / "null_range.jsonl"
+        run_null_range(results, options.first, options.minutes, options.most_samples)
+        return
     if options.command:
         run_commands(options.command, options.first, shape, options.folder, options.processes)
         return

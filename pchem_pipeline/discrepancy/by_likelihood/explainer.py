@@ -190,6 +190,10 @@ class HistogramExplainer:
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
         return self.first, z
 
+    def doubt(self) -> str:
+        """Return nothing: each candidate is fitted with the parameters, so what they bend is no evidence."""
+        return ""
+
     def gap(self, null: NullModel, z: Measured) -> Gap:
         """Measure the gap of the likelihood on the final part."""
         whole = LikelihoodGap(self.parts[2], self.sets.kept, 0.0, self._count, self.rng)

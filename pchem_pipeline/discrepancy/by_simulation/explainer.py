@@ -63,6 +63,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FEWEST_PIXELS = 32
+_NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters are no ground for a verdict
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
 # standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
@@ -222,6 +223,23 @@ class FrameExplainer:
         n_samples = self.frames.splits.final.size * int(self.evidence[0].maps.usable.sum())
         self.gaps = StatisticsGap(self.first, n_samples)
         return self.first, Measured(*(as_matrix(names, [e.z])[0] for e in self.evidence))
+
+    def doubt(self) -> str:
+        """Say which share of the pixels is not identified, and what would help; empty below a half."""
+        share, usable = self.plain.ambiguous, float(np.mean(self.plain.maps.usable))
+        if share < _NOT_IDENTIFIED and usable > 1.0 - _NOT_IDENTIFIED:
+            return ""
+        maps, frames = self.plain.maps, self.frames.seen.size
+        noise = np.nanmedian(maps.read_noise_dn * maps.conversion_gain)
+        lost = (
+            f"the bias of {share:.0%} of the pixels may be off by an electron"
+            if share >= _NOT_IDENTIFIED
+            else f"only {usable:.0%} of the pixels have a fit that can be relied upon"
+        )
+        return (
+            f"{lost} (fitted read noise {noise:.2f} e-, {frames} frames): several exposures fitted together "
+            "(pchem joint) identify them, so may many more frames or a lower read noise"
+        )
 
     def gap(self, null: NullModel, z: Measured) -> Gap:
         """Measure the gap in the statistics of the final frames."""

@@ -61,6 +61,9 @@ _APART = 4.0  # squared standard deviations between two maxima
 _RARE = 0.003
 _AGAIN = 100  # resamplings of the pixels behind the error of the centre
 _LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
+_USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks are hardly resolved, its scatter
+_MOST_NOISE = 12.0  # of 1/g over what it were without read noise
+_ITERATIONS = 30
 _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not asked
 
 
@@ -237,6 +240,7 @@ class _Maxima:
         evidence = self.value - 0.5 * np.einsum("jna,nab,jnb->jn", off, prior, off)
         evidence += 0.5 * (slope * step).sum(axis=2) + 0.5 * np.linalg.slogdet(covariance)[1]
         self.evidence = np.logaddexp.reduce(evidence, axis=0) + 0.5 * np.linalg.slogdet(prior)[1]
+        evidence = np.where(np.isfinite(evidence), evidence, -1e300)
         weight = np.exp(evidence - evidence.max(axis=0))
         arrived = (slope * step).sum(axis=2) < _ARRIVED
         weight *= _distinct(self.theta + step, covariance, arrived)
@@ -368,34 +372,51 @@ def _beginning(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> tupl
     Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.
     """
     mean, k = _cumulants(pixels)
-    centre = _centre_of(mean, k.mean(axis=1))
+    rng = np.random.default_rng(k.shape[1])
+    drawn = rng.integers(k.shape[1], size=(_AGAIN, k.shape[1]))
+    again = np.stack([k.mean(axis=1), *k[:, drawn].mean(axis=2).T])
+    centres = _centres_of(again)
+    centre = np.array([centres[0, 0], centres[0, 1], 0.0, centres[0, 2]])
+    centre[2] = np.median(mean) - np.exp(centre[0] + centre[1])
     start = np.tile(centre, (mean.size, 1))
     start[:, 2] = mean - np.exp(centre[0] + centre[1])
     known = np.asarray(np.isfinite(parameters).all(axis=1))
     if known.any() and mistaken <= _MANY:
         fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
         return fits, _first_guess(fits[known])
-    rng = np.random.default_rng(k.shape[1])
-    again = [
-        _centre_of(mean, k[:, rng.integers(k.shape[1], size=k.shape[1])].mean(axis=1)) for _ in range(_AGAIN)
-    ]
-    off = np.clip(np.array(again) - centre, -_LARGEST_ERROR, _LARGEST_ERROR)
+    off = np.insert(centres[1:] - centres[0], 2, 0.0, axis=1)
+    off = np.clip(off, -_LARGEST_ERROR, _LARGEST_ERROR)
     # mu follows H and 1/g: their product is known far better than both
     off[:, 2] = np.exp(centre[0] + centre[1]) * -np.expm1(off[:, 0] + off[:, 1])
     scatter = np.diag(np.maximum(_ALIKE, [0, 0, mean.std(), 0]) ** 2)
     return start, Population(centre, scatter, off.T @ off / len(off))
 
 
-def _centre_of(mean: FloatArray, k: FloatArray) -> FloatArray:
-    """Return theta of pixels that are alike, of their means (n,) and mean cumulants 2 to 4, DN^j.
+def _centres_of(k: FloatArray) -> FloatArray:
+    """Return log H, log 1/g, log sigma_R^2 of pixels that are alike from mean cumulants 2 to 4, DN^j, (b, 3).
 
-    ``k_2 = sigma^2 + H / g^2, k_3 = H / g^3, k_4 = H / g^4``.
+    ``k_2 = sigma^2 + H / g^2, k_3 = H / g^3, k_4 = H / g^4``. Of many electrons k_4 says little, and k_2 and
+    k_3 nearly all: then 1/g is what they give at a usual read noise. Both are weighted by their errors, which
+    the scatter of the rows (resamplings of the first) tells.
     """
-    k2, k3, k4 = np.maximum(k, 1e-3)
-    step = k4 / k3
-    electrons = k3 / step**3
-    variance = max(k2 - QUANTISATION_VARIANCE - k3 / step, 0.02 * k2)
-    return np.array([np.log(electrons), np.log(step), np.median(mean) - electrons * step, np.log(variance)])
+    k2, k3, k4 = np.maximum(k, [1e-3, 1e-3, 1e-6]).T
+    # from no read noise at all to much
+    least = k3 / k2
+    by_four = np.log(np.clip(k4 / k3, least, _MOST_NOISE * least))
+    step = least.copy()
+    for _ in range(_ITERATIONS):
+        step = np.minimum(least * (1.0 + _USUAL_NOISE * step**3 / k3), _MOST_NOISE * least)
+    by_three = np.log(step)
+    electrons = k3[0] / step[0] ** 3
+    error_three = np.hypot(by_three.std(), _NOISE_RANGE / (electrons + _USUAL_NOISE))
+    share = error_three**2 / (error_three**2 + by_four.std() ** 2 + 1e-12)
+    # resamplings scatter by what the read noise may be, too
+    unknown = np.linspace(-1.0, 1.0, len(k)) * 1.7 * _NOISE_RANGE / (electrons + _USUAL_NOISE)
+    unknown[0] = 0.0
+    log_step = np.maximum(share * by_four + (1.0 - share) * (by_three + unknown), np.log(least) + 1e-3)
+    step = np.exp(log_step)
+    variance = np.maximum(k2 - QUANTISATION_VARIANCE - k3 / step, 0.01 * step**2)
+    return np.stack([np.log(k3) - 3.0 * log_step, log_step, np.log(variance)], axis=1)
 
 
 def _cumulants(pixels: _Pixels) -> tuple[FloatArray, FloatArray]:

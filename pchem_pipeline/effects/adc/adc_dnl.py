@@ -157,7 +157,7 @@ class AdcDnl(Effect):
         codes, residuals, expected = usable_codes(evidence.code)
         variance, significance = roughness(residuals, expected)
         few = few_shifts(residuals, expected)
-        bit = _best_bit(codes, residuals, expected) if codes.size else None
+        bit = _best_bit(codes, residuals, expected) if codes.size > 1 else None
         found = [] if bit is None else [cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0])]
         if few is not None:
             found += cls._from_shifts(codes, few)

@@ -57,6 +57,8 @@ def few_shifts(residuals: NDArray[np.float64], expected: NDArray[np.float64]) ->
     One edge after the other, the one that lowers chi2 the most (matching pursuit); None if the residuals ask
     for more than a few, or for none.
     """
+    if residuals.size < 2:
+        return None  # no edge between two codes
     shifts = np.zeros(residuals.size + 1)
     left = residuals.copy()
     # an edge moved up makes the code below it wider by as much as that above it narrower

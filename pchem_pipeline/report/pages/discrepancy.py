@@ -31,6 +31,7 @@ VERDICT_WORDS: dict[str, tuple[Level, str]] = {
     "described": ("caution", "Described"),
     "unexplained": ("serious", "Unexplained"),
     "consistent": ("good", "Consistent"),
+    "cannot_tell": ("caution", "Cannot tell"),
 }
 
 #: (id, heading, introduction) of the parts of the page.

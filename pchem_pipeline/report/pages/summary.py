@@ -286,6 +286,7 @@ def _discrepancy(data: ReportData) -> list[Flag]:
     found = data.discrepancy.found
     levels: dict[str, Level] = {
         "consistent": "good",
+        "cannot_tell": "caution",
         "ambiguous": "caution",
         "described": "caution",
         "unexplained": "serious",

@@ -23,7 +23,7 @@ def verdict_text(found: Verdict) -> str:
     Returns:
         Lines of at most 100 characters, without one at the end.
     """
-    lines = [*_wrapped(f"{found.verdict.upper()}: {found.sentence}", "  ")]
+    lines = [*_wrapped(f"{found.word.upper()}: {found.sentence}", "  ")]
     lines += _places("where: ", found.where, _MOST_PLACES)
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)

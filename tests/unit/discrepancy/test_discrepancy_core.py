@@ -75,9 +75,9 @@ def test_length_of_blocks(frames: int, wanted: int | None, expected: int) -> Non
     assert block_length(frames, wanted) == expected
 
 
-@pytest.mark.parametrize(("frames", "wanted"), [(599, None), (800, 100)])
+@pytest.mark.parametrize(("frames", "wanted"), [(299, None), (800, 100)])
 def test_too_few_frames_are_refused_with_how_many(frames: int, wanted: int | None) -> None:
-    with pytest.raises(InputError, match=r"need (600|900)"):
+    with pytest.raises(InputError, match=r"need (300|900)"):
         block_length(frames, wanted)
 
 

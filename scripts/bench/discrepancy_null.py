@@ -1,0 +1,95 @@
+"""The null over the whole range of sensors: nothing is hidden, and nothing may be found.
+
+Sensors are drawn at random (``tests/helpers/plain_camera.py``, which shares no code with the package): read
+noise 0.15 to 0.8 e-, H 0.05 to 20, 3 to 30 DN per electron, 300 to 20,000 frames, 16^2 to 256^2 pixels; of
+the largest, fewer pixels and frames are simulated, so that many sensors fit into the time.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from discrepancy_figures import wilson
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+_RIGHT = ("consistent", "cannot_tell")
+
+
+def run_null_range(path: Path, first: int, minutes: float, most_samples: float) -> None:
+    """Look for discrepancies in stacks without any until the time is over, and print the share of alarms.
+
+    Args:
+        path: file of the results, a line a stack; seeds that it holds are not done again.
+        first: seed of the first sensor.
+        minutes: no stack begins later.
+        most_samples: frames x pixels of a stack.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = path.read_text().splitlines() if path.exists() else []
+    records = [json.loads(line) for line in lines]
+    done, start, seed = {r["seed"] for r in records}, time.monotonic(), first
+    with path.open("a") as file:
+        while time.monotonic() - start < 60.0 * minutes:
+            if seed not in done:
+                records.append(_one(seed, most_samples))
+                file.write(json.dumps(records[-1]) + "\n")
+                file.flush()
+                print(_line(records[-1]), flush=True)
+            seed += 1
+    print_null_range(records)
+
+
+def print_null_range(records: list[dict[str, Any]]) -> None:
+    """Print how often something was found where nothing is, with its 95 % interval (Wilson)."""
+    words = Counter(r["verdict"] for r in records)
+    print(
+        f"\nNothing hidden, {len(records)} sensors: " + ", ".join(f"{w} {n}" for w, n in words.most_common())
+    )
+    judged = [r for r in records if r["verdict"] != "refused"]
+    alarms = sum(r["verdict"] not in _RIGHT for r in judged)
+    low, high = (100 * end for end in wilson(alarms, len(judged)))
+    share = 100 * alarms / max(len(judged), 1)
+    interval = f"[{low:.1f}, {high:.1f}]"
+    print(f"any name, or unexplained: {alarms}/{len(judged)}, {share:.1f} % {interval}   target <= 1 %")
+    seconds = [r["cpu_seconds"] for r in judged] or [0.0]
+    print(f"CPU: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s")
+
+
+def _one(seed: int, most_samples: float) -> dict[str, Any]:
+    from helpers.plain_camera import drawn_camera
+
+    from pchem_pipeline.base.errors import InputError, PchEmError
+    from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+
+    camera = drawn_camera(np.random.default_rng([seed, 1]), most_samples)
+    sensor = {
+        "read_noise_e": camera.read_noise_e, "exposure": camera.exposure, "step": camera.step,
+        "shape": camera.shape, "n_frames": camera.n_frames,
+    }  # fmt: skip
+    record: dict[str, Any] = {"seed": seed, **sensor}
+    cpu = time.process_time()
+    try:
+        found = find_discrepancies(camera.frames(seed)).verdict
+        record |= {
+            "verdict": found.verdict, "effects": found.effects, "p": found.p_global.before,
+            "left_out": found.left_out,
+        }  # fmt: skip
+    except (InputError, PchEmError) as error:
+        record |= {"verdict": "refused", "why": str(error)}
+    except Exception as error:  # one defect must not end a study of hours; it counts as an alarm
+        record |= {"verdict": "error", "why": f"{type(error).__name__}: {error}"}
+    return record | {"cpu_seconds": time.process_time() - cpu}
+
+
+def _line(r: dict[str, Any]) -> str:
+    size = f"{r['shape'][0]}x{r['shape'][1]}x{r['n_frames']}"
+    sensor = f"s_e {r['read_noise_e']:.2f}  H {r['exposure']:7.3f}  {r['step']:4.1f} DN/e-  {size:14s}"
+    p = f"p {r['p']:.2g}" if "p" in r else r.get("why", "")[:90]
+    said = f"{r['verdict']:12s} {p} {r.get('effects') or ''}"
+    return f"{r['seed']:6d}  {sensor} {said}  ({r['cpu_seconds']:.0f} s)"

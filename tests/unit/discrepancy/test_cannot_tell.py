@@ -1,0 +1,50 @@
+"""Where pixels are not identified perfect frames are not called wrong, and gross disagreements are found."""
+
+import numpy as np
+import pytest
+from helpers.plain_camera import PlainCamera
+
+from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees, free_of_parameters
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.estimators.codes import few_shifts
+
+NOISY = PlainCamera(0.62, 1.2, 9.0, (20, 20), 600)
+QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
+
+
+def test_perfect_frames_of_a_noisy_sensor_cannot_tell_and_what_would_help_is_said():
+    found = find_discrepancies(NOISY.frames(11), settings=QUICK).verdict
+    assert found.verdict == "cannot_tell"
+    assert found.effects == ()
+    assert "pchem joint" in found.doubt
+    assert found.doubt in found.sentence
+    assert found.word == "cannot tell"
+
+
+def test_row_noise_is_found_on_a_noisy_sensor():
+    rng = np.random.default_rng(12)
+    frames = NOISY.frames(12).astype(np.int64)
+    # a third of the read noise of 5.6 DN, 19 errors of the variance of row means
+    frames += np.rint(1.9 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
+    found = find_discrepancies(np.maximum(frames, 0).astype(np.uint16), settings=QUICK).verdict
+    assert found.verdict == "named"
+    assert found.effects == ("row_noise",)
+
+
+def test_what_rests_on_the_parameters_does_not_count_where_they_are_not_identified():
+    names = ("shape.C3.mean", "space.row.readout.variance", "code.smooth", "code.rough")
+    assert free_of_parameters(names).tolist() == [False, True, False, True]
+    rng = np.random.default_rng(1)
+    null = NullModel.from_replicates(names, rng.standard_normal((40, 4)))
+    among = free_of_parameters(names)
+    off = np.array([20.0, 0.0, 20.0, 0.0])
+    assert disagrees(null, Measured(off, off, off), 0.005)
+    assert not disagrees(null, Measured(off, off, off), 0.005, among=among)
+    off = np.array([0.0, 20.0, 0.0, 0.0])
+    assert disagrees(null, Measured(off, off, off), 0.005, among=among)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_too_few_codes_hold_no_edges(n):
+    assert few_shifts(np.full(n, 0.01), np.full(n, 200.0)) is None
