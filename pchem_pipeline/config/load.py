@@ -26,6 +26,12 @@ __all__ = [
 ]
 
 
+#: values of a configuration: 100,000 named files are not unusual
+_MOST_VALUES = 1_000_000
+#: complaints that are listed, and characters of a key or value in them
+_MOST_LISTED, _MOST_SHOWN = 20, 200
+
+
 class _StrictLoader(yaml.SafeLoader):
     """A safe loader that refuses a key given twice."""
 
@@ -78,11 +84,29 @@ def yaml_content(text: str, name: str) -> dict[str, Any]:
     """
     try:
         content = yaml.load(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # numbers of thousands of digits, dates that are none
         raise ConfigError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{name}: not valid YAML: brackets within brackets too deep to read") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{name}: holds no settings; write a commented default with: pchem init")
+    if _holds_too_much(content):
+        raise ConfigError(
+            f"{name}: holds more than {_MOST_VALUES} values, or an alias (*) within what it stands for; "
+            "write the settings out"
+        )
     return content
+
+
+def _holds_too_much(content: Any) -> bool:
+    """Tell whether there are too many values for settings: a few lines of aliases can stand for billions."""
+    found, held = 0, [content]
+    while held and found <= _MOST_VALUES:
+        value = held.pop()
+        found += 1
+        if isinstance(value, (dict, list)):
+            held += value.values() if isinstance(value, dict) else value
+    return found > _MOST_VALUES
 
 
 def make_config(content: Mapping[str, Any], name: str, folder: Path | None = None) -> RunConfig:
@@ -165,17 +189,23 @@ def setting_of(config: RunConfig, dotted: str) -> Any:
 
 def complaints(error: ValidationError, model: type[BaseModel] = RunConfig) -> str:
     """Return in one line what is wrong with the settings of a model, each with its place."""
-    return "; ".join(_complaint(item, model) for item in error.errors())
+    found = error.errors()
+    listed = "; ".join(_complaint(item, model) for item in found[:_MOST_LISTED])
+    return listed + (f"; and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else "")
 
 
 def _complaint(item: Any, root: type[BaseModel]) -> str:
-    where = ".".join(str(part) for part in item["loc"])
+    where = ".".join(_shown(str(part)) for part in item["loc"])
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "extra_forbidden":
-        close = difflib.get_close_matches(str(item["loc"][-1]), _keys_at(item["loc"][:-1], root), 1)
+        close = difflib.get_close_matches(_shown(str(item["loc"][-1])), _keys_at(item["loc"][:-1], root), 1)
         return f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else "")
-    given = "" if isinstance(item["input"], dict | BaseModel) else f" (given: {item['input']!r})"
+    given = "" if isinstance(item["input"], dict | BaseModel) else f" (given: {_shown(repr(item['input']))})"
     return f"{where}: {message}{given}" if where else message
+
+
+def _shown(text: str) -> str:
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]} ..."
 
 
 def _keys_at(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:

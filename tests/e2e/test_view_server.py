@@ -171,6 +171,23 @@ def test_pixels_that_are_none(client, query):
     assert client.ask("GET", connection_path)[0] == 400
 
 
+def test_a_port_scanner_stops_nothing(client):
+    rng = np.random.default_rng(4)
+    sent = [b"", b"\r\n\r\n", b"\0" * 100, b"\x16\x03\x01\x02\x00\x01\x00", b"SSH-2.0-x\r\n", b"GET\r\n\r\n"]
+    sent += [b"GET //[ HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n\r\n" % client.port, b"GET /" + b"a" * 100_000]
+    sent += [b"GET / HTTP/9.9\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 500 + b"\r\n"]
+    sent += [rng.bytes(int(size)) for size in rng.integers(1, 3000, 20)]
+    held = []
+    for content in sent:
+        connection = socket.create_connection(("127.0.0.1", client.port), timeout=5)
+        connection.sendall(content)
+        held.append(connection)  # open while the others come
+    assert client.ask("GET", "/api/pixel?y=3&x=4")[0] == 200
+    for connection in held:
+        connection.close()
+    assert client.ask("GET", "/api/pixel?y=3&x=4")[0] == 200
+
+
 def test_nothing_is_written(client, finished):
     before = digest(finished)
     client.ask("GET", "/")

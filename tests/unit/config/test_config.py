@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 import yaml
 from helpers.places import ROOT
@@ -89,3 +91,43 @@ def test_old_keys_are_read_and_the_new_ones_told(capsys):
     ]
     both = "input: {files: [a.tif]}\ndiscrepancy: {grown_replicates: 24, extended_replicates: 30}\n"
     assert parse_config(both).discrepancy.extended_replicates == 30
+
+
+def bomb(start):
+    """Return lines in which nine aliases a line stand for a billion values."""
+    names = "abcdefghij"
+    lines = [f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in itertools.pairwise(names)]
+    return "\n".join(["a: &a [x, x, x, x, x, x, x, x, x]", *lines, start])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("input: " + "[" * 5000, "too deep to read"),
+        ("input: " + "{a: " * 5000, "too deep to read"),
+        (bomb("input: {files: *j}"), "write the settings out"),
+        ("run: &a {store: *a}", "write the settings out"),
+        ("input: !!python/object/apply:os.mkdir [trace]", "not valid YAML"),
+        ("run: {tile: " + "9" * 5000 + "}", "not valid YAML"),
+        ("run: {store: a\0b}", "not valid YAML"),
+        ("nothing: 1\nrun: {store: '" + "µ日本" * 100_000 + "'}", "nothing: unknown key"),
+        ("run: {" + ", ".join(f"k{i}: 1" for i in range(500)) + "}", "and 480 more"),
+        ("run: {tile: [" + "x, " * 50_000 + "]}", "run.tile"),
+        ('run: {"\\e[31m": 1}', "run.\\x1b[31m: unknown key"),
+    ],
+)
+def test_hostile_yaml_is_one_short_line(text, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text)
+    assert words in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 4100
+    assert not (tmp_path / "trace").exists()
+
+
+def test_yaml_in_many_scripts():
+    text = "Ελληνικά кириллица 日本語 한국어 عربى עברית हिन्दी ไทย ქართული አማርኛ 😀"
+    config = parse_config(f"run: {{store: '{text}.zarr'}}\ninput: {{files: ['{text}.npy']}}")
+    assert parse_config(dump_config(config)) == config
+    assert text in dump_config(config)
