@@ -326,16 +326,28 @@ def compare(
     tolerance: Annotated[
         float, typer.Option(help="same frames: relative difference that counts as rounding")
     ] = 1e-12,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="label of a run in the history, in their order: a temperature, a date (repeatable) "
+            "[default: dates of the frames]"
+        ),
+    ] = None,
+    fdr: Annotated[
+        float, typer.Option(help="false-discovery rate at which a pixel counts as moved since the first run")
+    ] = 0.01,
     workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
-    """Compare runs; exit code 3 if something changed.
+    """Compare runs, and write their history; exit code 3 if something changed.
 
     Runs on the same frames are compared value by value, others in standard errors.
     """
     from pchem_pipeline.commands.compare.compare import compare_runs
 
-    for path in compare_runs(runs, output, tolerance=tolerance, workers=workers, progress=progress):
+    for path in compare_runs(
+        runs, output, tolerance=tolerance, labels=label or (), rate=fdr, workers=workers, progress=progress
+    ):
         typer.echo(path)
 
 

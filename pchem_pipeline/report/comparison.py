@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.run_differences import MapDifference, Reasons
 
-__all__ = ["ArrayRow", "Comparison", "Pair", "RunFacts", "Setting"]
+__all__ = ["ArrayRow", "Comparison", "HistoryRow", "Pair", "RunFacts", "Setting"]
 
 #: How an array of two runs compares: to the bit; within rounding; not; absent in one of them.
 State = Literal["identical", "equal", "changed", "lost", "new"]
@@ -123,6 +123,35 @@ class Pair:
 
 
 @dataclass(frozen=True)
+class HistoryRow:
+    """One run among others of the same camera.
+
+    Attributes:
+        label: as given, else the date.
+        date: when its frames were written, UTC, ISO 8601; empty where that is not known.
+        place: number that the label begins with, or days of the date; NaN where there is none.
+        run: what its maps say.
+        hot_pixels: pixels far above the others in dark current, or in exposure.
+        flags: number of pixels that bear each word of ``fit_status``.
+        effects: tags of its model.
+        moved: map to number of pixels that moved since the first run; empty for that one itself.
+        any_moved: pixels that moved in any map.
+        compared: pixels with a good fit in both.
+    """
+
+    label: str
+    date: str
+    place: float
+    run: RunFacts
+    hot_pixels: int = 0
+    flags: Mapping[str, int] = field(default_factory=dict)
+    effects: tuple[str, ...] = ()
+    moved: Mapping[str, int] = field(default_factory=dict)
+    any_moved: int = 0
+    compared: int = 0
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Runs against the first of them.
 
@@ -130,11 +159,15 @@ class Comparison:
         runs: in the order given.
         pairs: the first with each of the others.
         tolerance: relative difference that counts as rounding.
+        history: a row for each run.
+        rate: false-discovery rate at which pixels count as moved.
     """
 
     runs: Sequence[RunFacts]
     pairs: Sequence[Pair]
     tolerance: float
+    history: Sequence[HistoryRow] = ()
+    rate: float = 0.01
 
     @property
     def changed(self) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.commands.compare.arrays import compare_arrays
+from pchem_pipeline.commands.compare.history import HISTORY_CSV, history_csv, history_rows
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import LIMIT, compare_maps, reasons_of_change
@@ -53,15 +54,19 @@ def compare_runs(
     folder: Path,
     *,
     tolerance: float = 1e-12,
+    labels: Sequence[str] = (),
+    rate: float = 0.01,
     workers: int | None = None,
     progress: ProgressMode = "auto",
 ) -> list[Path]:
-    """Compare runs with the first of them and write ``compare.html`` and ``compare.json``.
+    """Compare runs with the first of them and write ``compare.html``, ``compare.json`` and ``history.csv``.
 
     Args:
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
+        labels: of the runs, for their history: temperatures, dates; none: the dates of their frames.
+        rate: false-discovery rate at which a pixel counts as moved since the first run.
         workers: processes that draw; None: as the first run's section ``compute`` says.
         progress: auto | on | off.
 
@@ -74,10 +79,10 @@ def compare_runs(
         StoreError: a run has no maps, or the folder cannot be written.
     """
     reporter = Reporter(progress)
-    found = comparison_of(paths, tolerance, reporter)
+    found = comparison_of(paths, tolerance, reporter, labels, rate)
     draw = draw_by_workers(drawing_workers(workers, find_run(paths[0]).config.compute), reporter, "figures")
     page, numbers = render_comparison(found, draw)
-    files = {COMPARE_PAGE: page, COMPARE_JSON: numbers}
+    files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, HISTORY_CSV: history_csv(found.history)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -90,10 +95,16 @@ def compare_runs(
     return [folder / name for name in files]
 
 
-def comparison_of(paths: Sequence[Path], tolerance: float, reporter: Reporter) -> Comparison:
+def comparison_of(
+    paths: Sequence[Path],
+    tolerance: float,
+    reporter: Reporter,
+    labels: Sequence[str] = (),
+    rate: float = 0.01,
+) -> Comparison:
     """Return how the runs differ from the first of them; see :func:`compare_runs`."""
-    if not 2 <= len(paths) <= len(string.ascii_uppercase):
-        raise ConfigError(f"compare: {len(paths)} runs given; give two or more, up to 26")
+    if len(paths) < 2:
+        raise ConfigError(f"compare: {len(paths)} runs given; give two or more")
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: a relative difference from 0 to below 1 is meant")
     targets = [find_run(path) for path in paths]
@@ -105,13 +116,19 @@ def comparison_of(paths: Sequence[Path], tolerance: float, reporter: Reporter) -
     names = _told_apart([store.path for store in stores])
     runs = [
         _facts(label, name, store)
-        for label, name, store in zip(string.ascii_uppercase, names, stores, strict=False)
+        for label, name, store in zip(_letters(len(names)), names, stores, strict=True)
     ]
     pairs = [
         _pair((runs[0], targets[0], stores[0]), (run, target, store), tolerance, reporter)
         for run, target, store in zip(runs[1:], targets[1:], stores[1:], strict=True)
     ]
-    return Comparison(runs, pairs, tolerance)
+    return Comparison(runs, pairs, tolerance, history_rows(runs, stores, pairs, labels, rate), rate)
+
+
+def _letters(n: int) -> list[str]:
+    """Return n labels: A to Z, then AA to AZ and so on."""
+    singles = string.ascii_uppercase
+    return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
 
 
 _Side = tuple[RunFacts, Target, RunStore]

@@ -11,6 +11,7 @@ from pchem_pipeline.model.checks.run_differences import FAR
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
 from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.figures.history import history_figures
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report import template
 from pchem_pipeline.report.pages.report_json import json_value
@@ -26,6 +27,8 @@ COMPARE_VERSION = 1
 _SETTINGS = ReportSettings(figure_formats=(), dpi=200)
 #: At most so many sentences on what changed are shown; the JSON has all.
 _MOST_WORDS = 12
+#: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
+_MOST_DRAWN = 8
 
 
 @dataclass(frozen=True)
@@ -89,9 +92,13 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
         found: the comparison.
         draw: draws all figures at once; None: one after the other, here.
     """
-    maps = {pair.other.label: difference_figures(pair) for pair in found.pairs}
-    whole = ensembles_figures(found.runs)
-    drawn = (draw or draw_here)([*whole, *(each for figures in maps.values() for each in figures)], _SETTINGS)
+    many = len(found.pairs) > _MOST_DRAWN
+    maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
+    whole = ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]])
+    times = history_figures(found.history)
+    drawn = (draw or draw_here)(
+        [*whole, *times, *(each for figures in maps.values() for each in figures)], _SETTINGS
+    )
 
     def pictures(figures: Sequence[Figure]) -> list[Picture]:
         return [Picture(figure, drawn[figure.name]) for figure in figures]
@@ -104,6 +111,8 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
         sentence=sentence_of(found),
         parts=parts,
         runs=run_table(found),
+        history=history_table(found),
+        times=pictures(times),
         pictures=pictures(whole),
         sign="▲" if found.changed else "✓",
     )
@@ -182,6 +191,35 @@ _STATES = {
     "lost": "not there any more",
     "new": "new",
 }
+
+
+def history_table(found: Comparison) -> Table:
+    """Return a row for each run: pixels, flags, effects, and what moved since the first."""
+    rows = []
+    for row in found.history:
+        flagged = {name: n for name, n in row.flags.items() if n}
+        moved = {symbol(name)[1]: n for name, n in row.moved.items() if n}
+        rows.append(
+            (
+                row.label,
+                row.run.title,
+                f"{row.run.pixels[0]:,}",
+                f"{row.hot_pixels:,}",
+                ", ".join(f"{name} {n:,}" for name, n in flagged.items()) or "none",
+                ", ".join(row.effects) or "none",
+                f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
+                ", ".join(f"{name} {n:,}" for name, n in moved.items()),
+            )
+        )
+    return Table(
+        "history-runs",
+        "Run by run",
+        "Moved: pixels with a good fit in both whose value differs from the first run's beyond its errors, at "
+        f"a false-discovery rate of {found.rate:g}. This and all medians are in history.csv, a line for each "
+        "run.",
+        ("label", "run", "good pixels", "hot", "flags", "effects", "moved", "in"),
+        tuple(rows),
+    )
 
 
 def run_table(found: Comparison) -> Table:

@@ -1,0 +1,165 @@
+"""Runs of one camera over time: what each found, and which pixels moved since the first."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.model.checks.multiple_testing import false_discovery
+from pchem_pipeline.model.checks.run_differences import MapDifference
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.maps.maps import GOOD
+from pchem_pipeline.report.comparison import HistoryRow, Pair, RunFacts
+from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["HISTORY_CSV", "history_csv", "history_rows"]
+
+#: Name of the file.
+HISTORY_CSV = "history.csv"
+
+_HOT = ("dark_current", "quanta_exposure")  # the first that a run has
+_NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
+
+
+def history_rows(
+    runs: Sequence[RunFacts],
+    stores: Sequence[RunStore],
+    pairs: Sequence[Pair],
+    labels: Sequence[str],
+    rate: float,
+) -> list[HistoryRow]:
+    """Return a row for each run, in the order given.
+
+    Args:
+        runs: the runs.
+        stores: of them.
+        pairs: the first with each of the others.
+        labels: of the runs, such as temperatures; none: the dates of their frames.
+        rate: false-discovery rate at which a pixel counts as moved.
+
+    Raises:
+        ConfigError: there are labels, but not one for each run.
+    """
+    if labels and len(labels) != len(runs):
+        raise ConfigError(
+            f"--label: {len(labels)} given for {len(runs)} runs; give one for each, in their order"
+        )
+    if not 0.0 < rate < 1.0:
+        raise ConfigError(f"--fdr {rate:g}: a rate between 0 and 1 is meant, such as 0.01")
+    dates = [_date(store) for store in stores]
+    rows = []
+    for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
+        moved, any_moved, compared = _moved(pairs[i - 1], stores[0], store, rate) if i else ({}, 0, 0)
+        label = labels[i] if labels else dates[i]
+        place = _place(label) if labels else _days(dates[i])
+        rows.append(
+            HistoryRow(
+                label,
+                dates[i],
+                place,
+                run,
+                _hot(store),
+                _flags(store),
+                _effects(store),
+                moved,
+                any_moved,
+                compared,
+            )
+        )
+    return rows
+
+
+def _date(store: RunStore) -> str:
+    """Return when the camera files of a run were written, else read, UTC, ISO 8601; or empty."""
+    kept: Any = read_json(store.path / ".pchem" / "ingested.json") or {}
+    times = [each.get("mtime_ns") for each in (kept.get("quick") or {}).get("files", [])]
+    known = [time for time in times if time]
+    if known:
+        return datetime.fromtimestamp(min(known) / 1e9, UTC).isoformat(timespec="seconds")
+    record = store.records.read("ingest")
+    return "" if record is None else record.started
+
+
+def _days(date: str) -> float:
+    return datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
+
+
+def _place(label: str) -> float:
+    """Return the number that a label begins with; NaN where it begins with none."""
+    match = _NUMBER.match(label)
+    return float(match[1]) if match else float("nan")
+
+
+def _hot(store: RunStore) -> int:
+    """Return the number of pixels far above the others."""
+    summary: Mapping[str, Any] = store.attributes("maps").get("summary", {})
+    return next((int(summary[name]["n_high"]) for name in _HOT if name in summary), 0)
+
+
+def _flags(store: RunStore) -> dict[str, int]:
+    """Return how many pixels bear each word of the status."""
+    words = store.read("fit/fit_status")
+    return {str(bit.name).lower(): int(((words & int(bit)) != 0).sum()) for bit in FitStatus if bit}
+
+
+def _effects(store: RunStore) -> tuple[str, ...]:
+    version = model_of(store, "fit")
+    return () if version is None else tuple(effect.tag for effect in version.effects)
+
+
+def _moved(pair: Pair, one: RunStore, other: RunStore, rate: float) -> tuple[dict[str, int], int, int]:
+    """Return the pixels whose parameters moved: of each map, of any, and how many were compared."""
+    if pair.same_data or not pair.maps:
+        return {}, 0, 0
+    good = (one.read("maps/quality") == GOOD) & (other.read("maps/quality") == GOOD)
+    found = {name: moved_pixels(each, good, rate) for name, each in pair.maps.items()}
+    any_moved = np.logical_or.reduce(list(found.values()))
+    return {name: int(each.sum()) for name, each in found.items()}, int(any_moved.sum()), int(good.sum())
+
+
+def moved_pixels(each: MapDifference, good: NDArray[np.bool_], rate: float) -> NDArray[np.bool_]:
+    """Return where a map moved beyond its errors, at a false-discovery rate (Benjamini and Hochberg 1995).
+
+    Args:
+        each: the difference of two maps.
+        good: pixels with a good fit in both.
+        rate: among the pixels returned, the share that moved by chance alone is at most this.
+    """
+    probability = np.where(good, erfc(np.abs(each.z) / np.sqrt(2.0)), np.nan)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(false_discovery(probability) <= rate)
+
+
+def history_csv(rows: Sequence[HistoryRow]) -> str:
+    """Return the history as CSV: a line of headings, and a line for each run."""
+    maps = list(dict.fromkeys(name for row in rows for name in row.run.summary))
+    moved = list(dict.fromkeys(name for row in rows for name in row.moved))
+    flags = list(rows[0].flags)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        ["label", "date", "run", "frames", "pixels_good", "pixels_caution", "pixels_no_value", "hot_pixels"]
+        + [f"{name}_{part}" for name in maps for part in ("median", "median_stderr", "scatter")]
+        + [f"{name}_moved" for name in moved]
+        + ["moved_pixels", "compared_pixels", "effects", *(f"flag_{name}" for name in flags)]
+    )
+    for row in rows:
+        of_maps = [row.run.summary.get(name, (float("nan"),) * 3) for name in maps]
+        writer.writerow(
+            [row.label, row.date, row.run.name, row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
+            + ["" if value != value else f"{value:.9g}" for each in of_maps for value in each]
+            + [row.moved.get(name, "") for name in moved]
+            + [row.any_moved, row.compared, " ".join(row.effects), *(row.flags[name] for name in flags)]
+        )
+    return text.getvalue()

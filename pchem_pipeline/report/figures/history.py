@@ -1,0 +1,90 @@
+"""Figure of runs over time: medians and scatter of the maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from pchem_pipeline.report.comparison import HistoryRow
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, styled
+from pchem_pipeline.report.style.wording import short, symbol
+
+__all__ = ["history_figures"]
+
+_SHOWN = ("quanta_exposure", "dark_current", "conversion_gain", "bias", "read_noise_e")
+
+
+def history_figures(rows: Sequence[HistoryRow]) -> list[Figure]:
+    """Return the medians of the maps of each run; none for fewer than two runs."""
+    shown = [name for name in _SHOWN if all(name in row.run.summary for row in rows)]
+    if len(rows) < 2 or not shown:
+        return []
+    places = np.array([row.place for row in rows])
+    ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
+    by_date = ordered and all(row.label == row.date for row in rows)
+    at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
+    axis = "days since the first" if by_date else "label" if ordered else "run"
+    columns: dict[str, object] = {
+        "run": [row.run.name for row in rows],
+        "label": [row.label for row in rows],
+        axis: at,
+    }
+    if axis in ("run", "label"):
+        columns = {"name": columns["run"], "text": columns["label"], axis: at}
+    units = {}
+    for name in shown:
+        for part, key in enumerate(("median", "standard error", "scatter")):
+            heading = f"{name} {key}"
+            columns[heading] = [row.run.summary[name][part] for row in rows]
+            units[heading] = symbol(name)[2].replace("e⁻", "e-")
+    table = DataTable(columns, units)  # type: ignore[arg-type]
+    first, last = rows[0], rows[-1]
+    words = "; ".join(
+        f"{symbol(name)[1]} from {short(first.run.summary[name][0])} to {short(last.run.summary[name][0])} "
+        f"{symbol(name)[2]}"
+        for name in shown
+    )
+    return [
+        Figure(
+            "history",
+            "",
+            "The camera over time",
+            "Medians of the maps with their standard errors; the band is the scatter of the pixels.",
+            f"From {first.label} to {last.label}: {words}.",
+            (table,),
+            partial(draw_history, table=table, names=tuple(shown), axis=axis),
+            PAGE_MM,
+        )
+    ]
+
+
+@styled
+def draw_history(look: Look, *, table: DataTable, names: tuple[str, ...], axis: str) -> Drawing:
+    """Draw a panel for each map: median with its error, and the scatter of the pixels as a band.
+
+    Args:
+        look: width and colours.
+        table: of the figure.
+        names: the maps.
+        axis: column against which they are drawn.
+    """
+    drawing = look.empty(26.0 * len(names) + 10.0)
+    at = table[axis].astype(np.float64)
+    order = np.argsort(at, kind="stable")
+    panels = np.atleast_1d(drawing.subplots(len(names), 1, sharex=True))
+    for panel, name in zip(panels, names, strict=True):
+        median, error, scatter = (
+            table[f"{name} {part}"].astype(np.float64)[order]
+            for part in ("median", "standard error", "scatter")
+        )
+        panel.fill_between(
+            at[order], median - scatter, median + scatter, color=look.palette.blue, alpha=0.15, lw=0
+        )
+        panel.errorbar(at[order], median, error, fmt="o-", ms=3, color=look.palette.blue)
+        sign, _, unit = symbol(name)
+        panel.set_ylabel(f"{sign} ({unit})")
+    panels[-1].set_xlabel(axis)
+    return drawing
