@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import re
@@ -139,6 +140,51 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")
     assert "warm &lt;b&gt;.zarr" in page
     assert "<b>.zarr" not in page
+
+
+def test_the_history_of_a_camera(shell, copies, finished):
+    """Pixels that moved are found at the stated rate, run by run, and the medians against the labels."""
+    other_capture(copies)
+    shutil.copytree(finished, shell.folder / "c.zarr")
+    third = RunStore.open(shell.folder / "c.zarr", writable=True)
+    other_capture(third, seed=3)
+    bias, error = third.read("maps/bias"), third.read("maps/bias_stderr")
+    good = np.argwhere(third.read("maps/quality") == 0)[:40]
+    for y, x in good:
+        bias[y, x] += 12 * error[y, x]
+    third.write("maps/bias", whole(third, "maps/bias"), bias)
+    labels = ["-20 C", "-10 C", "0 C"]
+    with pytest.raises(ChangedError):
+        compare_runs(
+            [shell.folder / f"{name}.zarr" for name in "abc"],
+            shell.folder / "history",
+            labels=labels,
+            rate=0.05,
+            workers=1,
+            progress="off",
+        )
+    with (shell.folder / "history" / "history.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["label"] for row in rows] == labels
+    assert [row["run"] for row in rows] == ["a.zarr", "b.zarr", "c.zarr"]
+    assert rows[0]["bias_moved"] == ""
+    n = int(rows[1]["compared_pixels"])
+    # without a change each of 6 maps calls a pixel moved with a probability of 5 %, not each of its pixels
+    assert int(rows[1]["moved_pixels"]) <= 6
+    found = int(rows[2]["bias_moved"])
+    assert 38 <= found <= 40 + 12  # 40 moved; at most one in twenty of those found by chance, and its scatter
+    assert found < 0.2 * n
+    assert int(rows[2]["pixels_good"]) == int((third.read("maps/quality") == 0).sum())
+    summary = third.attributes("maps")["summary"]["conversion_gain"]
+    assert float(rows[2]["conversion_gain_median"]) == pytest.approx(summary["median"])
+    assert rows[0]["date"][:2] == "20"
+    assert "flag_poor_fit" in rows[0]
+    page = (shell.folder / "history" / "compare.html").read_text(encoding="utf-8")
+    assert "The camera over time" in page
+    assert "-20 C" in page
+    for wrong in ({"labels": ["one"]}, {"rate": 0.0}):
+        with pytest.raises(ConfigError, match="--"):
+            comparison_of([shell.folder / "a.zarr", shell.folder / "b.zarr"], 1e-12, Reporter("off"), **wrong)
 
 
 def test_bad_input_gets_one_line(shell, finished):

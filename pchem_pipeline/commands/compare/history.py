@@ -28,7 +28,7 @@ __all__ = ["HISTORY_CSV", "history_csv", "history_rows"]
 #: Name of the file.
 HISTORY_CSV = "history.csv"
 
-_HOT = ("dark_current", "quanta_exposure")  # the first that a run has
+_HOT = ("charge_rate", "dark_current", "quanta_exposure")  # the first that a run has
 _NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
 
 

@@ -14,7 +14,7 @@ from pchem_pipeline.report.style.wording import short, symbol
 
 __all__ = ["history_figures"]
 
-_SHOWN = ("quanta_exposure", "dark_current", "conversion_gain", "bias", "read_noise_e")
+_SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
 
 
 def history_figures(rows: Sequence[HistoryRow]) -> list[Figure]:

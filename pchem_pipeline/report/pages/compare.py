@@ -214,9 +214,9 @@ def history_table(found: Comparison) -> Table:
     return Table(
         "history-runs",
         "Run by run",
-        "Moved: pixels with a good fit in both whose value differs from the first run's beyond its errors, at "
-        f"a false-discovery rate of {found.rate:g}. This and all medians are in history.csv, a line for each "
-        "run.",
+        "Moved: pixels with a good fit in both whose value differs from the first run's beyond its errors, "
+        f"at a false-discovery rate of {found.rate:g}. This and all medians are in history.csv, a line "
+        "for each run.",
         ("label", "run", "good pixels", "hot", "flags", "effects", "moved", "in"),
         tuple(rows),
     )

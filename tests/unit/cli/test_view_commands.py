@@ -64,5 +64,5 @@ def test_runs_are_compared_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
         "compare", "a.zarr", "b.zarr", "c.zarr", "-o", "out", "--tolerance", "1e-9", "--workers", "1"
     )
     assert shown == "out/compare.html\n"
-    options = {"tolerance": 1e-9, "workers": 1, "progress": "auto"}
+    options = {"tolerance": 1e-9, "labels": (), "rate": 0.01, "workers": 1, "progress": "auto"}
     assert seen == [(([Path("a.zarr"), Path("b.zarr"), Path("c.zarr")], Path("out")), options)]
