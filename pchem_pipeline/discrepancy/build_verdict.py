@@ -30,6 +30,7 @@ from pchem_pipeline.discrepancy.verdict import (
     parameters_of,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
@@ -100,6 +101,7 @@ class Addition:
             verdict=self.verdict,
             candidates=self.candidates,
             parameters=parameters_of(self.effect, self.strength_stderr),
+            place=place_words(self.effect),
             gap_before=self.before.value,
             gap_after=self.after.value,
             gap_floor=self.after.floor,
@@ -287,7 +289,7 @@ def _gap_change(before: Gap, added: Added) -> GapChange:
 def _sentence(found: Findings) -> str:
     """Return the verdict in one sentence."""
     state, data, added = found.state, found.samples, found.added
-    titles = [type(effect).title or effect.tag for effect in found.named]
+    titles = [title_words(effect) for effect in found.named]
     if state == "consistent":
         return f"The {data} agree with the model in every statistic tested."
     if state == "cannot_tell":

@@ -283,6 +283,7 @@ class Step(_Part):
         verdict: of this step alone.
         candidates: those compared, the likeliest first.
         parameters: numbers of the named or the likeliest effect.
+        place: where and when it acts, in words; empty: everywhere, always.
         gap_before, gap_after, gap_floor: on the final samples without and with it, nats per sample.
         gap_interval_after: 95 % interval of the gap with it.
         families: the gap by family of statistics.
@@ -297,6 +298,7 @@ class Step(_Part):
     verdict: State
     candidates: tuple[Candidate, ...]
     parameters: dict[str, Measured]
+    place: str = ""
     gap_before: Number
     gap_after: Number
     gap_floor: Number

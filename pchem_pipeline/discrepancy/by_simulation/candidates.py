@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -29,6 +30,7 @@ Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 
 _log = logging.getLogger(__name__)
 _MOST_HYPOTHESES = 6  # of one effect
+_MOST_IN_A_PART = 2
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 _LARGEST_STEP = 30.0
@@ -117,11 +119,17 @@ class ReplicateSimulator:
     left_out: dict[str, str] = field(default_factory=dict)
     _rows: dict[str, FloatArray] = field(default_factory=dict)
 
-    def guesses(self, classes: Mapping[str, type[Effect]], evidence: Sequence[Evidence]) -> list[Effect]:
+    def guesses(
+        self,
+        classes: Mapping[str, type[Effect]],
+        evidence: Sequence[Evidence],
+        parts: Sequence[tuple[Part, Evidence]] = (),
+    ) -> list[Effect]:
         """Ask every candidate for hypotheses; one that raises is left out.
 
         The first evidence in which a candidate sees anything counts. A guess says only what to look at:
-        strengths are fitted on one split and scored on the other, both ways round.
+        strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
+        the sensor or run gives hypotheses that act there only.
         """
         found: list[Effect] = []
         for tag, effect in classes.items():
@@ -130,6 +138,9 @@ class ReplicateSimulator:
             try:
                 guessed = next(filter(None, (list(effect.estimate(one)) for one in evidence)), [])
                 found += guessed[:_MOST_HYPOTHESES]
+                for part, own in parts:
+                    placed = list(effect.estimate(own))[:_MOST_IN_A_PART]
+                    found += [each.at_place(part.region, part.when) for each in placed]
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
                 self._leave_out(tag, error)

@@ -44,10 +44,12 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate, by_part
+from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, suspicious
-from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import EXACT
 from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search
 from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
@@ -63,6 +65,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FEWEST_PIXELS = 32
+_BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
 _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters are no ground for a verdict
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
@@ -84,6 +87,7 @@ def find_discrepancies(
     integration_time: float = 1.0,
     model: Sequence[Effect] = (),
     mapper: Mapper = serial,
+    window: SensorWindow | None = None,
 ) -> Discrepancy:
     """Find where frames disagree with the fitted model, name the effects, and add them.
 
@@ -96,6 +100,7 @@ def find_discrepancies(
         integration_time: s.
         model: effects that the model has already; none of them is added again.
         mapper: runs the simulated stacks; None of the answers depends on how.
+        window: of the sensor that the frames are; None: all of it.
 
     Returns:
         The verdict, with everything that supports it.
@@ -111,6 +116,7 @@ def find_discrepancies(
     if bit_depth is None:
         bit_depth = min(int(stack.max()).bit_length() + 1, 24)
     frames = FrameStack(stack, numbers, splits, n_run or int(numbers[-1]) + 1, bit_depth, integration_time)
+    frames = replace(frames, window=window)
     return search(FrameExplainer(frames, settings, tuple(model), mapper))
 
 
@@ -125,6 +131,8 @@ class FrameStack:
         n_run: frames of the whole run.
         bit_depth: bits of the ADC.
         integration_time: s.
+        parts: of sensor and run that differ from the rest.
+        window: of the sensor that they are; None: all of it.
     """
 
     stack: NDArray[np.unsignedinteger]
@@ -133,6 +141,8 @@ class FrameStack:
     n_run: int
     bit_depth: int
     integration_time: float
+    parts: tuple[Part, ...] = ()
+    window: SensorWindow | None = None
 
     @property
     def seen(self) -> IntArray:
@@ -154,6 +164,54 @@ class FrameStack:
             start=maps,
         )
 
+    def with_parts(self, parts: tuple[Part, ...]) -> FrameStack:
+        """Return it with parts, dealt in blocks so short that a range of frames is alike in all splits."""
+        shortest = min((int(p.frames(self.numbers).sum()) for p in parts if p.when is not None), default=0)
+        length = max(shortest // _BLOCKS_IN_A_RANGE // 2 * 2, _SHORTEST_BLOCK)
+        splits = self.splits
+        if shortest and length < splits.block_frames:
+            splits = split_frames(self.numbers, length)
+        window = self.window
+        if window is not None:
+            parts = tuple(Part(window.on_sensor(part.region), part.when) for part in parts)
+        return replace(self, parts=parts, splits=splits)
+
+    def effects(self, model: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Return the effects of a model as they act on these pixels, row 0 being the first of these."""
+        return tuple(model) if self.window is None else self.window.effects(model)
+
+    def statistics(self, part: IntArray, evidence: Evidence) -> dict[str, float]:
+        """Return the statistics of some frames, those of the parts included, as replicates have them."""
+        apart = part_statistics(
+            self.stack[part],
+            self.numbers[part],
+            evidence.maps,
+            self.parts,
+            n_run=self.n_run,
+            block_frames=self.splits.block_frames,
+            window=self.window,
+        )
+        return {**evidence.z, **apart}
+
+    def seen_apart(self, evidence: Evidence) -> list[tuple[Part, Evidence]]:
+        """Return the evidence of each part, of train and test frames together."""
+        stack, numbers = self.stack[self.seen], self.numbers[self.seen]
+        return [
+            (
+                part,
+                part_evidence(
+                    stack,
+                    numbers,
+                    evidence.maps,
+                    part,
+                    n_run=self.n_run,
+                    block_frames=self.splits.block_frames,
+                    window=self.window,
+                ),
+            )
+            for part in self.parts
+        ]
+
     def acquisition(self, as_data: bool = False) -> Acquisition:
         """Return how replicates of the train part are taken.
 
@@ -167,6 +225,8 @@ class FrameStack:
             self.bit_depth,
             self.integration_time,
             other=self.numbers[self.splits.test] if as_data else None,
+            parts=self.parts,
+            window=self.window,
         )
 
 
@@ -209,6 +269,8 @@ class FrameExplainer:
                 f"{int(usable.sum())} of {usable.size} pixels have a usable fit, "
                 f"fewer than {_FEWEST_PIXELS}: nothing can be compared; see fit_status, or take more frames"
             )
+        self.frames = self.frames.with_parts(suspected_parts(self.plain))
+        splits = self.frames.splits
         parts = splits.train, splits.test, splits.final
         self.evidence = tuple(self.frames.observe(part, self.plain.maps) for part in parts)
         self.fit, self.sensor = self._mapped(self.model)
@@ -217,12 +279,14 @@ class FrameExplainer:
     def null(self) -> tuple[NullModel, Measured]:
         """Simulate and observe the fitted model, refit included."""
         vectors = self._replicates(self.model, self.sensor, "r0", self.settings.replicates)
-        common = set(STATISTICS).intersection(*vectors, *(e.z for e in self.evidence))
-        names = tuple(name for name in STATISTICS if name in common)
+        splits = self.frames.splits
+        parts = splits.train, splits.test, splits.final
+        own = [self.frames.statistics(part, e) for part, e in zip(parts, self.evidence, strict=True)]
+        names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
         n_samples = self.frames.splits.final.size * int(self.evidence[0].maps.usable.sum())
         self.gaps = StatisticsGap(self.first, n_samples)
-        return self.first, Measured(*(as_matrix(names, [e.z])[0] for e in self.evidence))
+        return self.first, Measured(*as_matrix(names, own))
 
     def doubt(self) -> str:
         """Say which share of the pixels is not identified, and what would help; empty below a half."""
@@ -263,7 +327,8 @@ class FrameExplainer:
             dict(self.left_out),
         )
         shifts = (z.train - null.mean, z.test - null.mean)
-        guesses = simulator.guesses(self.classes, (self.plain, *self.evidence[:2]))
+        apart = self.frames.seen_apart(self.plain)
+        guesses = simulator.guesses(self.classes, (self.plain, *self.evidence[:2]), apart)
         placebo = placebo_for(guesses, self.classes)
         hypotheses = simulator.fingerprints([*guesses, *placebo])
         hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
@@ -347,7 +412,9 @@ class FrameExplainer:
         if self.rounds:
             code = self.evidence[0].code
             codes = code.first + np.arange(code.observed.size)
-            expected = expected_codes(maps, self.model, codes, frames.numbers[frames.splits.train])
+            train = frames.numbers[frames.splits.train]
+            expected = expected_codes(maps, frames.effects(self.model), codes, train)
+        model = frames.effects(model)
         try:
             added = added_exposures(model, frames.stack, frames.numbers, plain.maps)
         except ConfigError as error:
@@ -367,10 +434,11 @@ class FrameExplainer:
         plain, fit = self.plain, None
         assert plain.covariance is not None
         frames, numbers = self.frames.stack[self.frames.seen], self.frames.numbers[self.frames.seen]
+        own = self.frames.effects(model)
         if model:
-            fit = refit_maps(frames, plain.maps, model, plain.covariance, numbers=numbers)
+            fit = refit_maps(frames, plain.maps, own, plain.covariance, numbers=numbers)
         fit = fit or Refit(plain.maps, {}, plain.covariance)
-        return fit, learn_sensor(frames, numbers, fit, model, plain.ambiguous)
+        return fit, learn_sensor(frames, numbers, fit, own, plain.ambiguous)
 
     def _replicates(
         self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0

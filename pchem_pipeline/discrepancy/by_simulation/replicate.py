@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps, observe
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_statistics
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.simulate.chain import dn_dtype, simulate_block
@@ -43,6 +44,8 @@ class Acquisition:
             those of the data: all their frames are fitted from nothing, this says which pixels can be used,
             and each part is observed near that fit. Without one the fits are begun at the truth, which is
             faster and will do for the difference that an effect makes.
+        parts: of sensor and run of which the leading statistics are looked at apart.
+        window: of the sensor that is simulated; None: all of it.
     """
 
     numbers: NDArray[np.int64]
@@ -51,6 +54,8 @@ class Acquisition:
     bit_depth: int
     integration_time: float = 1.0
     other: NDArray[np.int64] | None = None
+    parts: tuple[Part, ...] = ()
+    window: SensorWindow | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,10 @@ class Replicate:
 
     def evidence(self) -> tuple[Evidence, ...]:
         """Simulate, and observe each part."""
+        return tuple(evidence for _, _, evidence in self._observed())
+
+    def _observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], NDArray[np.int64], Evidence]]:
+        """Simulate; yield the frames of each part, their numbers and their evidence."""
         taken, start = self.acquisition, self.maps
         parts: tuple[NDArray[np.int64], ...] = (taken.numbers,)
         if taken.other is None:
@@ -82,24 +91,33 @@ class Replicate:
             parts, seen = (*parts, taken.other), np.union1d(taken.numbers, taken.other)
             frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
             start = fitted_maps(frames, ~self.maps.usable)
-        return tuple(
-            observe(
-                frames[np.isin(seen, numbers)],
+        for numbers in parts:
+            some = frames[np.isin(seen, numbers)]
+            evidence = observe(
+                some,
                 numbers,
                 n_run=taken.n_run,
                 block_frames=taken.block_frames,
                 exclude=~start.usable,
                 start=start,
             )
-            for numbers in parts
-        )
+            yield some, numbers, evidence
 
     def __call__(self) -> dict[str, float]:
         """Simulate, observe, and return the statistics by name, those of the second part behind a mark."""
-        first, *more = self.evidence()
-        found = {name: float(value) for name, value in first.z.items()}
-        for second in more:
-            found |= {OF_OTHER + name: float(value) for name, value in second.z.items()}
+        taken = self.acquisition
+        found: dict[str, float] = {}
+        for mark, (frames, numbers, evidence) in zip(("", OF_OTHER), self._observed(), strict=False):
+            apart = part_statistics(
+                frames,
+                numbers,
+                evidence.maps,
+                taken.parts,
+                n_run=taken.n_run,
+                block_frames=taken.block_frames,
+                window=taken.window,
+            )
+            found |= {mark + name: float(value) for name, value in {**evidence.z, **apart}.items()}
         return found
 
 
@@ -114,7 +132,7 @@ def simulate_frames(
         seed=seed,
         bit_depth=taken.bit_depth,
         integration_time=taken.integration_time,
-        effects=effects,
+        effects=effects if taken.window is None else taken.window.effects(effects),
     )
     truth = truth_of(maps)
     out = np.empty((taken.numbers.size, *shape), dn_dtype(taken.bit_depth))

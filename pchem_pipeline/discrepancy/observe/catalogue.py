@@ -6,7 +6,7 @@ statistic changes its meaning, since vectors of different versions must not be c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pchem_pipeline.effects.framework.evidence import SCORES
@@ -164,10 +164,23 @@ _TAIL = [
     Statistic("tail.high.clusters", "charge", "such samples come next to each other in the same frame"),
 ]
 
+
+class _Catalogue(dict[str, Statistic]):
+    """Statistics by name; ``name@columns=30:40`` is the one of that name in a part of the sensor or run."""
+
+    def __missing__(self, name: str) -> Statistic:
+        """Return a statistic of a part; those are no members, since there are as many as there are parts."""
+        whole, at, place = name.partition("@")
+        if not at or whole not in self:
+            raise KeyError(name)
+        known = self[whole]
+        return replace(known, name=name, sentence=f"{known.sentence} (in {place})")
+
+
 #: Every statistic by name, in the order of the vector.
-STATISTICS: dict[str, Statistic] = {
-    s.name: s for s in [*_scores(), *_GOODNESS, *_CODE, *_TAIL, *_time(), *_frame(), *_space()]
-}
+STATISTICS: dict[str, Statistic] = _Catalogue(
+    (s.name, s) for s in [*_scores(), *_GOODNESS, *_CODE, *_TAIL, *_time(), *_frame(), *_space()]
+)
 
 #: Statistics that are exact tests, never positive by chance, and by how much each event raises them (rows
 #: come by the dozen).

@@ -18,7 +18,15 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["PixelPlaces", "effect_words", "model_words", "pixel_maps", "sample_law"]
+__all__ = [
+    "PixelPlaces",
+    "effect_words",
+    "model_words",
+    "pixel_maps",
+    "place_words",
+    "sample_law",
+    "title_words",
+]
 
 
 def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.bool_]) -> PixelMaps:
@@ -149,10 +157,20 @@ def _some(maps: PixelMaps, pixels: NDArray[np.intp]) -> PixelMaps:
     return PixelMaps(*(getattr(maps, each.name)[pixels] for each in fields(PixelMaps)))
 
 
+def place_words(effect: Effect) -> str:
+    """Return in words where and when an effect acts; nothing where that is everywhere and always."""
+    return ", ".join(place.words() for place in (effect.region, effect.when) if place is not None)
+
+
 def effect_words(effect: Effect) -> str:
     """Return an effect in words, for example ``row_noise in columns 120 to 159, frames 0 to 99``."""
-    places = [place.words() for place in (effect.region, effect.when) if place is not None]
-    return f"{effect.tag} in {', '.join(places)}" if places else effect.tag
+    return effect.tag if effect.everywhere else f"{effect.tag} in {place_words(effect)}"
+
+
+def title_words(effect: Effect) -> str:
+    """Return the same with the name of the effect in the literature."""
+    title = type(effect).title or effect.tag
+    return title if effect.everywhere else f"{title} in {place_words(effect)}"
 
 
 def model_words(effects: Sequence[Effect]) -> str:

@@ -449,12 +449,18 @@ def _gaps(found: Verdict) -> Table:
     )
 
 
+def _beside(step: Step) -> str:
+    """Return what stands beside the title of an effect: where it acts, whether it is but the likeliest."""
+    place = f", in {step.place}" if step.place else ""
+    return place if step.effect else f"{place} (the likeliest)"
+
+
 def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
         (
             f"{tag}: {name}",
             measured(p.value, p.stderr, unit_text(p.unit)),
-            data.title(tag) + ("" if step.effect else " (the likeliest)"),
+            data.title(tag) + _beside(step),
             data.sources.get(tag, ""),
         )
         for step in data.found.steps

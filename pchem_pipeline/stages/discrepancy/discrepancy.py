@@ -13,6 +13,7 @@ from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.discrepancy.by_likelihood.explainer import SampleHistograms, find_in_histograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
+from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
@@ -71,6 +72,7 @@ def run(context: StageContext) -> None:
         integration_time=context.integration_time or 1.0,
         model=before,
         mapper=_Mapper(context),
+        window=SensorWindow(window.rows, window.columns, (source.shape[1], source.shape[2])),
     )
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
     found = replace(found, verdict=window.told(verdict, source.shape, places))

@@ -90,7 +90,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         lines += [f"  and {more} more"] if more > 0 else []
     if step.effect and step.parameters:
         values = [_value(name, p.value, p.stderr, p.unit) for name, p in step.parameters.items()]
-        lines += _listed(step.effect, values, 0)
+        lines += _listed(f"{step.effect} in {step.place}" if step.place else step.effect, values, 0)
     if not step.effect and found.verdict == "ambiguous":
         lines += [
             line

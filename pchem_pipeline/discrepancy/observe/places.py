@@ -1,0 +1,184 @@
+"""The leading statistics in a part of the sensor or of the run, for data and replicates alike.
+
+A part is seen as a sensor of its own: its rows and columns moved together, its frames alone, refitted from
+the fit of the whole. An effect that acts there only moves these statistics as one that acts everywhere moves
+those of the whole, which tells the two apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.observe import MINIMUM_BLOCKS, observe
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.effects.framework.registry import effect_classes
+
+__all__ = ["FEWEST_FRAMES", "FEWEST_PIXELS", "Part", "SensorWindow", "part_evidence", "part_statistics"]
+
+#: Of a part that is looked at by itself.
+FEWEST_PIXELS, FEWEST_FRAMES = 16, 64
+_LEADING = 2  # statistics of a signature that are looked at
+
+
+@dataclass(frozen=True)
+class SensorWindow:
+    """The rows and columns of a sensor that are looked at; regions are told on the sensor.
+
+    Attributes:
+        rows, columns: first, and end.
+        shape: rows and columns of the sensor.
+    """
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    shape: tuple[int, int]
+
+    @classmethod
+    def whole(cls, shape: tuple[int, ...]) -> SensorWindow:
+        """Return all of a sensor, or of frames (frame, y, x)."""
+        rows, columns = shape[-2:]
+        return cls((0, rows), (0, columns), (rows, columns))
+
+    def mask(self, region: Region | None) -> NDArray[np.bool_]:
+        """Return which pixels of the window lie in a region, (y, x)."""
+        every = np.ones(self.shape, np.bool_) if region is None else region.mask(self.shape)
+        return every[slice(*self.rows), slice(*self.columns)]
+
+    def effects(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Return effects as they act on the window, for itself a sensor; those that do not are left out."""
+        found = []
+        for effect in effects:
+            mask = self.mask(effect.region)
+            if effect.region is None or mask.all():
+                found.append(effect.at_place(None, effect.when))
+            elif mask.any():
+                found.append(effect.at_place(Region.of_mask(mask), effect.when))
+        return tuple(found)
+
+    def on_sensor(self, region: Region | None) -> Region | None:
+        """Return a region of the window as one of the sensor; without ends here it has none there."""
+        if region is None:
+            return None
+        y, x = self.rows[0], self.columns[0]
+        taps = region.taps
+        if taps is not None:
+            taps = taps.model_copy(update={"first": taps.first + (x if taps.along == "columns" else y)})
+            if taps.every is not None and taps.width == 1:
+                which = tuple(sorted((w + taps.first) % taps.every for w in taps.which))
+                taps = taps.model_copy(update={"first": 0, "which": which})
+        return region.model_copy(
+            update={
+                "rows": tuple((a + y, b + y) for a, b in region.rows),
+                "columns": tuple((a + x, b + x) for a, b in region.columns),
+                "pixels": tuple((row + y, a + x, b + x) for row, a, b in region.pixels),
+                "taps": taps,
+            }
+        )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the sensor, of the run, or of both.
+
+    Attributes:
+        region: its pixels; None: all.
+        when: its frames; None: all.
+    """
+
+    region: Region | None = None
+    when: When | None = None
+
+    @property
+    def text(self) -> str:
+        """It in one line, for the names of its statistics."""
+        return ",".join(place.text() for place in (self.region, self.when) if place is not None)
+
+    def frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which frames are its."""
+        return np.ones(numbers.size, np.bool_) if self.when is None else self.when.frames(numbers)
+
+
+def part_evidence(
+    frames: NDArray[np.unsignedinteger[Any]],
+    numbers: NDArray[np.int64],
+    maps: PixelMaps,
+    part: Part,
+    *,
+    n_run: int,
+    block_frames: int,
+    window: SensorWindow | None = None,
+) -> Evidence:
+    """Return the evidence of a part alone, with the rows and columns of the whole.
+
+    Args:
+        frames: codes (n, y, x), DN.
+        numbers: of the frames in the run, shape (n,).
+        maps: fit of all these frames.
+        part: what to look at.
+        n_run: frames of the whole run.
+        block_frames: frames of a block; shorter ones where the part has few.
+        window: of the sensor that the frames are; None: all of it.
+
+    Raises:
+        PchEmError: it holds too few frames, or no usable pixel.
+    """
+    chosen = part.frames(numbers)
+    length = min(block_frames, max(int(chosen.sum()) // (2 * MINIMUM_BLOCKS), 1))
+    stack = frames if chosen.all() else frames[chosen]
+    window = window or SensorWindow.whole(frames.shape)
+    exclude = ~(window.mask(part.region) & maps.usable)
+    return observe(stack, numbers[chosen], n_run=n_run, block_frames=length, exclude=exclude, start=maps)
+
+
+def part_statistics(
+    frames: NDArray[np.unsignedinteger[Any]],
+    numbers: NDArray[np.int64],
+    maps: PixelMaps,
+    parts: Sequence[Part],
+    *,
+    n_run: int,
+    block_frames: int,
+    window: SensorWindow | None = None,
+) -> dict[str, float]:
+    """Return the leading statistics of parts, by ``name@part``; none of a part that cannot be looked at.
+
+    Arguments as in :func:`part_evidence`.
+    """
+    found: dict[str, float] = {}
+    leading = _leading() if parts else ()
+    window = window or SensorWindow.whole(frames.shape)
+    for part in parts:
+        mask = window.mask(part.region)
+        rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+        own = PixelMaps(*(getattr(maps, each.name)[np.ix_(rows, columns)] for each in fields(PixelMaps)))
+        own = PixelMaps(
+            own.quanta_exposure,
+            own.conversion_gain,
+            own.bias,
+            own.read_noise_dn,
+            own.usable & mask[np.ix_(rows, columns)],
+        )
+        small = frames if mask.all() else frames[:, rows[:, None], columns]
+        try:
+            evidence = part_evidence(
+                small, numbers, own, Part(None, part.when), n_run=n_run, block_frames=block_frames
+            )
+        except (PchEmError, ConfigError):
+            continue
+        found |= {f"{name}@{part.text}": evidence.z[name] for name in leading if name in evidence.z}
+    return found
+
+
+def _leading() -> tuple[str, ...]:
+    """Return the leading statistics of all effects, in the order of the catalogue."""
+    wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}
+    return tuple(name for name in STATISTICS if name in wanted)

@@ -1,0 +1,144 @@
+"""Effects with a place: found where they are in frames that plain numpy made, and told on the sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, simulate_frames
+from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_statistics
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region, When
+
+SHAPE, FRAMES = (32, 32), 1500
+
+
+def camera(seed, add, shape=SHAPE, n_frames=FRAMES):
+    """Return frames of a sensor, Poisson electrons and Gaussian read noise, and ``add(rng, shape)`` DN."""
+    rng = np.random.default_rng(seed)
+    exposure = np.clip(1.5 * np.exp(0.4 * rng.standard_normal(shape)), 0.3, 5.0)
+    step, bias = rng.normal(11.0, 0.8, shape), rng.normal(100.0, 4.0, shape)
+    noise = 0.28 * np.exp(0.12 * rng.standard_normal(shape))
+    charge = rng.poisson(exposure, (n_frames, *shape))
+    x = bias + step * (charge + noise * rng.standard_normal(charge.shape))
+    return np.rint(np.clip(x + add(rng, charge.shape), 0, 4095)).astype(np.uint16)
+
+
+def rows_of_columns(rng, shape):
+    offsets = np.zeros(shape)
+    offsets[:, :, 24:29] = rng.normal(0.0, 1.2, (*shape[:2], 1))
+    return offsets
+
+
+def frames_of_quadrant(rng, shape):
+    offsets = np.zeros(shape)
+    offsets[:, 16:, :16] = rng.normal(0.0, 0.6, (shape[0], 1, 1))
+    return offsets
+
+
+def every_eighth(rng, shape):
+    offsets = np.zeros(shape)
+    offsets[:, :, 3::8] = 0.4 * (1 - 2 * (np.arange(shape[0]) % 2))[:, None, None]
+    return offsets
+
+
+def rows_of_frames(rng, shape):
+    offsets = np.zeros(shape)
+    offsets[600:760] = rng.normal(0.0, 0.7, (160, shape[1], 1))
+    return offsets
+
+
+def everywhere(rng, shape):
+    return rng.normal(0.0, 0.6, (*shape[:2], 1)) + 0.3 * np.linspace(-1, 1, shape[0])[:, None, None]
+
+
+def nothing(rng, shape):
+    return 0.0
+
+
+def parts_of(frames):
+    return suspected_parts(observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("add", "region"),
+    [
+        (rows_of_columns, Region(columns=((24, 29),))),
+        (frames_of_quadrant, Region(rows=((16, 32),), columns=((0, 16),))),
+        (every_eighth, Region.model_validate("every=8/3")),
+    ],
+)
+def test_a_part_of_the_sensor_that_differs_is_suspected(add, region, seed):
+    [part] = parts_of(camera(seed, add))
+    assert part.when is None
+    assert part.region.overlap(region, SHAPE) >= 0.8
+
+
+def test_frames_that_differ_are_suspected():
+    [part] = parts_of(camera(3, rows_of_frames))
+    assert part.region is None
+    assert part.when.overlap(When(range=((600, 760),)), FRAMES) >= 0.8
+
+
+@pytest.mark.parametrize("add", [nothing, everywhere])
+@pytest.mark.parametrize("seed", [4, 5, 6])
+def test_no_part_is_suspected_where_none_differs(add, seed):
+    assert parts_of(camera(seed, add)) == ()
+
+
+def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
+    frames = camera(7, rows_of_columns)
+    maps = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50).maps
+    part = Part(Region(columns=((24, 29),)))
+    found = part_statistics(frames, np.arange(FRAMES), maps, [part], n_run=FRAMES, block_frames=50)
+    alone = observe(
+        np.ascontiguousarray(frames[:, :, 24:29]), np.arange(FRAMES), n_run=FRAMES, block_frames=50
+    )
+    name = "space.x.rr@columns=24:29"
+    assert found[name] == pytest.approx(alone.z["space.x.rr"], rel=0.01)
+    assert found[name] > 20.0
+    assert STATISTICS[name].family == "space"
+    assert "columns=24:29" in STATISTICS[name].sentence
+    with pytest.raises(KeyError):
+        STATISTICS["nothing@columns=24:29"]
+
+
+def test_effects_are_told_on_the_sensor_and_act_in_the_window():
+    window = SensorWindow((8, 24), (4, 20), (40, 32))
+    effects = [
+        RowNoise(row_noise_dn=4.0, region="columns=10:14"),
+        RowNoise(row_noise_dn=4.0, region="columns=24:30"),
+        RowNoise(row_noise_dn=4.0, region="rows=0:30"),
+    ]
+    inside = window.effects(effects)
+    assert [e.region for e in inside] == [Region(columns=((6, 10),)), None]
+    assert window.on_sensor(Region(columns=((6, 10),))) == Region(columns=((10, 14),))
+    assert window.on_sensor(Region.model_validate("every=8/3")) == Region.model_validate("every=8/7")
+    assert window.on_sensor(None) is None
+    maps = PixelMaps(*(np.full((16, 16), v) for v in (1.5, 0.1, 100.0, 3.0)), np.ones((16, 16), bool))
+    taken = Acquisition(np.arange(60), 60, 10, 12, window=window)
+    moved = simulate_frames(maps, (effects[0],), 3, taken) != simulate_frames(maps, (), 3, taken)
+    np.testing.assert_array_equal(np.flatnonzero(moved.any(axis=(0, 1))), [6, 7, 8, 9])
+
+
+def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
+    window = SensorWindow((100, 124), (40, 72), (512, 512))
+    frames = camera(8, rows_of_columns, (24, 32), 1000)
+    settings = DiscrepancySettings(candidates=("row_noise",), replicates=30, extended_replicates=16)
+    found = find_discrepancies(frames, settings=settings, window=window)
+    assert found.verdict.verdict == "named"
+    assert found.verdict.effects == ("row_noise",)
+    [effect] = found.model
+    assert effect.region is not None
+    assert effect.region.overlap(Region(columns=((64, 69),)), (512, 512)) >= 0.8
+    [step] = found.verdict.steps
+    assert abs(effect.row_noise_dn - 1.2) < 4.0 * step.parameters["row_noise_dn"].stderr + 0.06
+    assert "in columns 64 to 68" in found.verdict.sentence
+    assert step.place == "columns 64 to 68"
