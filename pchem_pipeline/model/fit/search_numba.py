@@ -58,6 +58,7 @@ _SURE_THRESHOLDS = 4.0  # ... and, so many times the gap that counts as ambiguou
 _FEW_STEP = 3.0  # DN per electron
 _FINE_STEP = 5.0  # DN per electron: below it climbs from a neighbour also meet combs that fit whole numbers
 _CLEAR_LOBE = 3.0  # standard errors: a side lobe of the characteristic function that settles the gain
+_SURE_LOBE = 5.0  # the same where the model does not fit: other starts have only helped below 3
 _MOST_MOVES = 40
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
@@ -199,6 +200,29 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
 
 
 @kernel(inline=True)
+def _settled(
+    pixel: Pixel, theta: FloatArray, clear: bool, chi2: float, freedom: int, score: float
+) -> tuple[bool, bool]:
+    """Tell whether a maximum fits well, its gain settled, and whether other starts have a chance at all.
+
+    They have none where the fit is good, nor where it is poor and the side lobe all the same far out of the
+    noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and not the start.
+
+    Args:
+        pixel: its samples.
+        theta: the maximum.
+        clear: a side lobe of one of several samples stands clear of the noise.
+        chi2: of the goodness of fit.
+        freedom: its degrees of freedom.
+        score: as a standard normal deviate.
+    """
+    n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
+    good = score < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
+    of_the_model = n == 1 and freedom > 0 and lobe > _SURE_LOBE * math.sqrt(chi2 / max(freedom, 1))
+    return good, not (good or of_the_model)
+
+
+@kernel(inline=True)
 def expected_gap(n: float, theta: FloatArray) -> float:
     """Return how many nats the likelier neighbour (H -+ 1, mu +- 1/g) of a right answer is expected below it.
 
@@ -313,7 +337,7 @@ def search_density(
     for attempt in range(n_attempts(n)):
         clear, count = fill_starts(attempt, pixel, tools.basis, tools.evaluate, best, tools.scratch)
         used += count
-        good = False
+        unsure = True
         for _ in range(1 if n == 1 or (clear and attempt == 0) else N_KEPT):
             which = 0
             for i in range(1, N_KEPT):
@@ -339,8 +363,7 @@ def search_density(
             copy(trial, best)
             best_loglik, freedom, score = examine(pixel, tools, best, out)
             used += 1
-            settled = (n > 1 and not clear) or side_lobe(pixel, best) > _CLEAR_LOBE
-            good = score < SUSPICIOUS and settled
+            good, unsure = _settled(pixel, best, clear, out[CHI2], freedom, score)
             if n == 1:
                 expected = expected_gap(pixel.facts[0, N_FRAMES], best)
                 if good and freedom > 0 and expected > sure and best[place] > _FINE_STEP:
@@ -352,9 +375,8 @@ def search_density(
             if higher > loglik:
                 best_loglik, freedom, score = examine(pixel, tools, best, out)
                 used += 1
-                settled = (n > 1 and not clear) or side_lobe(pixel, best) > _CLEAR_LOBE
-                good = score < SUSPICIOUS and settled
-        if good:
+                good, unsure = _settled(pixel, best, clear, out[CHI2], freedom, score)
+        if not unsure:
             break
     if not best[place] > 0.0:
         return GAIN_NOT_IDENTIFIED if degenerate else FIT_NOT_CONVERGED, used, 0

@@ -98,3 +98,24 @@ def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law() -> None:
     assert (both & ambiguous).sum() > 40
     assert not (both & lower & ~ambiguous).any()
     assert (both & lower).sum() <= 8  # 14 by the maxima of the density alone, one by 17 nats
+
+
+def test_a_misfit_of_the_model_calls_for_no_other_starts() -> None:
+    # noise that grows with the signal: the fit is poor, the peaks are resolved, and no other gain is likelier
+    rng = np.random.default_rng(3)
+    n = 60
+    step, noise = rng.uniform(8, 14, n), rng.uniform(0.15, 0.28, n)
+    truth = np.stack([rng.uniform(1.5, 6, n), 1 / step, rng.uniform(95, 105, n), noise * step], 1)
+    counts, origin = drawn(rng, truth, 6000, 0.18**2)
+    settings = FitSettings(tail_guard=0.0)
+    found = fit_histograms(counts, origin, settings=settings)
+    poor = (found.fit_status & int(FitStatus.POOR_FIT)) != 0
+    assert poor.sum() > 20
+    assert np.median(found.n_iterations[poor]) < 30  # it was 80
+    for scale in (0.5, 0.71, 0.83, 1.2, 1.4, 2.0):
+        start = found.columns.copy()
+        h = start[:, 0] / scale**2
+        start[:, 2] += start[:, 0] / start[:, 1] - h * scale / start[:, 1]
+        start[:, 0], start[:, 1], start[:, 3] = h, start[:, 1] / scale, start[:, 3] * scale
+        again = fit_histograms(counts, origin, settings=settings, start=start)
+        assert not (again.log_likelihood[poor] > found.log_likelihood[poor] + 1e-6).any()
