@@ -22,7 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Hypothesis,
     fit_set,
 )
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.null import look_elsewhere, two_sided
 
 __all__ = ["Comparison", "compare", "leaves_nothing", "own_signature"]
@@ -32,6 +32,7 @@ FloatArray = NDArray[np.float64]
 _MOST_SINGLES = 7
 _MOST_OF_ONE = 3  # hypotheses of the same effect
 _MOST_SETS = 4
+_MOST_DEAR = 2  # sets whose refit takes long
 _LOOSE = 0.1  # relative error of a fingerprint before its refit
 # nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
 _FAR, _FAR_SHARE = 40.0, 0.25
@@ -91,11 +92,14 @@ def compare(
     tried: list[Refitted] = []
 
     def refit(members: Sequence[Hypothesis]) -> None:
+        dear = [one for one in tried if is_dear(one.effects)]
+        if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
+            return
         best = max((one.score for one in tried), default=-np.inf)
         tried.append(refitter.refined((*held, *members), best))
 
-    # an erratic one, whose refit looks for levels in each pixel, last: it may be beaten by then
-    for hypothesis in sorted(_singles(hypotheses, choice), key=lambda h: type(h.effect).erratic):
+    # dear ones last: they may be beaten by then
+    for hypothesis in sorted(_singles(hypotheses, choice), key=lambda h: is_dear([h.effect])):
         if not tried or not _beaten(refitter, hypothesis, max(tried, key=_worth)):
             refit((hypothesis,))
     best = max(tried, key=_worth)
@@ -184,6 +188,8 @@ def _all_seen(refitter: Refitter, one: Refitted, tried: Sequence[Refitted]) -> b
     noise = np.sqrt(np.diag(refitter.noise(one.covariance, len(one.vectors)).covariance))
     for place, hypothesis in enumerate(one.hypotheses):
         others = next((t for t in tried if t.tags == one.tags - {hypothesis.tag}), None)
+        if others is None and is_dear(h.effect for h in one.hypotheses):
+            return False
         if others is None:
             others = refitter.refined([h for h in one.hypotheses if h.tag != hypothesis.tag], one.score)
         part = one.hypotheses[place].fingerprint

@@ -9,7 +9,7 @@ by secants): an effect is judged by what is left after its best fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,12 +20,13 @@ from pchem_pipeline.discrepancy.by_simulation.maps import Refit
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["Refitted", "Refitter"]
+__all__ = ["Refitted", "Refitter", "is_dear"]
 
 FloatArray = NDArray[np.float64]
 
 _FEW = 6  # replicates at each strength on the way
 _MOST_STEPS = 5
+_STEPS_OF_DEAR = 2
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
 _LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
@@ -124,11 +125,12 @@ class Refitter:
         """
         best = now = self._simulated(tuple(hypotheses), None, replicates)
         nothing, shortened = self.nothing, 0
+        dear = is_dear(h.effect for h in hypotheses)
         for step_number in range(self.steps):
             if best.settled or best.promise < rival - _REACH - _REACH_SHARE * (rival - nothing):
                 break
-            if step_number and best.score < rival and any(type(h.effect).erratic for h in hypotheses):
-                break  # its refit looks for levels in every pixel: dear
+            if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
+                break
             step = np.clip(best.change, -_LARGEST_STEP, _LARGEST_STEP) * 0.5**shortened
             moved = _moved(best.hypotheses, step)
             if moved is None:
@@ -228,6 +230,11 @@ class Refitter:
         moved = np.abs(vectors.mean(axis=0) - null.mean) > _MOVED * null.std / np.sqrt(n)
         ratio = np.where(moved, np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0), 1.0)
         return np.asarray(null.covariance * np.outer(ratio, ratio))
+
+
+def is_dear(effects: Iterable[Effect]) -> bool:
+    """Tell whether a refit with effects takes long: those look for levels or a path in every pixel."""
+    return any(type(effect).erratic for effect in effects)
 
 
 def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothesis, ...] | None:

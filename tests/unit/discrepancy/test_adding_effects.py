@@ -87,6 +87,14 @@ def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) 
     assert world.drawn <= 6 * 7
 
 
+def test_a_dear_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.refits.is_dear", lambda _: True)
+    world = World([effect("row_noise", 2.0)])
+    found = world.refitter().refined([hypothesis("row_noise", 0.02)])
+    assert world.drawn <= 3 * 6
+    assert not found.settled
+
+
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     world = World([effect("row_noise", 0.5)])
     # frame noise helps the fingerprint of row noise out where that is extrapolated
