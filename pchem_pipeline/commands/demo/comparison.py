@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.effects.framework.compose import effect_words
 from pchem_pipeline.report.pages.discrepancy import parameter_texts
 
 if TYPE_CHECKING:
@@ -37,7 +38,9 @@ def compare(found: Verdict, hidden: Effect, truth: Maps, before: Maps, after: Ma
         after: the same of the extended model.
     """
     title = type(hidden).title
-    lines = [f"hidden was: {hidden.tag}{f' ({title})' if title else ''} - {judgement(found, hidden)}"]
+    words = f"{effect_words(hidden)}{f' ({title})' if title else ''}"
+    lines = [f"hidden was: {words} - {judgement(found, hidden)}"]
+    lines += [f"found in {s.place}" for s in found.steps if s.effect == hidden.tag and s.place]
     if type(hidden).untestable:
         lines += textwrap.wrap(f"such frames cannot show it: {type(hidden).untestable}", 100)
     return "\n".join([*lines, *_parameters(found, hidden), *_biases(truth, before, after)])

@@ -20,6 +20,7 @@ from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import read_verdict
+from pchem_pipeline.effects.framework.region import GRAMMAR, Region, When, parse_place
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.run.session import Command, run_stages
@@ -65,7 +66,7 @@ def run_hidden_demo(
 
     Args:
         output: folder for the frames, the YAML, the store and the sealed key.
-        hidden: tag of the effect, or ``random``.
+        hidden: tag of the effect, or ``random``; with ``@`` and a place or a time: it acts only there.
         size: rows and columns.
         n_frames: number of frames.
         seed: root of the random numbers; None: 1, and a new one each time for ``random``.
@@ -98,14 +99,33 @@ def _new_seed() -> int:
     return secrets.randbelow(2**31)
 
 
-def _check_tag(hidden: str) -> None:
+def _check_tag(asked: str) -> None:
+    hidden = _parted(asked)[0]
     if hidden == RANDOM:
         return
     if hidden not in effect_classes():
         known = ", ".join((*effect_classes(), RANDOM))
-        raise ConfigError(f"--hidden {hidden!r}: there is no such effect; choose one of: {known}")
+        raise ConfigError(
+            f"--hidden {hidden!r}: there is no such effect; choose one of: {known}; "
+            f"behind it @ and a place, if any: {GRAMMAR}"
+        )
     if not effect_class(hidden).typical() and hidden != "clipping":
         raise ConfigError(f"--hidden {hidden}: this effect names no typical strength to hide; choose another")
+
+
+def _parted(asked: str) -> tuple[str, Region | None, When | None]:
+    """Return the tag, place and time of ``row_noise@columns=40:50,frames=200:400``.
+
+    Raises:
+        ConfigError: the place is not of the grammar; says it.
+    """
+    tag, at, place = asked.partition("@")
+    if not at:
+        return tag, None, None
+    try:
+        return tag, *parse_place(place)
+    except ValueError as error:  # of pydantic, too
+        raise ConfigError(f"--hidden {asked}: {' '.join(str(error).split())}") from None
 
 
 def _check_folder(output: Path, asked: dict[str, Any]) -> None:
@@ -119,14 +139,23 @@ def _check_folder(output: Path, asked: dict[str, Any]) -> None:
     raise ConfigError(f"{output} {what}; choose another folder with --output")
 
 
-def hidden_effect(hidden: str, settings: SimulateSettings, truth: TruthMaps) -> Effect:
+def hidden_effect(asked: str, settings: SimulateSettings, truth: TruthMaps) -> Effect:
     """Return the effect to hide, at a strength that is clearly visible but moderate.
 
     Args:
-        hidden: its tag, or ``random`` for any effect that such frames can show, of any kind.
+        asked: its tag, or ``random`` for any effect that such frames can show, of any kind; with ``@`` and a
+            place or a time in one line.
         settings: camera, without effects.
         truth: maps of the sensor; limits of the scale are set by them.
     """
+    hidden, region, when = _parted(asked)
+    if region is not None:
+        region.mask(settings.shape)  # is it on the sensor?
+    return _everywhere(hidden, settings, truth).at_place(region, when)
+
+
+def _everywhere(hidden: str, settings: SimulateSettings, truth: TruthMaps) -> Effect:
+    """Return the effect without a place."""
     rng = np.random.default_rng([settings.seed, 0x5EA1ED])
     if hidden != RANDOM:
         kinds = list(effect_class(hidden).typical())

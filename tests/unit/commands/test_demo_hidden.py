@@ -16,6 +16,7 @@ from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands.demo import hidden
 from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement
 from pchem_pipeline.commands.demo.hidden import RANDOM, SEALED_KEY, hidden_effect, run_hidden_demo
+from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -43,6 +44,20 @@ def test_every_effect_can_be_hidden(tag: str) -> None:
     effect = hidden_effect(tag, SETTINGS, draw_truth(SETTINGS))
     assert effect.tag == tag
     hidden._check_tag(tag)
+
+
+def test_an_effect_can_be_hidden_in_a_place() -> None:
+    effect = hidden_effect("row_noise@columns=2:5,frames=10:20", SETTINGS, draw_truth(SETTINGS))
+    assert effect.tag == "row_noise"
+    assert effect.region == Region(columns=((2, 5),))
+    assert effect.when == When(range=((10, 20),))
+    assert hidden_effect("random@columns=2:5", SETTINGS, draw_truth(SETTINGS)).region == effect.region
+    with pytest.raises(ConfigError, match="columns=A:B"):
+        hidden._check_tag("row_noise@colums=2:5")
+    with pytest.raises(ConfigError, match="no such effect"):
+        hidden._check_tag("rownoise@columns=2:5")
+    with pytest.raises(ConfigError, match="the sensor has"):
+        hidden_effect("row_noise@columns=2:9000", SETTINGS, draw_truth(SETTINGS))
 
 
 def test_random_hides_any_that_can_be_seen() -> None:
