@@ -103,7 +103,8 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
         lines += _criteria(answer["criteria"])
     if numbers["headline"]:
         lines += ["", *_headline(numbers["headline"])]
-    cautions = [flag for flag in numbers["flags"] if flag["level"] == "caution"]
+    told = " ".join(answer["text"] for answer in numbers["answers"])
+    cautions = [f for f in numbers["flags"] if f["level"] == "caution" and f["text"] not in told]
     lines += [line for flag in cautions for line in _wrapped(f"Caution: {flag['text']}", "  ", "")]
     lines.append("")
     for i, step in enumerate(numbers["next"]):

@@ -57,8 +57,8 @@ def joint(tmp_path_factory, kernels):
         camera(folder, f"dark_{seconds:g}s", 10 + seed, seconds)
     camera(folder, "bias", 20, 0.001, dead=1.0)
     shell = Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    [command] = re.findall(r"```shell\n(pchem joint .*)\n```", readme)
+    manual = (ROOT / "docs" / "howto" / "several_exposures.md").read_text(encoding="utf-8")
+    [command] = re.findall(r"^\$ (pchem joint .*)$", manual, re.MULTILINE)
     result = shell.ok(*command.split()[1:])
     assert result.stdout.strip() == str(folder.resolve() / "dark.zarr" / "report.html")
     return folder
@@ -338,7 +338,7 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, settin
         (joint / f"{name}.yaml").write_text(f"run: {{store: {name}.zarr, tile: 8}}\n{text}\n")
     path = write(joint, "bad", samples, **settings)
     with pytest.raises(PchEmError) as caught:
-        run_joint(find_joint([path])[0], QUIET)
+        run_joint(find_joint([path])[0], QUIET, print)
     message = str(caught.value)
     assert words in message
     assert "\n" not in message
@@ -350,11 +350,11 @@ def test_a_refused_list_leaves_its_name_free(joint):
     for runs in (["dark_2s.yaml", "dark_1s.yaml"], ["dark_1s.yaml", "dark_1s.zarr"]):
         target, is_new = find_joint([joint / run for run in runs], store=store)
         with pytest.raises(ConfigError, match=r"is not above|is the run of"):
-            run_joint(target, QUIET, is_new=is_new)
+            run_joint(target, QUIET, print, is_new=is_new)
         assert not store.with_suffix(".yaml").exists()
     kept = write(joint, "kept", [("dark_2s.zarr", ""), ("dark_1s.zarr", "")])
     with pytest.raises(ConfigError):
-        run_joint(find_joint([kept])[0], QUIET)
+        run_joint(find_joint([kept])[0], QUIET, print)
     assert kept.exists()
 
 
