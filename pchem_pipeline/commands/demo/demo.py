@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
@@ -48,7 +48,12 @@ def run_demo(output: Path, *, size: int, n_frames: int, seed: int, quiet: bool =
     target = find_run(path)
     run_stages(target, pipeline_of(target.config), Command(quiet=quiet))
     table = comparison_table(RunStore.open(target.store))
-    return f"{table}\n\nreport: {target.store / 'report.html'}"
+    place = quoted(target.store)
+    return (
+        f"{table}\n\nreport: {target.store / 'report.html'}\n\n"
+        f"use it: pchem apply {place} FRAMES --output OUT    (other frames in electrons, with errors)\n"
+        f"        pchem twin {place} --output camera.yaml    (this camera, to simulate other scenes)"
+    )
 
 
 def comparison_table(store: RunStore) -> str:
