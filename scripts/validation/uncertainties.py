@@ -36,8 +36,7 @@ prepare_environment()
 from pchem_pipeline.model.checks.multiple_testing import false_discovery  # noqa: E402
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
-from pchem_pipeline.model.fit.intervals import quantile_of  # noqa: E402
-from pchem_pipeline.model.fit.result import FitResult  # noqa: E402
+from pchem_pipeline.model.fit.result import FitResult, quantile_of  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 from pchem_pipeline.model.fit.status import FitStatus  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402

@@ -15,8 +15,7 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, ensemble_sums
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.intervals import quantile_of
-from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import pcd_mass

@@ -41,3 +41,8 @@ def test_a_system_without_the_module_resource_is_no_reason_to_fail(monkeypatch):
 )
 def test_files_of_the_package_are_those_that_a_wheel_takes(name):
     assert (ROOT / "pchem_pipeline" / name).exists()
+
+
+def test_no_folder_has_more_than_twenty_files():
+    folders = {path.parent for path in (ROOT / "pchem_pipeline").rglob("*.py")}
+    assert not [str(each) for each in folders if len(list(each.glob("*.py"))) > 20]

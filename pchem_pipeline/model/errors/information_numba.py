@@ -161,7 +161,7 @@ def grouped_trace(
 
     The trace of the groups' Fisher information times the covariance of the estimates: 4 where grouping
     loses nothing, 0 where the groups say nothing. Groups are those of
-    :func:`~pchem_pipeline.model.fit.goodness_numba.pearson`.
+    :func:`~pchem_pipeline.model.fit.search_numba.pearson`.
 
     Args:
         first: first occupied DN, shape (n,).

@@ -15,8 +15,7 @@ from pchem_pipeline.model.fit import engine, guard_numba, profile_numba, search_
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 from pchem_pipeline.model.fit.guard import fit_guarded
-from pchem_pipeline.model.fit.intervals import quantile_of
-from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.rounding import biased_by_rounding
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus

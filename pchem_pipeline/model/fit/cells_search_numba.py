@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, same_place, sensible
-from pchem_pipeline.model.fit.goodness_numba import normal_score
 from pchem_pipeline.model.fit.satellites_numba import fill_core, search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
@@ -28,6 +27,7 @@ from pchem_pipeline.model.fit.search_numba import (
     from_start,
     judge,
     loglik_without_gain,
+    normal_score,
 )
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,

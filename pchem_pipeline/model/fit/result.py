@@ -1,4 +1,4 @@
-"""What a fit finds of a batch of pixels."""
+"""What a fit finds of a batch of pixels, and the names and quantiles of confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from pchem_pipeline.model.fit.status import describe
 
 __all__ = ["FitResult", "html_table"]
 
 FloatArray = NDArray[np.float64]
+
+#: What has an interval, in the order of the axis ``quantity``.
+INTERVAL_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 
 
 #: Fits that a notebook shows.
@@ -124,3 +128,13 @@ class FitResult:
                 arrays[each.name] = mine.copy()
                 arrays[each.name][pixels] = theirs
         return replace(self, **arrays)
+
+
+def quantile_of(level: float) -> float:
+    """Return z such that a standard normal lies within -+ z with probability ``level``.
+
+    Example:
+        >>> round(quantile_of(0.95), 3)
+        1.96
+    """
+    return float(ndtri(0.5 * (1.0 + level)))

@@ -14,7 +14,7 @@ from helpers.reference_pchem import Theta, e_step, em, log_likelihood
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.errors import algebra_numba
-from pchem_pipeline.model.fit import climb_numba, goodness_numba, starts_numba
+from pchem_pipeline.model.fit import climb_numba, search_numba, starts_numba
 from pchem_pipeline.model.law import density_numba, pixel_numba, simd_math_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
@@ -302,15 +302,15 @@ def test_chi_square_merges_to_five_and_keeps_the_total() -> None:
     seen = np.array([0.0, 3, 9, 30, 41, 25, 12, 4, 1])
     expected = np.array([1.0, 3, 10, 28, 40, 20, 13, 3.5, 0.5])  # 119 of 120 inside the window
     groups = [(12, 14), (30, 28), (41, 40), (25, 20), (12, 13), (5, 5)]
-    chi2, freedom = goodness_numba.pearson(seen, expected, 9, 120.0)
+    chi2, freedom = search_numba.pearson(seen, expected, 9, 120.0)
     assert freedom == 1
     assert chi2 == pytest.approx(sum((o - e) ** 2 / e for o, e in groups))
-    assert goodness_numba.pearson(seen[:5], expected[:5], 5, 82.0)[1] == 0
+    assert search_numba.pearson(seen[:5], expected[:5], 5, 82.0)[1] == 0
     wide_seen, wide_expected = np.full(20, 10.0), np.full(20, 10.0)
     wide_seen[3] = 16
-    assert goodness_numba.pearson(wide_seen, wide_expected, 20, 200.0) == (pytest.approx(3.6), 15)
-    assert goodness_numba.normal_score(15.0, 15) == pytest.approx(0.0, abs=0.2)
-    assert goodness_numba.normal_score(60.0, 15) > 4
+    assert search_numba.pearson(wide_seen, wide_expected, 20, 200.0) == (pytest.approx(3.6), 15)
+    assert search_numba.normal_score(15.0, 15) == pytest.approx(0.0, abs=0.2)
+    assert search_numba.normal_score(60.0, 15) > 4
 
 
 def test_no_kernel_lets_the_compiler_choose_the_bits() -> None:

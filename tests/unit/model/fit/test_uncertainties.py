@@ -15,8 +15,7 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.intervals import INTERVAL_NAMES, quantile_of
-from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.pcd import log_pcd
 from pchem_pipeline.stages.fit.fit import fit_tile
