@@ -56,6 +56,7 @@ _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _BATCH = 1 << 19  # masses at once
 _MAD = 1.4826
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
+_WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
 _ARRIVED = 0.2  # nats, twice the rise that a further step promises: more, and a point is no maximum
 _APART = 4.0  # squared standard deviations between two maxima
 _RARE = 0.003
@@ -110,11 +111,15 @@ class Posterior:
         every = np.arange(n)
         covariance = self.covariance[chosen, every]
         root = np.linalg.cholesky(covariance)
-        theta = self.theta[chosen, every] + np.einsum("nab,nb->na", root, rng.standard_normal((n, 4)))
+        theta = self.theta[chosen, every].copy()
+        # mu is free: what is far from Gaussian where hardly anything is known are the logarithms
+        widest = np.array([_WIDEST_DRAW, 0.2 * _WIDEST_DRAW, np.inf, _WIDEST_DRAW])
+        off = np.einsum("nab,nb->na", root, rng.standard_normal((n, 4)))
         sizes, axes = np.linalg.eigh(self.population.uncertainty)
         moved = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * rng.standard_normal(4))
         # each pixel follows the centre by as much as its own samples leave open
-        theta += covariance @ np.linalg.solve(self.population.scatter, moved)
+        off += covariance @ np.linalg.solve(self.population.scatter, moved)
+        theta += np.clip(off, -widest, widest)
         return to_parameters(_inside(theta))
 
 
@@ -178,7 +183,9 @@ def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Po
     information = np.zeros((1, *covariance.shape))
     information[0, known] = np.linalg.inv(error[known] + 1e-12 * np.eye(4))
     shape = (1, len(theta))
-    maxima = _Maxima(theta[None], np.zeros(shape), np.zeros((*shape, 4)), information, np.ones(len(theta)))
+    maxima = _Maxima(
+        theta[None], np.zeros(shape), np.zeros((*shape, 4)), information, np.ones(len(theta)), parabolic=True
+    )
     return maxima.posterior(_expectation_maximisation(maxima, population))
 
 
@@ -219,7 +226,8 @@ class _Pixels:
 class _Maxima:
     """Parabolas of the log-likelihood about theta, shapes (j, n, ...), and each pixel's widening of T.
 
-    ``evidence`` is the logarithm of each pixel's marginal likelihood as of the last solution, shape (n,).
+    ``evidence`` is the logarithm of each pixel's marginal likelihood as of the last solution, shape (n,);
+    ``parabolic`` likelihoods are parabolas everywhere, so that one step arrives.
     """
 
     theta: FloatArray
@@ -228,6 +236,7 @@ class _Maxima:
     information: FloatArray
     widening: FloatArray
     evidence: FloatArray = field(default_factory=lambda: np.zeros(0))
+    parabolic: bool = False
 
     def solve(self, population: Population) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return posterior mean (j, n, 4), covariance (j, n, 4, 4) and weight (j, n) under a population."""
@@ -240,11 +249,14 @@ class _Maxima:
         evidence = self.value - 0.5 * np.einsum("jna,nab,jnb->jn", off, prior, off)
         evidence += 0.5 * (slope * step).sum(axis=2) + 0.5 * np.linalg.slogdet(covariance)[1]
         self.evidence = np.logaddexp.reduce(evidence, axis=0) + 0.5 * np.linalg.slogdet(prior)[1]
-        evidence = np.where(np.isfinite(evidence), evidence, -1e300)
+        arrived = ((slope * step).sum(axis=2) < _ARRIVED) | self.parabolic
+        counts = _distinct(self.theta + step, covariance, arrived) > 0.0
+        # the first maximum always counts, however unlikely the others make it
+        evidence = np.where(counts & np.isfinite(evidence), evidence, -1e300)
         weight = np.exp(evidence - evidence.max(axis=0))
-        arrived = (slope * step).sum(axis=2) < _ARRIVED
-        weight *= _distinct(self.theta + step, covariance, arrived)
-        return self.theta + step, covariance, weight / weight.sum(axis=0)
+        # a step from where the climb has not arrived leads anywhere
+        theta = self.theta + np.where(arrived[:, :, None], step, 0.0)
+        return theta, covariance, weight / weight.sum(axis=0)
 
     def likely(self, population: Population) -> FloatArray:
         """Return the maxima without those kinds that hardly a pixel has, shape (i, n, 4)."""
