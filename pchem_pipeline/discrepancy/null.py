@@ -203,7 +203,6 @@ def disagrees(
     z: Measured,
     significance: float,
     tolerance: FloatArray | float = 0.0,
-    among: NDArray[np.bool_] | None = None,
 ) -> bool:
     """Tell whether some statistic deviates more than chance allows, and does so in both splits.
 
@@ -213,7 +212,6 @@ def disagrees(
         significance: allowed probability of a chance, anywhere among the statistics.
         tolerance: deviation that is not held against the model, shape (m,): effects that it has are never
             known in every detail.
-        among: the statistics that count, shape (m,); None: all.
     """
     p = _p_values(null, z, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
@@ -221,8 +219,6 @@ def disagrees(
     alone = [two_sided(pull, null.freedom) < _REPLICATION for pull in pulls]
     same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
-    if among is not None:
-        same &= among
     return bool(np.any(same & (p < limit)))
 
 

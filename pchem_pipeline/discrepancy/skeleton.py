@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees, free_of_parameters
+from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.discrepancy.where import locate
@@ -104,9 +104,7 @@ def search(by: Explainer[Explanation]) -> Discrepancy:
     places = locate(evidence, first, z.both, significance)
     null, rounds = first, 0
     doubt = by.doubt()
-    # where the pixels are not identified only what does not rest on their parameters counts
-    among = free_of_parameters(first.names) if doubt else None
-    still = disagrees(null, z, significance, among=among)
+    still = disagrees(null, z, significance)
     wanted = still or (not doubt and by.suspects(null, z))
     while wanted and rounds < by.most_rounds:
         explanation = by.explain(null, z, still)
@@ -114,10 +112,10 @@ def search(by: Explainer[Explanation]) -> Discrepancy:
         if extended is None:
             break
         null, rounds = extended, rounds + 1
-        wanted = still = disagrees(null, z, significance, by.tolerance(), among)
+        wanted = still = disagrees(null, z, significance, by.tolerance())
     described = by.describe(before, null, z) if still else None
     if described is not None:
-        null, still = described, disagrees(described, z, significance, by.tolerance(), among)
+        null, still = described, disagrees(described, z, significance, by.tolerance())
     added = by.close(before, null, z, still)
     found = Findings(by.samples, z, first, null, before, places, still, added, doubt)
     model = found.model(present, by.model)

@@ -46,7 +46,7 @@ from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate, by_part
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, suspicious
+from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
@@ -283,6 +283,9 @@ class FrameExplainer:
         parts = splits.train, splits.test, splits.final
         own = [self.frames.statistics(part, e) for part, e in zip(parts, self.evidence, strict=True)]
         names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
+        if self.doubt():
+            # where the pixels are not identified only what does not rest on their parameters counts
+            names = tuple(np.array(names)[free_of_parameters(names)].tolist())
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
         n_samples = self.frames.splits.final.size * int(self.evidence[0].maps.usable.sum())
         self.gaps = StatisticsGap(self.first, n_samples)
