@@ -160,7 +160,7 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path,
     ("old", "new", "message"),
     [
         ("[row_noise, frame_noise]", "[row_nois]", "unknown effects row_nois"),
-        ("n_frames: 1800", "n_frames: 500", "take more frames"),
+        ("n_frames: 1800", "n_frames: 250", "take more frames"),
         ("shape: [16, 16]", "shape: [4, 4]", "fewer than 32"),
     ],
 )

@@ -18,7 +18,6 @@ from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
-from pchem_pipeline.store.zarr_store import foreign_codecs
 
 __all__ = ["ZarrReader", "write_frames"]
 
@@ -48,6 +47,8 @@ class ZarrReader(FrameReader):
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         import zarr
+
+        from pchem_pipeline.store.zarr_store import foreign_codecs
 
         _check_links(path)
         node = zarr.open(path, mode="r")

@@ -18,6 +18,8 @@ def test_the_public_names_are_these():
         "PchEmError",
         "RunStore",
         "__version__",
+        "characterise",
+        "fit_counts",
         "fit_histograms",
         "open_run",
     }

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.places import TESTS
-from hidden.chain import ALL, LIBRARY, OUTSIDE, UNTESTABLE, hide
+from hidden.chain import ALL, DECOYS, LIBRARY, OUTSIDE, UNTESTABLE, hide
 
 HIDDEN = TESTS / "hidden"
 SHAPE, FRAMES = (24, 20), 500
@@ -319,7 +319,8 @@ def test_every_effect_is_there_and_checked():
     }
     assert set(LIBRARY) == set(" ".join(named).split())
     assert len(OUTSIDE) >= 3
-    assert set(ALL) == set(LIBRARY) | set(UNTESTABLE) | set(OUTSIDE)
+    assert set(ALL) == set(LIBRARY) | set(UNTESTABLE) | set(OUTSIDE) | set(DECOYS)
+    assert len(DECOYS) >= 20
 
 
 def test_the_sensor_does_not_depend_on_what_is_hidden():
