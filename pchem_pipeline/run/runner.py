@@ -74,9 +74,7 @@ def _perform(
     context.fingerprint = old.fingerprint if resumes and old is not None else fingerprint_of(content)
     context.fresh = not resumes and not context.is_prepared
     if context.fresh:
-        records.forget(stage.name)
-        for path in stage.writes:
-            context.store.delete(path)
+        records.unmark_all(stage.name)
     record = StageRecord(
         stage.name,
         stage.version,
@@ -87,7 +85,11 @@ def _perform(
         versions=_versions(),
     )
     record = replace(record, model=rests_on(record, context.store))
+    # markers went first and arrays go last: a stage that is killed in between is still known to have begun
     records.write(record)
+    if context.fresh:
+        for path in stage.writes:
+            context.store.delete(path)
     context.reporter.event("start", stage=stage.name, why=before.words())
     wall, cpu = clock
     try:

@@ -85,6 +85,10 @@ class Records:
     def forget(self, stage: str) -> None:
         """Drop the record and all markers of a stage."""
         remove_file(self._folder / "stages" / f"{stage}.json")
+        self.unmark_all(stage)
+
+    def unmark_all(self, stage: str) -> None:
+        """Drop all markers of a stage, which has its record still."""
         remove_folder(self._folder / "done" / stage)
         self._forgotten()
 

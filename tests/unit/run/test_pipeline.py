@@ -247,6 +247,26 @@ def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
     assert again.store.read("fit/bias")[0, 0] == 9
 
 
+@pytest.mark.parametrize("moment", ["unmark_all", "write", "delete"])
+def test_a_stage_killed_while_it_begins_anew_is_still_known(make, monkeypatch, moment):
+    for name in ("fit", "maps"):
+        execute(name, make("fit: {gap_threshold: 3}"))
+    owner = RunStore if moment == "delete" else type(make().store.records)
+    real = getattr(owner, moment)
+
+    def killed(*arguments):
+        raise SystemExit
+
+    monkeypatch.setattr(owner, moment, killed)
+    with pytest.raises(SystemExit):
+        execute("fit", make("fit: {gap_threshold: 7}"))
+    monkeypatch.setattr(owner, moment, real)
+    assert status(FAKES["fit"], make("fit: {gap_threshold: 7}")).state != "missing"
+    for name in ("fit", "maps"):
+        assert execute(name, make("fit: {gap_threshold: 7}")).state == "complete"
+    np.testing.assert_array_equal(make().store.read("maps/bias")[0], 14)
+
+
 def test_the_total_is_known_while_a_stage_runs(make):
     context, totals = make(), []
 
