@@ -21,6 +21,7 @@ __all__ = [
     "load_config",
     "make_config",
     "parse_config",
+    "present_keys",
     "setting_of",
     "yaml_content",
 ]
@@ -116,7 +117,9 @@ def make_config(content: Mapping[str, Any], name: str, folder: Path | None = Non
         ConfigError: a setting is wrong.
     """
     try:
-        settings = _of_earlier_version(_renamed(content, name), name)
+        renamed, lines = present_keys(content)
+        sys.stderr.writelines(f"pchem: {name}: {line}\n" for line in lines)
+        settings = _of_earlier_version(renamed, name)
         return RunConfig.model_validate(settings, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(f"{name}: {complaints(error)}") from error
@@ -126,24 +129,26 @@ def make_config(content: Mapping[str, Any], name: str, folder: Path | None = Non
 _OLD_KEYS: Mapping[str, str | None] = {
     "discrepancy.grown_replicates": "discrepancy.extended_replicates",
     "discrepancy.material": None,
+    "fit.allowed_failed_fraction": None,  # run.allowed_failed_pixels is read
 }
 
 
-def _renamed(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Rename keys of version 0.1 to those of now; write a line about each to stderr."""
+def present_keys(content: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return settings under the keys of now, and a line about each key of version 0.1 among them."""
     result = {key: dict(value) if isinstance(value, dict) else value for key, value in content.items()}
+    lines: list[str] = []
     for old, new in _OLD_KEYS.items():
         section, key = old.split(".")
         if not isinstance(result.get(section), dict) or key not in result[section]:
             continue
         value = result[section].pop(key)
         if new is None:
-            sys.stderr.write(f"pchem: {name}: {old} did nothing and is gone; remove it\n")
+            lines.append(f"{old} did nothing and is gone; remove it")
             continue
-        sys.stderr.write(f"pchem: {name}: {old} is now called {new}\n")
+        lines.append(f"{old} is now called {new}")
         section, key = new.split(".")
         result.setdefault(section, {}).setdefault(key, value)
-    return result
+    return result, lines
 
 
 def _of_earlier_version(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.config.load import present_keys
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
@@ -295,12 +296,14 @@ def model_of_content(store: RunStore, content: dict[str, Any]) -> ModelVersion |
 
 
 def present_content(store: RunStore, content: dict[str, Any]) -> dict[str, Any]:
-    """Return what decided a result as this version of the program says it: 0.1 had no versions of the model.
+    """Return what decided a result as this version of the program says it, keys of settings included.
 
-    There the fit read the section of the YAML and the digest of the arrays, the search a list of effects.
+    0.1 had no versions of the model: there the fit read the section of the YAML and the digest of the arrays,
+    the search a list of effects.
     """
     given = dict(content.get("input") or {})
-    settings = dict(content.get("settings") or {})
+    settings, _ = present_keys(content.get("settings") or {})
+    content = {**content, "settings": settings}
     if content.get("stage") == "fit" and "model" in settings:
         given["model"] = _digest(_section(settings.pop("model")), given.pop("added_exposure", None))
         return {**content, "settings": settings, "input": given}

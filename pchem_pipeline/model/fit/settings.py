@@ -84,9 +84,3 @@ class FitSettings(Section):
     minimum_quanta_exposure: float = Field(
         default=1e-4, gt=0, le=0.1, description="e-: lower bound of the quanta exposure in the fit"
     )
-    allowed_failed_fraction: float = Field(
-        default=0.05,
-        ge=0,
-        le=1,
-        description="the run ends with exit code 3 when a larger fraction of the pixels could not be fitted",
-    )

@@ -304,6 +304,7 @@ def as_of_0_1(folder: Path, **more: Any) -> None:
     assert model is not None
     old = fit["fingerprint"]
     fit["content"]["settings"]["model"] = model.model
+    fit["content"]["settings"]["fit"]["allowed_failed_fraction"] = 0.05  # a key that is gone
     del fit["content"]["input"]["model"]
     fit["content"]["input"] |= more
     new = fingerprint_of(fit["content"])
