@@ -362,7 +362,10 @@ def demo(
     ] = None,
     hidden: Annotated[
         str | None,
-        typer.Option(help="hide this effect (a tag, or random: not told before the end) and search for it"),
+        typer.Option(
+            help="hide this effect (a tag, or random: not told before the end) and search for it; in a part "
+            "of the sensor or of the run: row_noise@columns=40:50"
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

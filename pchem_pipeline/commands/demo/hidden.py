@@ -149,9 +149,16 @@ def hidden_effect(asked: str, settings: SimulateSettings, truth: TruthMaps) -> E
         truth: maps of the sensor; limits of the scale are set by them.
     """
     hidden, region, when = _parted(asked)
+    share = 1.0
     if region is not None:
-        region.mask(settings.shape)  # is it on the sensor?
-    return _everywhere(hidden, settings, truth).at_place(region, when)
+        share *= float(region.mask(settings.shape).mean())  # refuses what is not on the sensor
+    if when is not None:
+        share *= when.share(np.arange(settings.n_frames))
+    effect = _everywhere(hidden, settings, truth)
+    if effect.strength and 0.0 < share < 1.0:
+        # as visible as everywhere: the errors of its statistics grow like that with fewer samples
+        effect = effect.scaled(share**-0.5)
+    return effect.at_place(region, when)
 
 
 def _everywhere(hidden: str, settings: SimulateSettings, truth: TruthMaps) -> Effect:

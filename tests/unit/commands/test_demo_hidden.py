@@ -49,6 +49,8 @@ def test_every_effect_can_be_hidden(tag: str) -> None:
 def test_an_effect_can_be_hidden_in_a_place() -> None:
     effect = hidden_effect("row_noise@columns=2:5,frames=10:20", SETTINGS, draw_truth(SETTINGS))
     assert effect.tag == "row_noise"
+    everywhere = hidden_effect("row_noise", SETTINGS, draw_truth(SETTINGS)).model_dump()["row_noise_dn"]
+    assert effect.model_dump()["row_noise_dn"] == pytest.approx(everywhere * (4 * 6) ** 0.5)
     assert effect.region == Region(columns=((2, 5),))
     assert effect.when == When(range=((10, 20),))
     assert hidden_effect("random@columns=2:5", SETTINGS, draw_truth(SETTINGS)).region == effect.region
