@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble import ensemble_numba
-from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
@@ -192,7 +191,7 @@ def curve_errors(
     """
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
     plain = np.stack(pixels.columns(), axis=1)
-    information_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
+    ensemble_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
     ones, zeros = np.ones(len(pixels)), np.zeros(len(pixels))
     corrected = np.stack([pixels.quanta_exposure, ones, zeros, pixels.read_noise_e], axis=1)
     slope = np.zeros((len(pixels), 4, 4))
@@ -200,7 +199,7 @@ def curve_errors(
     slope[:, 3, 1], slope[:, 3, 3] = pixels.read_noise_dn, pixels.conversion_gain
     known = np.where(np.isfinite(covariance), covariance, 0.0)
     moved = slope @ known @ np.swapaxes(slope, 1, 2)
-    information_numba.curve_variance(corrected, moved, nuced.start * nuced.width, nuced.width, bins)
+    ensemble_numba.curve_variance(corrected, moved, nuced.start * nuced.width, nuced.width, bins)
     return raw, bins
 
 

@@ -18,6 +18,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 __all__ = [
     "add_density",
     "add_mass",
+    "curve_variance",
     "poisson_weights",
     "sum_nuced_cells",
     "sum_nuced_product",
@@ -183,6 +184,94 @@ def _add_nuced(
     if 0 <= bin_open < nuced.size:
         nuced[bin_open] += held
         nuced_square[bin_open] += held * held
+
+
+@kernel
+def curve_variance(
+    parameters: FloatArray, covariance: NDArray[np.float64], x0: float, pitch: float, out: FloatArray
+) -> None:
+    """Add every pixel's variance of its density at ``x0 + i pitch`` by the delta method to ``out[i]``.
+
+    ``d f = D' d theta`` with the slopes D of the density in (H, g, mu, sigma), so the variance is ``D' C D``.
+
+    Args:
+        parameters: (H, g, mu, sigma), shape (n, 4); all known.
+        covariance: of the estimates, shape (n, 4, 4); entries that are NaN count as 0.
+        x0: first place, in the unit of the bias.
+        pitch: between places.
+        out: in and out, shape (m,).
+    """
+    weights = np.zeros(_capacity(parameters[:, 0]))
+    slopes = np.zeros((out.size, 4))
+    known = np.zeros((4, 4))
+    for p in range(parameters.shape[0]):
+        exposure, step = parameters[p, 0], 1.0 / parameters[p, 1]
+        bias, sigma = parameters[p, 2], parameters[p, 3]
+        for i in range(4):
+            for j in range(4):
+                entry = covariance[p, i, j]
+                known[i, j] = entry if math.isfinite(entry) else 0.0
+        low, high = poisson_weights(exposure, weights)
+        reach = REACH * sigma
+        first = max(0, math.ceil((bias + low * step - reach - x0) / pitch))
+        last = min(out.size - 1, math.floor((bias + high * step + reach - x0) / pitch))
+        for k in range(low, high + 1):
+            rise = k / exposure - 1.0 if exposure > 0.0 else 0.0
+            _add_slopes(slopes, x0, pitch, weights[k], rise, k * step * step, bias + k * step, sigma)
+        for i in range(first, last + 1):
+            for row in range(4):
+                for column in range(4):
+                    out[i] += slopes[i, row] * known[row, column] * slopes[i, column]
+            slopes[i] = 0.0
+
+
+@kernel
+def _add_slopes(
+    slopes: NDArray[np.float64],
+    x0: float,
+    pitch: float,
+    weight: float,
+    rise: float,
+    shift: float,
+    centre: float,
+    sigma: float,
+) -> None:
+    """Add a component's slopes in (H, g, mu, sigma) at ``x0 + i pitch``.
+
+    Args:
+        slopes: in and out, shape (m, 4).
+        x0: first place.
+        pitch: between places.
+        weight: of the component.
+        rise: of the logarithm of the weight with H.
+        shift: by which the centre falls as g rises by one.
+        centre: of the component.
+        sigma: of the component.
+    """
+    reach = REACH * sigma
+    first = max(0, math.ceil((centre - reach - x0) / pitch))
+    last = min(slopes.shape[0] - 1, math.floor((centre + reach - x0) / pitch))
+    if first > last:
+        return
+    nearest = min(max(math.floor((centre - x0) / pitch + 0.5), first), last)
+    precision = 1.0 / (sigma * sigma)
+    distance = x0 + nearest * pitch - centre
+    peak = weight * 0.3989422804014327 / sigma * math.exp(-0.5 * distance * distance * precision)
+    shrink = math.exp(-precision * pitch * pitch)
+    for side in (1, -1):
+        value, ratio = peak, math.exp(-(side * distance + 0.5 * pitch) * pitch * precision)
+        i = nearest
+        while first <= i <= last:
+            if side > 0 or i < nearest:
+                e = x0 + i * pitch - centre
+                pull = value * e * precision
+                slopes[i, 0] += value * rise
+                slopes[i, 1] -= pull * shift
+                slopes[i, 2] += pull
+                slopes[i, 3] += (pull * e - value) / sigma
+            value *= ratio
+            ratio *= shrink
+            i += side
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The score of single samples: what sandwich errors, the calibration of chi-square and curves are made of.
+"""The score of single samples: what sandwich errors and the calibration of chi-square are made of.
 
 The score of a sample x is the posterior mean of the complete-data score (Louis 1982): it is ``E[k] - H``,
 ``E[k e]/s2``, ``E[e]/s2`` and ``-1/2 + E[e^2]/(2 s2)`` in (log H, 1/g, mu, log s2), ``e = x - mu - k/g``.
@@ -209,43 +209,6 @@ def _form(vector: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
             if math.isfinite(matrix[i, j]):
                 found += vector[i] * matrix[i, j] * vector[j]
     return found
-
-
-@kernel
-def curve_variance(
-    parameters: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    x0: float,
-    pitch: float,
-    out: NDArray[np.float64],
-) -> None:
-    """Add every pixel's variance of its density at ``x0 + i pitch`` by the delta method to ``out[i]``.
-
-    ``d f = f S' d theta`` with the score S of a sample there, so the variance is ``f^2 S' C S``.
-
-    Args:
-        parameters: (H, g, mu, sigma), shape (n, 4); all known.
-        covariance: of the estimates, shape (n, 4, 4); entries that are NaN count as 0.
-        x0: first place, in the unit of the bias.
-        pitch: between places.
-        out: in and out, shape (m,).
-    """
-    score = np.empty(4)
-    for p in range(parameters.shape[0]):
-        exposure, gain = parameters[p, 0], parameters[p, 1]
-        bias, sigma = parameters[p, 2], parameters[p, 3]
-        spread = 9.0 * math.sqrt(exposure) + 9.0
-        low = bias + max(exposure - spread, 0.0) / gain - 9.0 * sigma
-        high = bias + (exposure + spread) / gain + 9.0 * sigma
-        start = max(0, math.floor((low - x0) / pitch))
-        stop = min(out.size - 1, math.ceil((high - x0) / pitch))
-        if start > stop:
-            continue
-        weights = log_poisson(exposure, _size(exposure, gain, x0 + stop * pitch - bias))
-        for i in range(start, stop + 1):
-            logged = sample_score(x0 + i * pitch, parameters[p], weights, score)
-            if logged > -40.0:
-                out[i] += math.exp(2.0 * logged) * _form(score, covariance[p])
 
 
 @kernel

@@ -12,6 +12,7 @@ from scipy.special import gammaln, logsumexp
 from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
+from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
@@ -170,15 +171,39 @@ def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, fl
 def test_loops_are_the_same_compiled_and_plain() -> None:
     pixel, at, covariance = fitted(CASES[1])
     at, covariance = at[None], covariance[None]
-    for name, arguments, shape in (
-        ("curve_variance", (at, covariance, 90.0, 1.0), (40,)),
-        ("grouped_trace", (pixel.origin, pixel.origin + 150, np.array([float(N)]), at, covariance), (1,)),
+    for kernel, arguments, shape in (
+        (ensemble_numba.curve_variance, (at, covariance, 90.0, 1.0), (40,)),
+        (
+            information_numba.grouped_trace,
+            (pixel.origin, pixel.origin + 150, np.array([float(N)]), at, covariance),
+            (1,),
+        ),
     ):
-        kernel = getattr(information_numba, name)
         compiled, plain = np.zeros(shape), np.zeros(shape)
         kernel(*arguments, compiled)
         kernel.py_func(*arguments, plain)
-        np.testing.assert_allclose(plain, compiled, rtol=1e-10, err_msg=name)
+        np.testing.assert_allclose(plain, compiled, rtol=1e-10)
+
+
+@pytest.mark.parametrize(("x0", "pitch"), [(85.0, 1.0), (101.3, 0.37)])
+def test_variance_of_a_curve_follows_from_its_slopes(x0: float, pitch: float) -> None:
+    rng = np.random.default_rng(5)
+    pixels = np.array([[0.3, 0.4, 100.2, 0.9], [6.0, 0.11, 99.0, 3.0]])
+    roots = rng.standard_normal((2, 4, 4)) * (0.1 * pixels)[:, :, None]
+    covariance = roots @ np.swapaxes(roots, 1, 2)
+    covariance[1, 2] = covariance[1, :, 2] = np.nan  # the bias was held by a bound
+    found = np.zeros(60)
+    ensemble_numba.curve_variance(pixels, covariance, x0, pitch, found)
+    x, expected = x0 + pitch * np.arange(60), np.zeros(60)
+    for at, known in zip(pixels, np.nan_to_num(covariance), strict=True):
+        slopes = np.empty((4, 60))
+        for i in range(4):
+            up, down = at.copy(), at.copy()
+            up[i] *= 1 + 1e-6
+            down[i] *= 1 - 1e-6
+            slopes[i] = (np.exp(log_pcd(x, *up)) - np.exp(log_pcd(x, *down))) / (2e-6 * at[i])
+        expected += np.einsum("ix,ij,jx->x", slopes, known, slopes)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-8 * expected.max())
 
 
 def test_groups_of_single_dn_determine_all_four_parameters() -> None:

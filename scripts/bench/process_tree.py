@@ -1,0 +1,104 @@
+"""What a command takes with all its processes, as the kernel counts: ``process_tree.py pchem run ...``.
+
+Shared pages count once (PSS of /proc/*/smaps_rollup, Linux), added over the tree and looked at every 50 ms;
+the largest resident set of a single process comes from the kernel's own high-water marks.
+"""
+
+from __future__ import annotations
+
+import re
+import resource
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Took", "run_measured"]
+
+_EVERY = 0.05
+
+
+@dataclass(frozen=True)
+class Took:
+    """What a command took.
+
+    Attributes:
+        code: its exit code.
+        words: the last of what it wrote to standard error.
+        wall: seconds.
+        cpu: CPU seconds of all its processes.
+        tree: largest memory of all its processes together, MiB.
+        largest: largest resident set of one of them, MiB.
+    """
+
+    code: int
+    words: str
+    wall: float
+    cpu: float
+    tree: float
+    largest: float
+
+
+def run_measured(command: Sequence[str], folder: Path | None = None) -> Took:
+    """Run a command to its end and return what it took."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        command, cwd=folder, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    highest = [0, 0]
+    ended = threading.Event()
+    watch = threading.Thread(target=_watch, args=(process.pid, highest, ended))
+    watch.start()
+    _, words = process.communicate()
+    ended.set()
+    watch.join()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    wall = time.perf_counter() - start
+    return Took(process.returncode, words[-2000:], wall, cpu, highest[0] / 1024, highest[1] / 1024)
+
+
+def _watch(root: int, highest: list[int], ended: threading.Event) -> None:
+    """Keep the largest sum over the tree, and the largest resident set of a process, kB."""
+    while not ended.wait(_EVERY):
+        tree = _tree(root)
+        highest[0] = max(highest[0], sum(_kilobytes(pid, "smaps_rollup", "Pss") for pid in tree))
+        highest[1] = max([highest[1], *(_kilobytes(pid, "status", "VmHWM") for pid in tree)])
+
+
+def _tree(root: int) -> list[int]:
+    """Return a process and all that it has started, and they in turn."""
+    parents: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except (OSError, IndexError):
+                continue
+            parents.setdefault(parent, []).append(int(entry.name))
+    found = [root]
+    for pid in found:
+        found += parents.get(pid, ())
+    return found
+
+
+def _kilobytes(pid: int, file: str, name: str) -> int:
+    try:
+        match = re.search(rf"^{name}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.M)
+    except OSError:
+        return 0
+    return int(match[1]) if match else 0
+
+
+if __name__ == "__main__":
+    took = run_measured(sys.argv[1:])
+    print(took.words, end="")
+    print(
+        f"{took.wall:.1f} s, {took.cpu:.1f} CPU s, {took.tree:.0f} MiB in all, "
+        f"{took.largest:.0f} MiB the largest process, exit {took.code}"
+    )
+    sys.exit(took.code)
