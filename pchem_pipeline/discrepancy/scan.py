@@ -204,16 +204,17 @@ class _Contrast:
     values: FloatArray
     some: FloatArray
     spread: float
+    fewest: int = _FEWEST
 
     @classmethod
-    def of(cls, values: FloatArray, some: BoolArray) -> _Contrast | None:
-        """Centre a map; None where it has no pixels."""
+    def of(cls, values: FloatArray, some: BoolArray, fewest: int = _FEWEST) -> _Contrast | None:
+        """Centre a map, to look for places of so many values or more; None where it has too few."""
         inside = values[some]
         if inside.size <= 2 * _FEWEST:
             return None
         # what stands out widens the spread of the whole: take it from the middle
         spread = max(1.0, float(np.subtract(*np.quantile(inside, [0.75, 0.25]))) / 1.349)
-        return cls(np.where(some, values - inside.mean(), 0.0), some.astype(np.float64), spread)
+        return cls(np.where(some, values - inside.mean(), 0.0), some.astype(np.float64), spread, fewest)
 
     @property
     def n(self) -> float:
@@ -224,12 +225,31 @@ class _Contrast:
         """Return the deviation of mean inside from mean outside, for places of such sums and counts."""
         with np.errstate(divide="ignore", invalid="ignore"):
             z = sums / (self.spread * np.sqrt(counts * (1.0 - counts / self.n)))
-        return np.where((counts >= _FEWEST) & (counts <= self.n - _FEWEST), z, 0.0)
+        return np.where((counts >= self.fewest) & (counts <= self.n - self.fewest), z, 0.0)
 
 
 def _log_p(z: float, places: float) -> float:
     """Return the logarithm of the union bound over places, both signs, at most 0."""
     return min(0.0, float(special.log_ndtr(-abs(z))) + math.log(2.0 * places))
+
+
+def _log_p_range(z: float, n: int, shortest: int) -> float:
+    """Return the logarithm of the probability of such a range among n frames, both signs.
+
+    Ranges overlap: of those of ``shortest`` frames or more far fewer are independent than there are. Siegmund
+    (1992, eq. 1.3; Olshen et al. 2004) for the largest contrast of a range against the rest:
+    ``b^3 phi(b) / 2 int nu(b / sqrt(n t (1 - t)))^2 / (t^2 (1 - t)) dt`` over t from ``shortest / n``.
+    """
+    union = _log_p(z, n**2 / 2)
+    b, least = abs(z), shortest / n
+    if b < 2.0 or least >= 0.5:
+        return union
+    t = np.geomspace(least, 1.0 - least, 500)
+    x = b / np.sqrt(n * t * (1.0 - t))
+    phi = np.exp(-(x**2) / 8.0) / np.sqrt(2.0 * np.pi)
+    nu = (2.0 / x) * (special.ndtr(x / 2.0) - 0.5) / ((x / 2.0) * special.ndtr(x / 2.0) + phi)
+    total = float(np.trapezoid(nu**2 / (t**2 * (1.0 - t)), t))
+    return min(union, 3.0 * math.log(b) - b**2 / 2.0 - 0.5 * math.log(8.0 * math.pi) + math.log(total))
 
 
 def _intervals(contrast: _Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
@@ -374,7 +394,12 @@ def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> flo
 
 
 def scan_series(
-    values: FloatArray, numbers: NDArray[np.int64], *, significance: float = 1e-3, most: int = 2
+    values: FloatArray,
+    numbers: NDArray[np.int64],
+    *,
+    significance: float = 1e-3,
+    most: int = 2,
+    shortest: int = _FEWEST,
 ) -> list[Stretch]:
     """Return the frames that stand out of a series, the most significant first.
 
@@ -383,11 +408,12 @@ def scan_series(
         numbers: frame numbers, increasing, (n,).
         significance: largest probability of a chance.
         most: stretches at most.
+        shortest: frames that a range or a phase of a period must have.
     """
     left = np.isfinite(values)
     found: list[Stretch] = []
     while len(found) < most and left.sum() > 2 * _FEWEST:
-        best = _best_frames(values, numbers, left)
+        best = _best_frames(values, numbers, left, shortest)
         if best is None:
             break
         when, place = best[0], _checked(best[1], values, left)
@@ -402,10 +428,10 @@ def scan_series(
 
 
 def _best_frames(
-    values: FloatArray, numbers: NDArray[np.int64], some: BoolArray
+    values: FloatArray, numbers: NDArray[np.int64], some: BoolArray, shortest: int
 ) -> tuple[When, _Found] | None:
     kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = _Contrast.of(kept, some)
+    contrast = _Contrast.of(kept, some, shortest)
     if contrast is None:
         return None
     families = [_frame_range(contrast), _frame_period(contrast, numbers), _single(values, some)]
@@ -441,7 +467,7 @@ def _frame_range(contrast: _Contrast) -> _Found:
         z = float(scores[np.argmax(np.abs(scores))])
     mask = np.zeros(n, np.bool_)
     mask[first:last] = True
-    return _Found("range", mask, z, _log_p(z, n**2 / 2))
+    return _Found("range", mask, z, _log_p_range(z, n, contrast.fewest))
 
 
 def _frame_period(contrast: _Contrast, numbers: NDArray[np.int64]) -> _Found | None:

@@ -63,7 +63,7 @@ def nothing(rng, shape):
 
 
 def parts_of(frames):
-    return suspected_parts(observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50))
+    return suspected_parts(observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50), frames)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

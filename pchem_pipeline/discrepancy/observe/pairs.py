@@ -1,0 +1,330 @@
+"""Products of pixels that share a row, a column or only the frame, summed by cells of the sensor.
+
+What pixels share adds to the covariance of all their pairs, not only to that of neighbours: a row of w pixels
+has w (w - 1) / 2 pairs, and w - 1 neighbours. Samples are standardised by the variance of their pixel. Given
+the histograms, frames without an effect are in random order: then products of different pixels have mean 0,
+variance 1, and are uncorrelated, whatever the pixels' law, so that the sum over N of them has the standard
+deviation ``sqrt(N)`` exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe.sums import PixelStatistics, pixel_statistics
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.histogram.count import histogram_frames
+
+__all__ = ["CHANNELS", "MODES", "PERIOD", "Pairs", "Samples", "pairs_of"]
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+CHANNELS = ("charge", "readout")
+#: What pixels share: their row, their column, or only the frame (neither row nor column).
+MODES = ("row", "column", "frame")
+#: Lines are told apart by their number modulo this.
+PERIOD = 32
+#: Cells along an edge of the sensor, for lines; half as many for frames.
+_CELLS = 64
+#: Samples count as no more than so many standard deviations: a track of a particle is no common mode.
+_CLIP = 6.0
+_CHUNK_SAMPLES = 1 << 22
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Frames as standardised deviations of their pixels, channel by channel.
+
+    Attributes:
+        frames: codes (n, y, x), DN.
+        first, last: smallest and largest code of each pixel's table, (y, x).
+        start: row of the first one in ``tables``, (y, x).
+        tables: k and r of each code over their standard deviation, (2, rows).
+        usable: pixels that count, (y, x).
+    """
+
+    frames: NDArray[np.unsignedinteger[Any]]
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    start: NDArray[np.int32]
+    tables: Float32Array
+    usable: BoolArray
+
+    @classmethod
+    def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
+        """Prepare frames by the fit of their pixels."""
+        histograms = histogram_frames(frames)
+        outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
+        known = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+        laws = pixel_laws(
+            histograms.counts.reshape(-1, histograms.counts.shape[2]),
+            histograms.origin.ravel().astype(np.int64),
+            outside,
+            np.stack([values.ravel() for values in known], axis=1),
+            maps.usable.ravel(),
+        )
+        shape = (maps.usable.shape[0], maps.usable.shape[1])
+        pixels = pixel_statistics(laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), shape)
+        return cls.by_laws(frames, laws, pixels)
+
+    @classmethod
+    def by_laws(
+        cls, frames: NDArray[np.unsignedinteger[Any]], laws: PixelLaws, pixels: PixelStatistics
+    ) -> Samples:
+        """Prepare frames by the laws of their pixels."""
+        usable = pixels.usable
+        first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T.astype(np.int32)
+        tables = laws.tables.T.copy()
+        for channel, variance in enumerate((pixels.charge, pixels.readout)):
+            scale = np.sqrt(np.where(usable, variance, 1.0)).ravel()
+            good = np.flatnonzero(usable.ravel())
+            rows = np.concatenate([[0], np.repeat(good, length[good])]) if good.size else np.zeros(1, int)
+            tables[channel, : rows.size] /= scale[rows]
+        np.clip(tables, -_CLIP, _CLIP, out=tables)
+        first, last, start = (values.reshape(usable.shape) for values in (first, first + length - 1, start))
+        return cls(frames, first, last, start, tables, usable)
+
+    def without(self, pixels: BoolArray) -> Samples:
+        """Return it without some pixels, (y, x)."""
+        return replace(self, usable=self.usable & ~pixels)
+
+    def during(self, frames: BoolArray) -> Samples:
+        """Return it with some of its frames, (n,)."""
+        return replace(self, frames=self.frames[frames])
+
+    def chunks(self, channel: int) -> Iterator[tuple[slice, Float32Array]]:
+        """Yield some frames at a time as deviations, (frame, y, x), 0 in pixels that do not count."""
+        n, ny, nx = self.frames.shape
+        size = max(1, _CHUNK_SAMPLES // (ny * nx))
+        weight = self.usable.astype(np.float32)
+        for begin in range(0, n, size):
+            at = self.frames[begin : begin + size].astype(np.int32)
+            np.clip(at, self.first, self.last, out=at)
+            at += self.start - self.first
+            yield slice(begin, min(begin + size, n)), self.tables[channel][at] * weight
+
+    def energies(self, channel: int, mode: str, pixels: BoolArray) -> FloatArray:
+        """Return the sum of the products of pairs of some pixels that share a mode, in each frame, (n,)."""
+        found = np.zeros(self.frames.shape[0])
+        rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        small = replace(
+            self,
+            frames=self.frames[(slice(None), *box)],
+            first=self.first[box],
+            last=self.last[box],
+            start=self.start[box],
+            usable=self.usable[box] & pixels[box],
+        )
+        for part, u in small.chunks(channel):
+            own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
+            rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))
+            of_rows, of_columns = ((sums**2).sum(axis=1) for sums in (rows, columns))
+            if mode == "frame":
+                found[part] = rows.sum(axis=1) ** 2 - of_rows - of_columns + own
+            else:
+                found[part] = (of_rows if mode == "row" else of_columns) - own
+        return found / 2.0
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Sums of products of pairs of pixels that share a row (column, frame), by cells of the sensor.
+
+    Cells lie across the line: groups of columns for rows. Pairs are counted twice, as (a, b) and (b, a).
+
+    Attributes:
+        sums, counts: over ranges of lines: of rows (columns) a to b - 1 the element b less a, shape
+            (lines + 1, across, across); of frames, cumulative over both rows, (y + 1, y + 1, x, x).
+        phases, phase_counts: the same by the column's (row's) number modulo :data:`PERIOD`, over all lines.
+        rows, columns: edges of the cells, pixels.
+    """
+
+    mode: str
+    sums: FloatArray
+    counts: FloatArray
+    phases: tuple[FloatArray, ...]
+    phase_counts: tuple[FloatArray, ...]
+    rows: IntArray
+    columns: IntArray
+
+    def boxes(self, table: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
+        """Return ``sums`` (or ``counts``) over bands ``first`` to ``last - 1`` across the lines.
+
+        Cumulative along the lines as the table is, the bands in the last axis.
+        """
+        total = np.pad(
+            np.cumsum(np.cumsum(table, axis=-2), axis=-1), [(0, 0)] * (table.ndim - 2) + [(1, 0)] * 2
+        )
+        corners = ((last, last), (first, last), (last, first), (first, first))
+        return np.asarray(
+            sum(s * total[..., i, j] for s, (i, j) in zip((1, -1, -1, 1), corners, strict=True))
+        )
+
+    def from_line(self, boxes: FloatArray, first: int) -> FloatArray:
+        """Return from :meth:`boxes` those of lines ``first`` to each later one, (later lines, bands)."""
+        if self.mode == "frame":
+            last = np.arange(first + 1, boxes.shape[0])
+            return np.asarray(
+                boxes[last, last] - boxes[first, last] - boxes[last, first] + boxes[first, first]
+            )
+        return np.asarray(boxes[first + 1 :] - boxes[first])
+
+    @property
+    def lines(self) -> IntArray:
+        """Edges of the cells along which lines are counted."""
+        return self.columns if self.mode == "column" else self.rows
+
+    @property
+    def across(self) -> IntArray:
+        """Edges of the cells across the lines."""
+        return self.rows if self.mode == "column" else self.columns
+
+
+def pairs_of(samples: Samples, channel: int) -> dict[str, Pairs]:
+    """Sum the products of all pairs in one pass over the frames, by what the pixels share."""
+    gathered, counted = (_Gathered(*samples.usable.shape) for _ in range(2))
+    counted.add(samples.usable[None].astype(np.float32))
+    for _, u in samples.chunks(channel):
+        gathered.add(u)
+    return _told(gathered, counted, samples.frames.shape[0])
+
+
+class _Gathered:
+    """Sums of products of cells of rows, of columns and of frames, squares included.
+
+    Attributes:
+        rows, columns: edges of the cells of lines; those of frames are every ``stride`` of them.
+        squares: (y, x).
+        of_rows, of_columns: (y, x, x) and (x, y, y).
+        of_frames: (y', x', y', x').
+        phases: of rows by the column's number, of columns by the row's, of frames by either.
+        own: squares and products within a line by the number of the column, of the row, (PERIOD,) each.
+    """
+
+    def __init__(self, ny: int, nx: int) -> None:
+        """Begin with nothing, for a sensor of ny rows and nx columns."""
+        self.rows, self.columns = (
+            np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in (ny, nx)
+        )
+        self.stride = tuple(2 if n > _CELLS // 2 else 1 for n in (ny, nx))
+        y, x = self.rows.size - 1, self.columns.size - 1
+        self.squares = np.zeros((y, x))
+        self.of_rows, self.of_columns = np.zeros((y, x, x)), np.zeros((x, y, y))
+        v, u = (-(-n // by) for n, by in zip((y, x), self.stride, strict=True))
+        self.of_frames = np.zeros((v * u, v * u))
+        self.phases = np.zeros((4, PERIOD, PERIOD))
+        self.own = np.zeros((4, PERIOD))
+
+    def add(self, u: Float32Array) -> None:
+        """Add frames (t, y, x)."""
+        square = np.einsum("tyx,tyx->yx", u, u, dtype=np.float64)
+        self.squares += _summed(square, (self.rows[:-1], self.columns[:-1]))
+        turned = u.transpose(0, 2, 1)
+        self._add_lines(u, self.rows, self.columns, self.of_rows, 0)
+        self._add_lines(turned, self.columns, self.rows, self.of_columns, 1)
+        for which, (v, axis) in enumerate(((u, 0), (turned, 1))):
+            self.own[which] += _by_number(square.sum(axis=axis))
+            lines = v.sum(axis=1, dtype=np.float64)
+            self.own[2 + which] += _by_number((lines**2).sum(axis=0))
+            folded = _folded(lines)
+            self.phases[2 + which] += folded.T @ folded
+        rows, columns = self.rows[: -1 : self.stride[0]], self.columns[: -1 : self.stride[1]]
+        flat = np.add.reduceat(np.add.reduceat(u, rows, axis=1), columns, axis=2).reshape(u.shape[0], -1)
+        self.of_frames += flat.T @ flat
+
+    def _add_lines(
+        self, u: Float32Array, lines: IntArray, across: IntArray, products: FloatArray, which: int
+    ) -> None:
+        """Add products of cells of the same line: frames (t, line, across)."""
+        cells = np.add.reduceat(u, across[:-1], axis=2)
+        for i in range(lines.size - 1):
+            part = cells[:, lines[i] : lines[i + 1]].reshape(-1, cells.shape[2])
+            products[i] += part.T @ part
+        folded = _folded(u).reshape(-1, PERIOD)
+        self.phases[which] += folded.T @ folded
+
+    def tables(self) -> dict[str, FloatArray]:
+        """Return the products of different pixels of a line, and of frames of different rows and columns.
+
+        Cumulative along the lines; see :class:`Pairs`.
+        """
+        rows, columns = self.of_rows.copy(), self.of_columns.copy()
+        by, bx = (
+            np.arange(0, size, step) for size, step in zip(self.squares.shape, self.stride, strict=True)
+        )
+        v, u = by.size, bx.size
+        frames = self.of_frames.reshape(v, u, v, u).transpose(0, 2, 1, 3).copy()
+        i, j = np.arange(v), np.arange(u)
+        frames[i, i] -= _summed(rows, (by, bx, bx))
+        frames[:, :, j, j] -= _summed(columns, (bx, by, by)).transpose(1, 2, 0)
+        own = _summed(self.squares, (by, bx))
+        for a in range(v):
+            frames[a, a, j, j] += own[a]
+        for table, square in ((rows, self.squares), (columns, self.squares.T)):
+            index = np.arange(table.shape[1])
+            table[:, index, index] -= square
+        lines = {
+            mode: np.pad(table, ((1, 0), (0, 0), (0, 0))).cumsum(axis=0)
+            for mode, table in (("row", rows), ("column", columns))
+        }
+        both = np.pad(frames, ((1, 0), (1, 0), (0, 0), (0, 0))).cumsum(axis=0).cumsum(axis=1)
+        return {**lines, "frame": both}
+
+    def by_number(self) -> dict[str, tuple[FloatArray, ...]]:
+        """Return the same by the number of the column or row modulo the period."""
+        rows, columns = (self.phases[i] - np.diag(self.own[i]) for i in (0, 1))
+        frames = tuple(
+            self.phases[2 + i] - np.diag(self.own[2 + i]) - each for i, each in ((0, rows), (1, columns))
+        )
+        return {"row": (rows,), "column": (columns,), "frame": frames}
+
+
+def _told(gathered: _Gathered, counted: _Gathered, n: int) -> dict[str, Pairs]:
+    """Return the sums by what pixels share, with the counts of the usable pixels in n frames."""
+    sums, counts = gathered.tables(), counted.tables()
+    phases, numbers = gathered.by_number(), counted.by_number()
+    whole = gathered.rows, gathered.columns
+    ends = gathered.rows[-1:], gathered.columns[-1:]
+    wide = tuple(
+        np.append(edges[:-1:step], end) for edges, end, step in zip(whole, ends, gathered.stride, strict=True)
+    )
+    return {
+        mode: Pairs(
+            mode,
+            sums[mode],
+            n * counts[mode],
+            phases[mode],
+            tuple(n * each for each in numbers[mode]),
+            *(wide if mode == "frame" else whole),
+        )
+        for mode in MODES
+    }
+
+
+def _by_number(values: FloatArray) -> FloatArray:
+    """Return sums of values of lines by the line's number modulo the period, (PERIOD,)."""
+    return np.bincount(np.arange(values.size) % PERIOD, values, PERIOD).astype(np.float64)
+
+
+def _summed(values: FloatArray, starts: tuple[IntArray, ...]) -> FloatArray:
+    """Return sums of groups along each axis."""
+    for axis, first in enumerate(starts):
+        values = np.add.reduceat(values, first, axis=axis)
+    return values
+
+
+def _folded(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return sums over the last axis by its number modulo the period, (..., PERIOD)."""
+    missing = -values.shape[-1] % PERIOD
+    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+    return np.asarray(padded.reshape(*values.shape[:-1], -1, PERIOD).sum(axis=-2))

@@ -1,0 +1,247 @@
+"""Places whose pixels share noise of their rows, columns or frames: a scan over all pairs of pixels.
+
+Of every band of lines, every band across them, every rectangle and every n-th line the mean covariance of the
+pairs inside is compared with that of all other pairs, so that noise which all pixels share has no place. The
+standard error is ``1 / sqrt(N)`` of N pairs (:mod:`.observe.pairs`), or what the frames' scatter gives where
+that is more; the sum of squares behind it is skewed, which Wilson and Hilferty's root takes away. The
+probability is the union bound over the places of the family, the families, modes and channels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.discrepancy.observe.laws import chi_square
+from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, MODES, PERIOD, Pairs, Samples, pairs_of
+from pchem_pipeline.discrepancy.scan import Suspect
+from pchem_pipeline.effects.framework.region import Region, Taps
+
+__all__ = ["Shared", "scan_pairs"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_PERIODS = (2, 4, 8, 16, 32)
+_FEWEST_LINES = 2  # of a period
+#: Families of places: bands of lines, bands across them, rectangles, periods.
+_FAMILIES = 4
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A place whose pixels move together, unlike the rest.
+
+    Attributes:
+        place: it; ``inside`` and ``outside`` are mean correlations of pairs.
+        channel: 0 for electron numbers, 1 for residuals.
+        mode: row, column or frame: what the pixels share.
+    """
+
+    place: Suspect
+    channel: int
+    mode: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Pixels that a place must have, the share of the sensor that it may have, and the contrast it needs.
+
+    Attributes:
+        fewest: pixels.
+        largest: share of all pixels.
+        contrast: of the mean inside, the most that the mean outside may be.
+    """
+
+    fewest: int = 16
+    largest: float = 0.6
+    contrast: float = 0.4
+
+
+@dataclass(frozen=True)
+class _Best:
+    """The best place of a family: cells of lines and across them (or a tap), z, pairs, number of places."""
+
+    family: str
+    z: float
+    places: float
+    lines: tuple[int, int] = (0, 0)
+    across: tuple[int, int] = (0, 0)
+    taps: Taps | None = None
+
+
+def scan_pairs(
+    samples: Samples, *, significance: float = 1e-3, most: int = 2, limits: Limits | None = None
+) -> list[Shared]:
+    """Return the places whose pixels share noise, the most significant first, each without those before it.
+
+    Args:
+        samples: standardised frames.
+        significance: largest probability of a chance in any place, mode and channel.
+        most: places at most.
+        limits: of their sizes.
+    """
+    limits = limits or Limits()
+    found: list[Shared] = []
+    while len(found) < most and samples.usable.sum() > 2 * limits.fewest:
+        candidates = [
+            each
+            for channel in range(len(CHANNELS))
+            for mode, pairs in pairs_of(samples, channel).items()
+            for each in _places(samples, channel, mode, pairs, limits, math.log(significance))
+        ]
+        if not candidates:
+            break
+        best = min(candidates, key=lambda each: each.place.log_p)
+        found.append(best)
+        shape = samples.usable.shape[0], samples.usable.shape[1]
+        samples = samples.without(best.place.region.mask(shape))
+    return found
+
+
+def _places(
+    samples: Samples, channel: int, mode: str, pairs: Pairs, limits: Limits, log_limit: float
+) -> Iterator[Shared]:
+    """Yield the best place of each family of a mode that is no chance."""
+    shape = samples.usable.shape[0], samples.usable.shape[1]
+    for best in (*_boxes(pairs, samples.usable, limits), *_periods(pairs, limits)):
+        # a first guess without the error that the frames' scatter gives
+        if _log_p(best.z, best.places) > log_limit:
+            continue
+        region = _region(best, pairs, shape)
+        if region is None:
+            continue
+        place = _measured(samples, channel, mode, pairs, region.mask(shape), best)
+        if place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside:
+            yield Shared(replace(place, region=region), channel, mode)
+
+
+def _log_p(z: float, places: float) -> float:
+    """Return the logarithm of the union bound over the places of a family, all families and modes."""
+    looks = places * _FAMILIES * len(MODES) * len(CHANNELS)
+    return min(0.0, float(special.log_ndtr(-z)) + math.log(max(looks, 1.0)))
+
+
+def _region(best: _Best, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
+    """Return the pixels of a place in the sensor's rows and columns; None for all of it."""
+    if best.taps is not None:
+        return Region(taps=best.taps)
+    mask = np.zeros(shape, np.bool_)
+    lines, across = (
+        slice(int(edges[a]), int(edges[b]))
+        for edges, (a, b) in ((pairs.lines, best.lines), (pairs.across, best.across))
+    )
+    mask[(across, lines) if pairs.mode == "column" else (lines, across)] = True
+    return None if mask.all() else Region.of_mask(mask)
+
+
+def _measured(
+    samples: Samples, channel: int, mode: str, pairs: Pairs, inside: BoolArray, best: _Best
+) -> Suspect:
+    """Return a place with its significance by theory or by the scatter of the frames, whichever is less."""
+    usable = samples.usable
+    energy, total = (samples.energies(channel, mode, part) for part in (usable & inside, usable))
+    n = energy.size
+    own, every = (_number_of_pairs(part, mode) for part in (usable & inside, usable))
+    share = own / every
+    apart = energy - share * total
+    by_theory = math.sqrt(n * own * (1.0 - share))
+    by_scatter = float(np.std(apart) * math.sqrt(n))
+    z = float(apart.sum()) / max(by_theory, by_scatter)
+    # partners of each pixel: squares of sums over w of them have this many degrees of freedom
+    partners = 2.0 * own / max(int((usable & inside).sum()), 1)
+    freedom = 2.0 * n * own / max(partners - 1.0, 1e-9) ** 2
+    z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
+    rest = (float(total.sum()) - float(energy.sum())) / max(n * (every - own), 1.0)
+    region = Region(columns=((0, 1),))  # told by the caller
+    return Suspect(region, best.family, z, _log_p(z, best.places), float(energy.sum()) / (n * own), rest)
+
+
+def _number_of_pairs(pixels: BoolArray, mode: str) -> float:
+    """Return the pairs of pixels that share a mode in one frame."""
+    size = float(pixels.sum())
+    rows, columns = (float((pixels.sum(axis=axis, dtype=np.float64) ** 2).sum()) for axis in (1, 0))
+    twice = {"row": rows - size, "column": columns - size, "frame": size**2 - rows - columns + size}
+    return twice[mode] / 2.0
+
+
+# -- families -----------------------------------------------------------------------------------
+
+
+def _boxes(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
+    """Return the best band of lines, band across them, and rectangle."""
+    lines, across = pairs.lines.size - 1, pairs.across.size - 1
+    c, d = np.triu_indices(across + 1, 1)
+    sums, counts = (pairs.boxes(table, c, d) for table in (pairs.sums, pairs.counts))
+    whole = int(np.flatnonzero((c == 0) & (d == across))[0])
+    total, number = (float(pairs.from_line(table, 0)[-1, whole]) for table in (sums, counts))
+    if number <= 0:
+        return []
+    area = _areas(usable if pairs.mode != "column" else usable.T, pairs.lines, pairs.across)
+    best = {name: _Best(name, 0.0, 0.0) for name in ("lines", "across", "rectangle")}
+    for a in range(lines):
+        counted = pairs.from_line(counts, a)
+        size = area[a + 1 :, d] - area[a, d] - area[a + 1 :, c] + area[a, c]
+        some = (size >= limits.fewest) & (size <= limits.largest * usable.sum()) & (counted > 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            z = pairs.from_line(sums, a) - counted * total / number
+            z /= np.sqrt(2.0 * counted * (1.0 - counted / number))
+        for family, which in _families(some, a, whole).items():
+            best[family] = _better(best[family], np.where(which, z, 0.0), int(which.sum()), a, (c, d))
+    return [each for each in best.values() if each.z > 0]
+
+
+def _families(some: BoolArray, first: int, whole: int) -> dict[str, BoolArray]:
+    """Return which boxes (last line, band) from a first line on belong to which family."""
+    every, full = np.zeros_like(some), np.zeros_like(some)
+    full[:, whole] = True
+    every[-1] = first == 0
+    return {
+        "lines": some & full & ~every,
+        "across": some & every & ~full,
+        "rectangle": some & ~every & ~full,
+    }
+
+
+def _better(best: _Best, z: FloatArray, tried: int, first: int, bands: tuple[IntArray, IntArray]) -> _Best:
+    """Return the best box so far of a family, with the number of those tried."""
+    last, band = np.unravel_index(int(np.argmax(z)), z.shape)
+    if z[last, band] > best.z:
+        across = int(bands[0][band]), int(bands[1][band])
+        best = replace(best, z=float(z[last, band]), lines=(first, first + 1 + int(last)), across=across)
+    return replace(best, places=best.places + tried)
+
+
+def _areas(usable: BoolArray, lines: IntArray, across: IntArray) -> FloatArray:
+    """Return the usable pixels before each edge, (lines + 1, across + 1)."""
+    total = np.pad(np.cumsum(np.cumsum(usable, axis=0, dtype=np.int64), axis=1), ((1, 0), (1, 0)))
+    return np.asarray(total[np.ix_(lines, across)], np.float64)
+
+
+def _periods(pairs: Pairs, limits: Limits) -> list[_Best]:
+    """Return the best set of every n-th column, and of every n-th row where they share the line."""
+    ways = {"row": ("columns",), "column": ("rows",), "frame": ("columns", "rows")}[pairs.mode]
+    best, tried = _Best("period", 0.0, 1.0), 0
+    for along, sums, counts in zip(ways, pairs.phases, pairs.phase_counts, strict=True):
+        total, number = float(sums.sum()), float(counts.sum())
+        length = int((pairs.columns if along == "columns" else pairs.rows)[-1])
+        for period in (p for p in _PERIODS if _FEWEST_LINES * p <= length and number > 0):
+            for phase in range(period):
+                some = np.ix_(*2 * (np.arange(PERIOD) % period == phase,))
+                inside, counted = float(sums[some].sum()), float(counts[some].sum())
+                tried += 1
+                if not 0 < counted < number:
+                    continue
+                z = (inside - counted * total / number) / math.sqrt(2.0 * counted * (1.0 - counted / number))
+                if z > best.z:
+                    taps = Taps(
+                        every=period, which=(phase,), along="columns" if along == "columns" else "rows"
+                    )
+                    best = _Best("period", z, 1.0, taps=taps)
+    return [replace(best, places=float(tried))] if best.z > 0 else []

@@ -1,0 +1,124 @@
+"""Pairs of pixels that share a row, a column or a frame: their sums, and places that stand out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.observe.pairs import PERIOD, Samples, pairs_of
+from pchem_pipeline.discrepancy.scan import scan_series
+from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
+from pchem_pipeline.effects.framework.region import Region
+
+Floats = np.ndarray[Any, np.dtype[np.float64]]
+SHAPE, FRAMES = (32, 32), 1000
+
+
+def samples_of(values: Floats, usable: np.ndarray[Any, np.dtype[np.bool_]] | None = None) -> Samples:
+    """Return deviations (frame, y, x) as samples of both channels, to a hundredth of a standard deviation."""
+    shape = values.shape[1:]
+    zero = np.zeros(shape, np.int32)
+    table = np.tile(((np.arange(1201) - 600) / 100.0).astype(np.float32), (2, 1))
+    codes = np.rint(100.0 * values + 600.0).astype(np.uint16)
+    every = np.ones(shape, np.bool_) if usable is None else usable
+    return Samples(codes, zero, zero + 1200, zero, table, every)
+
+
+@pytest.mark.parametrize("shape", [(6, 9), (70, 40), (40, 33)])
+def test_sums_of_cells_are_those_of_all_pairs(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(sum(shape))
+    usable = rng.random(shape) < 0.8
+    samples = samples_of(np.clip(rng.standard_normal((5, *shape)), -6, 6), usable)
+    [(_, u)] = samples.chunks(0)
+    flat = u.reshape(5, -1).astype(np.float64)
+    y, x = (each.ravel() for each in np.mgrid[: shape[0], : shape[1]])
+    products, counts = flat.T @ flat, 5.0 * np.outer(usable.ravel(), usable.ravel())
+    same_row, same_column = y[:, None] == y, x[:, None] == x
+    shared = {
+        "row": same_row & ~same_column,
+        "column": same_column & ~same_row,
+        "frame": ~same_row & ~same_column,
+    }
+    for mode, pairs in pairs_of(samples, 0).items():
+        first, last = 1, pairs.lines.size - 2
+        begin, end = 2, pairs.across.size - 1
+        line, across = (x, y) if mode == "column" else (y, x)
+        inside = (line >= pairs.lines[first]) & (line < pairs.lines[last])
+        inside &= (across >= pairs.across[begin]) & (across < pairs.across[end])
+        for table, full in ((pairs.sums, products), (pairs.counts, counts)):
+            boxes = pairs.boxes(table, np.array([begin]), np.array([end]))
+            expected = (full * shared[mode])[np.ix_(inside, inside)].sum()
+            assert pairs.from_line(boxes, first)[last - first - 1, 0] == pytest.approx(expected, abs=1e-2)
+        for number, phases in enumerate(pairs.phases):
+            along = x if mode == "row" or (mode == "frame" and number == 0) else y
+            some = along % PERIOD == 3
+            expected = (products * shared[mode])[np.ix_(some, some)].sum()
+            assert phases[3, 3] == pytest.approx(expected, abs=1e-2)
+        pixels = inside.reshape(shape) & usable
+        energy = samples.energies(0, mode, pixels).sum()
+        expected = (products * shared[mode])[np.ix_(pixels.ravel(), pixels.ravel())].sum() / 2.0
+        assert energy == pytest.approx(expected, abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("mode", "axes", "place"),
+    [
+        ("row", (FRAMES, 32, 1), {"columns": [8, 16]}),
+        ("row", (FRAMES, 32, 1), {"rows": [20, 28], "columns": [4, 16]}),
+        ("column", (FRAMES, 1, 32), {"rows": [3, 11]}),
+        ("frame", (FRAMES, 1, 1), {"rows": [16, 32], "columns": [0, 16]}),
+        ("frame", (FRAMES, 1, 1), {"taps": {"every": 8, "which": 5}}),
+    ],
+)
+def test_a_place_is_found_from_twelve_standard_errors_of_its_pairs_on(
+    mode: str, axes: tuple[int, ...], place: dict[str, Any]
+) -> None:
+    rng = np.random.default_rng(5)
+    region = Region.model_validate(place)
+    mask = region.mask(SHAPE)
+    row, column = ((mask.sum(axis=axis, dtype=float) ** 2).sum() for axis in (1, 0))
+    size = float(mask.sum())
+    pairs = {"row": row - size, "column": column - size, "frame": size**2 - row - column + size}[mode] / 2.0
+    shared = np.sqrt(12.0 / np.sqrt(FRAMES * pairs)) * rng.standard_normal(axes)
+    frames = rng.standard_normal((FRAMES, *SHAPE)) + mask * shared
+    found = scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3)
+    assert found[0].mode == mode
+    assert found[0].place.region.overlap(region, SHAPE) > 0.7
+    # the scatter of the noise put in and the root take up to half of it, the best of all places adds
+    assert 6.0 < found[0].place.z < 16.0
+
+
+def test_what_all_pixels_share_has_no_place_and_nothing_is_found_in_nothing() -> None:
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        frames = rng.standard_normal((300, *SHAPE))
+        assert scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3) == []
+        frames += 0.4 * rng.standard_normal((300, 32, 1)) + 0.3 * rng.standard_normal((300, 1, 32))
+        frames += 0.2 * rng.standard_normal((300, 1, 1))
+        assert scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3) == []
+
+
+def test_ranges_of_frames_come_by_chance_as_often_as_told() -> None:
+    numbers = np.arange(600)
+    chances = [
+        found[0].p
+        for seed in range(200)
+        if (
+            found := scan_series(
+                np.random.default_rng(seed).standard_normal(600),
+                numbers,
+                significance=0.1,
+                most=1,
+                shortest=64,
+            )
+        )
+    ]
+    # binomial: three standard deviations above 0.1 (of 200) and, so that it is no mere bound, ten below
+    assert 4 <= len(chances) <= 33
+    rng = np.random.default_rng(999)
+    shifted = rng.standard_normal(600) + 0.75 * ((numbers >= 200) & (numbers < 264))
+    [one] = scan_series(shifted, numbers, significance=1e-3, shortest=64)
+    assert one.z < 7.5  # a count of all ranges would ask for 6.5 and more
+    assert one.when.range[0][0] == pytest.approx(200, abs=25)
