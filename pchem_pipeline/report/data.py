@@ -181,7 +181,6 @@ class ReportData:
             ``peak_memory_bytes``, ``units``, ``notes``.
         misfits: what the maps say of the goodness of fit: ``tested``, ``misfits``, ``false_discovery_rate``,
             ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``, ``p``, ``q``), ``pixels_with_outliers``.
-        worst: the pixels of the poorest fit.
         intervals: by quantity the ends of its profile intervals, (y, x) each, where they were asked for.
         interval_level: probability that these cover the truth.
         missing: part (see ``PARTS``) to the reason why it is absent.
@@ -218,7 +217,6 @@ class ReportData:
     inputs: Sequence[Mapping[str, Any]] = ()
     stages: Sequence[Mapping[str, Any]] = ()
     misfits: Mapping[str, Any] = field(default_factory=dict)
-    worst: Sequence[PixelFit] = ()
     intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     interval_level: float = 0.6827
     missing: Mapping[str, str] = field(default_factory=dict)

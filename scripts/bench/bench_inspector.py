@@ -87,7 +87,7 @@ def make_page(size: int) -> str:
         maps=maps,
         inspector=InspectorData(tuple(entries), sample, "a quarter", "pchem view"),
     )
-    dot = Drawn(DOT, "", 9, 9)
+    dot = Drawn(DOT, 9, 9)
     settings = ReportSettings(figure_formats=())
     return render_report(data, settings, lambda figures, _: {each.name: dot for each in figures}).html
 

@@ -69,7 +69,7 @@ def page_without_pictures(data: ReportData) -> str:
     """Return the page with a dot for every figure: fast."""
 
     def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
-        dot = Drawn("data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", "", 10, 10)
+        dot = Drawn("data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", 10, 10)
         return {figure.name: dot for figure in figures}
 
     return render_report(data, ReportSettings(figure_formats=()), dots).html

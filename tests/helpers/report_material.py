@@ -184,7 +184,6 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
             "largest_outlier_share": 5.6e-5,
             "worst": [{"y": 0, "x": 0, "chi2": 99.0, "dof": 60.0, "p": 1e-3, "q": 0.7}],
         },
-        worst=[pixel_fit(truth, 0, 0, "q = 0.7")],
         ensemble=arrays,
         ensemble_facts=facts,
         component_cases=CASES,

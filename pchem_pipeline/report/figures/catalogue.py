@@ -31,7 +31,6 @@ REPORT_FIGURES: tuple[tuple[Callable[[ReportData, ReportSettings], list[Figure]]
     (samples.exposure_figures, ("exposures",)),
     (samples.transfer_figures, ("photon_transfer",)),
     (trust.goodness_figures, ("goodness",)),
-    (pixels.worst_figures, ("worst_pixels",)),
     (trust.left_out_figures, ("left_out",)),
     (maps.read_noise_figures, ("read_noise_histogram",)),
     (maps.map_figures, tuple(f"map_{name}" for name in maps.DRAWN_MAPS)),

@@ -64,7 +64,6 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
         alt,
         (DataTable({"difference": each.z}, {"difference": "standard errors"}),),
         partial(draw_difference, z=each.z, n_far=each.n_far, title=title, same_data=pair.same_data),
-        raster=True,
     )
 
 

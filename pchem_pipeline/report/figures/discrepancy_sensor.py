@@ -96,7 +96,6 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
             (table,),
             partial(draw_sensor, maps=maps, flagged=flagged, origin=origin),
             PAGE_MM,
-            raster=True,
         )
     ]
 
@@ -118,7 +117,6 @@ def line_figures(data: DiscrepancyData) -> list[Figure]:
             tables,
             partial(draw_lines, arrays=_line_arrays(data.arrays), origin=origin),
             PAGE_MM,
-            raster=True,
         )
     ]
 

@@ -81,7 +81,6 @@ class Figure:
         tables: its data, the main part first.
         draw: draws it in a look; another process can be sent it.
         width_mm: width at which it is saved.
-        raster: embed it as PNG (images of many pixels) instead of SVG.
     """
 
     name: str
@@ -92,7 +91,6 @@ class Figure:
     tables: tuple[DataTable, ...]
     draw: Callable[[Look], Drawing]
     width_mm: float = COLUMN_MM
-    raster: bool = False
 
 
 def csv_text(table: DataTable) -> str:

@@ -30,6 +30,8 @@ FloatArray = NDArray[np.float64]
 _STRIP = 2
 #: Images longer than this ratio are stretched to fit instead of keeping square pixels.
 _LONGEST_RATIO = 4.0
+#: Rows or columns of an image up to which a vector file keeps each pixel.
+_MOST_KEPT = 800
 
 _CAPTIONS = {
     "charge_rate": "Charge rate: quanta exposure over integration time; what made the charge is not said.",
@@ -71,7 +73,6 @@ def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
         _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
         tables,
         partial(draw_map, tables=tables, name=name, stretch=settings.map_stretch),
-        raster=not strip,
     )
 
 
@@ -133,7 +134,6 @@ def status_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             "Map of the fit status. " + "; ".join(parts) + ".",
             (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
             partial(draw_status, status=status, rows=rows, unfitted=data.unfitted),
-            raster=not is_strip(status.shape),
         )
     ]
 
@@ -264,9 +264,12 @@ def show_map(axes: Axes, colour: NDArray[Any], **options: Any) -> AxesImage:
     ny, nx = colour.shape
     square = 1.0 / _LONGEST_RATIO <= ny / nx <= _LONGEST_RATIO
     axes.set_facecolor(colours_of(axes).no_value)
+    # a vector file keeps the pixels as they are, but for more of them than it can show
+    kept = "none" if max(ny, nx) <= _MOST_KEPT else "nearest"
     image = axes.imshow(
-        colour, origin="upper", interpolation="nearest", aspect="equal" if square else "auto", **options
+        colour, origin="upper", interpolation=kept, aspect="equal" if square else "auto", **options
     )
+    image.set_cmap(image.get_cmap().with_extremes(bad=colours_of(axes).no_value))
     axes.set(xlabel="x (pixel)", ylabel="y (pixel)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(6, integer=True))

@@ -58,10 +58,6 @@ _FITS_CAPTION = (
     "expected) / √expected; the gray band is two standard deviations. A good fit has about one line "
     "in twenty beyond the band and no pattern. Uncertainties are standard errors of the fit."
 )
-_WORST_CAPTION = (
-    "The pixels of the poorest fit, the poorest first, drawn as above. With thousands of pixels the "
-    "poorest look odd by chance, too: q is the rate of false discoveries at which the pixel counts."
-)
 
 
 def cell_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
@@ -122,25 +118,6 @@ def pixel_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             fit_tables(data.pixels),
             partial(draw_pixels, pixels=data.pixels),
             PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
-        )
-    ]
-
-
-def worst_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
-    """Return the histograms of the pixels of the poorest fit."""
-    if not data.worst or not data.misfits or "goodness_q" not in data.fit:
-        return []
-    places = ", ".join(pixel.place for pixel in data.worst)
-    return [
-        Figure(
-            "worst_pixels",
-            "goodness",
-            "Pixels of the poorest fit",
-            _WORST_CAPTION,
-            f"Histograms with fitted densities and residuals: {places}.",
-            fit_tables(data.worst),
-            partial(draw_pixels, pixels=data.worst),
-            PAGE_MM if len(data.worst) > 1 else COLUMN_MM,
         )
     ]
 

@@ -73,7 +73,6 @@ def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             (table,),
             partial(draw_goodness, table=table, false_discovery_rate=rate),
             PAGE_MM,
-            raster=not is_strip(data.shape),
         )
     ]
 
@@ -95,7 +94,6 @@ def left_out_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             (DataTable({"share left out": share}),),
             partial(draw_left_out, share=share, n_frames=data.n_frames),
             PAGE_MM,
-            raster=not is_strip(data.shape),
         )
     ]
 

@@ -11,7 +11,9 @@ from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.style import COLUMN_MM, Look, drawing_bytes, small_png, without_collector
 
 #: SVG files beyond this size are embedded as PNG, which is drawn once more.
-_LARGEST_SVG = 260_000
+_LARGEST_SVG = 900_000
+#: Dots per inch of the PNG, and of images of more pixels than a page can show.
+_PAGE_DPI = 250
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,11 @@ class Drawn:
 
     Attributes:
         source: data URL.
-        narrow: data URL of the drawing for small screens; empty where the first serves.
         width, height: size on the page, px.
         files: file name to content.
     """
 
     source: str
-    narrow: str
     width: int
     height: int
     files: Mapping[str, bytes] = field(default_factory=dict)
@@ -38,6 +38,11 @@ class Picture:
 
     figure: Figure
     drawn: Drawn
+
+    @property
+    def wide(self) -> bool:
+        """Whether it takes the whole width of a page."""
+        return self.figure.width_mm > COLUMN_MM
 
 
 #: Draws many figures at once and returns them by name.
@@ -57,19 +62,13 @@ def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
         f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=settings.dpi, title=figure.title)
         for kind in settings.figure_formats
     }
-    svg, png = (files.get(f"{figure.name}.{kind}") for kind in ("svg", "png"))
-    if figure.raster:
-        source = _data_url(small_png(png or drawing_bytes(drawing, "png", dpi=settings.dpi)), "png")
+    svg = files.get(f"{figure.name}.svg") or drawing_bytes(drawing, "svg", dpi=_PAGE_DPI)
+    if len(svg) <= _LARGEST_SVG:
+        source = _data_url(svg, "svg+xml")
     else:
-        source = _line_drawing(
-            svg or drawing_bytes(drawing, "svg"), lambda: drawing_bytes(drawing, "png", dpi=200)
-        )
-    narrow = ""
-    if figure.width_mm > COLUMN_MM:
-        small = figure.draw(Look(COLUMN_MM))
-        narrow = _line_drawing(drawing_bytes(small, "svg"), lambda: drawing_bytes(small, "png", dpi=250))
+        source = _data_url(small_png(drawing_bytes(drawing, "png", dpi=_PAGE_DPI)), "png")
     width, height = drawing.get_size_inches() * 96.0
-    return Drawn(source, narrow, round(width), round(height), files)
+    return Drawn(source, round(width), round(height), files)
 
 
 def draw_here(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
@@ -77,15 +76,5 @@ def draw_here(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, 
     return {figure.name: draw_figure(figure, settings) for figure in figures}
 
 
-def longest_first(figures: Sequence[Figure]) -> list[Figure]:
-    """Return the figures in the order in which several workers finish soonest: wide ones are drawn twice."""
-    return sorted(figures, key=lambda figure: -figure.width_mm)
-
-
-def _line_drawing(svg: bytes, png: Callable[[], bytes]) -> str:
-    return _data_url(svg, "svg") if len(svg) <= _LARGEST_SVG else _data_url(small_png(png()), "png")
-
-
 def _data_url(content: bytes, kind: str) -> str:
-    media = "image/svg+xml" if kind == "svg" else "image/png"
-    return f"data:{media};base64,{base64.b64encode(content).decode('ascii')}"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"

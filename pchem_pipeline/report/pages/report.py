@@ -12,7 +12,7 @@ from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_
 from pchem_pipeline.report.inspector.inspector import content_policy, embedded, script
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
 from pchem_pipeline.report.pages.methods import method_tables
-from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here, longest_first
+from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import report_json
 from pchem_pipeline.report.pages.sections import Material, page_sections
 from pchem_pipeline.report.pages.tables import result_tables
@@ -51,7 +51,7 @@ def render_report(
     """
     settings = settings or ReportSettings()
     shown, others = report_figures(data, settings), discrepancy_figures(data.discrepancy)
-    drawn = (draw or draw_here)(longest_first([*shown, *others]), settings)
+    drawn = (draw or draw_here)([*shown, *others], settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
     pictures, evidence = (
         [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)

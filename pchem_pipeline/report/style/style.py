@@ -5,6 +5,7 @@ Figures are made with matplotlib's objects alone (no ``pyplot``), so that drawin
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import functools
 import gc
@@ -233,6 +234,7 @@ _PATH = re.compile(rb' d="[^"]*"')
 _DIGITS = re.compile(rb"(\.\d\d)\d+")
 _BLANKS = re.compile(rb"(?<=[MLQC]) | ?\n")
 _BETWEEN = re.compile(rb">\s+<")
+_IMAGE = re.compile(rb"(?<=data:image/png;base64,)[A-Za-z0-9+/=\s]+")
 
 
 def drawing_bytes(drawing: Drawing, kind: str, *, dpi: int = 300, title: str = "") -> bytes:
@@ -250,7 +252,8 @@ def drawing_bytes(drawing: Drawing, kind: str, *, dpi: int = 300, title: str = "
 
 
 def _compact(svg: bytes) -> bytes:
-    """Return an SVG in which paths are given to a hundredth of a point, without blanks: a quarter less."""
+    """Return an SVG with paths to 0.01 pt, images of 256 colours, no blanks: a quarter less."""
+    svg = _IMAGE.sub(lambda image: base64.b64encode(small_png(base64.b64decode(image.group()))), svg)
     short = _PATH.sub(lambda path: _BLANKS.sub(b"", _DIGITS.sub(rb"\1", path.group())), svg)
     return _BETWEEN.sub(b"><", short)
 
@@ -258,6 +261,8 @@ def _compact(svg: bytes) -> bytes:
 def small_png(png: bytes) -> bytes:
     """Return a PNG with a palette of 256 colours: a third of the size, no visible change."""
     with Image.open(io.BytesIO(png)) as image:
+        if image.mode == "RGBA" and image.getextrema()[3][0] < 255:
+            return png  # a palette has no transparent colours
         few = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     few.save(buffer, "PNG", compress_level=_COMPRESSION)

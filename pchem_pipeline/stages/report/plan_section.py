@@ -18,7 +18,7 @@ __all__ = ["plan_section"]
 
 _TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
 _DRAWN = _TARGETS[:2]
-_FINE = 22  # points along each axis of the figure
+_FINE = 14  # points along each axis of the figure
 
 
 def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:

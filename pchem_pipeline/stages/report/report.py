@@ -84,7 +84,8 @@ def run(context: StageContext) -> None:
         context.config,
         context.integration_time,
         _stage_rows(context),
-        draw_by_workers(context.executor.workers, context.reporter, context.stage),
+        # in this process: another would spend more on importing matplotlib than on its share of the figures
+        draw_by_workers(1, context.reporter, context.stage),
     )
     done = context.run_units([WHOLE], task, unit_name="report")
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
@@ -145,27 +146,24 @@ def gather(
         StoreError: maps or histograms are missing.
     """
     run = read_run(store)
-    shape, shown, worst = run.sensor.shape, _shown(run, config), _worst(run)
+    shape, shown = run.sensor.shape, _shown(run, config)
     full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
-    index = np.concatenate([pixel_index([*shown, *worst], shape), full.index])
+    index = np.concatenate([pixel_index(shown, shape), full.index])
     histograms = read_histograms(store, index, shape, run.model)
     maps, exact = read_maps(store, shape, full.index)
     # from here on nothing is read
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
-    drawn = slice(0, len(shown) + len(worst))
+    drawn = slice(0, len(shown))
     held, some = slice(drawn.stop, None), slice(0, drawn.stop + _SOME_MASSES)
     masses = bin_masses([c[some] for c in columns], histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
-    fits = pixel_fits(
-        [*shown, *worst], run.maps, run.fit, histograms.of(drawn), masses[drawn], channel=channel
-    )
+    fits = pixel_fits(shown, run.maps, run.fit, histograms.of(drawn), masses[drawn], channel=channel)
     deciding = deciding_parameters([c[held] for c in columns], run.model.at(index[held]))
     kept = histograms.of(held)
     sample = PixelSample(full.index, exact, kept.origin, kept.counts, deciding, masses[held], full.reasons)
     return replace(
         report_data(run, config, integration_time, stages),
-        pixels=fits[: len(shown)],
-        worst=fits[len(shown) :],
+        pixels=fits,
         inspector=inspector_data(run.name, shape, maps, sample),
         quick_look=run_quick_look(store, run),
     )
@@ -179,12 +177,6 @@ def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
     return chosen
-
-
-def _worst(run: StoredRun) -> list[Chosen]:
-    """Return the pixels of the poorest fit."""
-    rows = run.facts["maps"].get("goodness", {}).get("worst", ())
-    return [(f"q = {row['q']:.2g}", row["y"], row["x"]) for row in rows]
 
 
 def _suspects(run: StoredRun) -> list[tuple[int, int]]:

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers.report_material import report_data
 
@@ -17,7 +16,7 @@ from pchem_pipeline.compute import fresh_processes
 from pchem_pipeline.compute.executor import SerialExecutor, Stop
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
 from pchem_pipeline.report.figures.catalogue import report_figures
-from pchem_pipeline.report.pages.pictures import Drawn, draw_figure, longest_first
+from pchem_pipeline.report.pages.pictures import Drawn, draw_figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_executor
@@ -74,13 +73,9 @@ def test_figures_are_the_same_whoever_draws_them() -> None:
     assert all(isinstance(drawn, Drawn) and drawn.files for drawn in here.values())
 
 
-def test_one_worker_draws_here_and_wide_figures_come_first() -> None:
+def test_one_worker_draws_here() -> None:
     assert isinstance(drawing_executor(1, 9), SerialExecutor)
     assert isinstance(drawing_executor(8, 1), SerialExecutor)
-    figures = report_figures(report_data((12, 16)), QUICK)
-    order = longest_first(figures)
-    assert {figure.name for figure in order} == {figure.name for figure in figures}
-    assert np.all(np.diff([figure.width_mm for figure in order]) <= 0)
 
 
 def test_a_process_whose_parent_is_gone_ends_without_a_word() -> None:

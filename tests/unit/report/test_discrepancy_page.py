@@ -74,7 +74,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
     def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
-        return {figure.name: Drawn("data:image/png;base64,AA==", "", 10, 10) for figure in figures}
+        return {figure.name: Drawn("data:image/png;base64,AA==", 10, 10) for figure in figures}
 
     monkeypatch.setattr(report_module, "draw_here", dots)
 

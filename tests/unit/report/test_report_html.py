@@ -139,7 +139,8 @@ def test_tables_have_headings_and_scroll_by_keyboard(page: Page) -> None:
     scopes = [a.get("scope") for a in page.of("th")]
     assert scopes
     assert set(scopes) == {"col", "row"}
-    regions = [a for a in page.of("div") if a.get("role") == "region"]
+    regions = [a for a in page.of("div") if a.get("class") == "scroll"]
+    assert all(a["role"] == "region" for a in regions)
     assert len(regions) == len(list(page.of("table")))
     assert all(a["tabindex"] == "0" for a in regions)
 
@@ -174,7 +175,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
     def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
-        return {figure.name: Drawn("data:image/png;base64,AA==", "", 10, 10) for figure in figures}
+        return {figure.name: Drawn("data:image/png;base64,AA==", 10, 10) for figure in figures}
 
     monkeypatch.setattr(report_module, "draw_here", dots)
 
