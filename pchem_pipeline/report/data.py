@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
+from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
@@ -186,6 +187,7 @@ class ReportData:
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
         quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
+        sums: of frames, rows, columns and blocks of frames; None where the run keeps none.
         inspector: maps and pixels to look at in the browser, or None.
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
@@ -222,6 +224,7 @@ class ReportData:
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
     quick_look: QuickLook | None = None
+    sums: StackSums | None = None
     inspector: InspectorData | None = None
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None

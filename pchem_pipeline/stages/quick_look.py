@@ -27,8 +27,13 @@ _MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22
 _PIXELS, _PIECES, _FEWEST = 1024, 8, 16
 
 
-def run_quick_look(store: RunStore, run: StoredRun) -> QuickLook | None:
+def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> QuickLook | None:
     """Return the quick look at a run; None where no pixel has parameters.
+
+    Args:
+        store: the run.
+        run: what was read of it.
+        sums: of :func:`read_sums`.
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -38,7 +43,6 @@ def run_quick_look(store: RunStore, run: StoredRun) -> QuickLook | None:
         return None
     model = tuple(effect.tag for effect in run.model.effects)
     missing: dict[str, str] = {}
-    sums = read_sums(store)
     if sums is None:
         why = store.attributes("summary").get("missing", "the stage histogram has none")
         missing["rows, columns, frames, neighbours and lags"] = str(why)

@@ -80,6 +80,12 @@ SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         ),
     ),
     (
+        "stability",
+        "Stability and structure",
+        "From sums over all pixels and frames: what moves, and what repeats along rows and columns.",
+        (),
+    ),
+    (
         "ensemble",
         "The sensor as a whole",
         "If the model holds, the parameters of the pixels predict the distribution of all raw data taken "

@@ -25,7 +25,7 @@ from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
-from pchem_pipeline.stages.quick_look import run_quick_look
+from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
 from pchem_pipeline.stages.report.drawing import draw_by_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
@@ -151,7 +151,8 @@ def gather(
     index = np.concatenate([pixel_index(shown, shape), full.index])
     histograms = read_histograms(store, index, shape, run.model)
     maps, exact = read_maps(store, shape, full.index)
-    # from here on nothing is read
+    sums = read_sums(store)
+    # from here on little is read
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
     drawn = slice(0, len(shown))
     held, some = slice(drawn.stop, None), slice(0, drawn.stop + _SOME_MASSES)
@@ -165,7 +166,8 @@ def gather(
         report_data(run, config, integration_time, stages),
         pixels=fits,
         inspector=inspector_data(run.name, shape, maps, sample),
-        quick_look=run_quick_look(store, run),
+        quick_look=run_quick_look(store, run, sums),
+        sums=sums,
     )
 
 

@@ -1,0 +1,283 @@
+"""Figures of stability and structure: means of frames, rows and columns, and their spectra.
+
+All are made of the sums that the stage ``histogram`` keeps; what chance alone does is drawn beside them.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import Drawing, Look, colours_of, styled
+from pchem_pipeline.report.style.wording import count, short
+
+__all__ = [
+    "frame_table",
+    "line_spectra",
+    "pattern_spectra",
+    "power_table",
+    "profile_table",
+    "stability_figures",
+]
+
+FloatArray = NDArray[np.float64]
+
+#: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
+_MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
+#: Frames, rows or columns that a spectrum needs.
+_FEWEST = 8
+_LINES = ("row", "column")
+#: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
+_CLIP = 6.0
+_WIDTH = 1.2533  # standard error of a median over that of a mean
+
+_FRAMES = (
+    "Top: mean of all pixels{averaged}; gray: two standard errors of independent pixels. Below: its power "
+    "spectrum over that of independent pixels (1): mean, and largest, of neighbouring frequencies."
+)
+_PROFILES = (
+    "Median over each row and column of the pixels' mean signal; gray: two standard errors about the median "
+    "of the sensor, where unrelated pixels put it."
+)
+_SPECTRA = (
+    "Top: of the fixed pattern, the means of rows and columns over all frames, hot pixels clipped. "
+    "Below: of their noise, what they do from frame to frame. 1 is what unrelated pixels give."
+)
+
+
+def stability_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+    """Return means against frame, row and column, and their spectra, where the run has the sums."""
+    sums = data.sums
+    if sums is None:
+        return []
+    makers = (_frame_figure, _profile_figure, _spectrum_figure)
+    return [figure for make in makers if (figure := make(sums)) is not None]
+
+
+def _frame_figure(sums: StackSums) -> Figure:
+    means, power = frame_table(sums), power_table(sums)
+    together = math.ceil(sums.n_frames / _MOST_POINTS)
+    averaged = f" over {together} frames each" if together > 1 else " of each frame"
+    error = float(means["error of chance"][0])
+    scatter = float(means["mean"].std())
+    alt = (
+        f"Mean of {count(sums.n_frames, 'frame')}: {short(float(means['mean'].mean()), 5)} DN, scatter "
+        f"{short(scatter)} DN where independent pixels give {short(error)} DN; largest power "
+        f"{short(float(power['largest'].max()), 2)} times chance."
+    )
+    return Figure(
+        "frame_means", "stability", "Mean of the frames", _FRAMES.format(averaged=averaged), alt,
+        (means, power), partial(draw_frames, means=means, power=power),
+    )  # fmt: skip
+
+
+def _profile_figure(sums: StackSums) -> Figure | None:
+    tables = [profile_table(sums, axis) for axis in (0, 1) if sums.shape[1 - axis] > 1]
+    tables = [table for table in tables if table["mean signal"].size > 1]
+    if not tables:
+        return None
+    words = []
+    for table in tables:
+        low, high = (table[name] for name in ("chance from", "chance to"))
+        outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
+        words.append(f"{outside} of {count(low.size, table.part)} outside of what chance does")
+    return Figure(
+        "profiles", "stability", "Profiles of rows and columns", _PROFILES,
+        f"Profiles of the mean signal: {'; '.join(words)}.",
+        tuple(tables), partial(draw_profiles, tables=tuple(tables)),
+    )  # fmt: skip
+
+
+def _spectrum_figure(sums: StackSums) -> Figure | None:
+    fixed, temporal = pattern_spectra(sums), line_spectra(sums)
+    if not fixed or not temporal:
+        return None
+    largest = [
+        f"{table.part.replace('_', ' of ')}s {short(float(table['power'].max()), 2)}"
+        for table in (*fixed, *temporal)
+    ]
+    return Figure(
+        "spatial_spectra", "stability", "Spectra of rows and columns", _SPECTRA,
+        f"Largest power over chance: {', '.join(largest)}.",
+        (*fixed, *temporal), partial(draw_spectra, fixed=fixed, temporal=temporal),
+    )  # fmt: skip
+
+
+def frame_table(sums: StackSums) -> DataTable:
+    """Return the mean of all pixels in each frame, or in as many together as a curve can show."""
+    together = math.ceil(sums.n_frames / _MOST_POINTS)
+    starts = np.arange(0, sums.n_frames, together)
+    lengths = np.diff(np.append(starts, sums.n_frames))
+    means = np.add.reduceat(sums.frame_mean, starts) / lengths
+    columns = {"frame": starts, "mean": means, "error of chance": _chance(sums) / np.sqrt(lengths)}
+    return DataTable(columns, {"mean": "DN", "error of chance": "DN"})
+
+
+def _chance(sums: StackSums) -> float:
+    """Return the standard deviation of a frame's mean over independent pixels, DN."""
+    return float(np.sqrt(np.nansum(sums.variance)) / sums.variance.size)
+
+
+def power_table(sums: StackSums) -> DataTable:
+    """Return the power spectrum of the frames' means over that of independent pixels, by frequency."""
+    series = sums.frame_mean - sums.frame_mean.mean()
+    power = np.abs(np.fft.rfft(series)[1:]) ** 2 / series.size / max(_chance(sums) ** 2, 1e-300)
+    frequency = np.arange(1, power.size + 1) / series.size
+    edges = np.unique(np.geomspace(1, power.size + 1, _MOST_FREQUENCIES).astype(np.int64)) - 1
+    starts = edges[:-1] if edges.size > 1 else edges
+    lengths = np.diff(np.append(starts, power.size))
+    columns = {
+        "frequency": np.add.reduceat(frequency, starts) / lengths,
+        "power": np.add.reduceat(power, starts) / lengths,
+        "largest": np.maximum.reduceat(power, starts),
+    }
+    return DataTable(columns, {"frequency": "1/frame"}, "spectrum")
+
+
+def _mean_signal(sums: StackSums) -> FloatArray:
+    """Return the mean of each pixel over the frames whose sums are at hand, DN."""
+    return np.asarray(sums.block_sum.sum(axis=0) / float(sums.lengths.sum()))
+
+
+def _robust(values: FloatArray) -> tuple[float, float]:
+    middle = float(np.median(values))
+    return middle, 1.4826 * float(np.median(np.abs(values - middle)))
+
+
+def profile_table(sums: StackSums, axis: int) -> DataTable:
+    """Return the median of the pixels' means over each row (axis 0) or column (axis 1), and chance.
+
+    Chance are two standard errors of the median of that many pixels drawn from the whole sensor.
+    """
+    image = _mean_signal(sums)
+    middle, width = _robust(image)
+    reach = 2.0 * _WIDTH * width / math.sqrt(image.shape[1 - axis])
+    medians = np.median(image, axis=1 - axis)
+    columns = {
+        "yx"[axis]: np.arange(medians.size),
+        "mean signal": medians,
+        "chance from": np.full(medians.size, middle - reach),
+        "chance to": np.full(medians.size, middle + reach),
+    }
+    return DataTable(columns, {"yx"[axis]: "pixel"} | dict.fromkeys(list(columns)[1:], "DN"), _LINES[axis])
+
+
+def pattern_spectra(sums: StackSums) -> tuple[DataTable, ...]:
+    """Return the power of the means of rows and columns by frequency, over that of unrelated pixels."""
+    image = _mean_signal(sums)
+    middle, width = _robust(image)
+    image = np.clip(image - middle, -_CLIP * width, _CLIP * width)
+    found = []
+    for axis, line in enumerate(_LINES):
+        if image.shape[axis] < _FEWEST:
+            continue
+        power = np.abs(np.fft.rfft(image.mean(axis=1 - axis))[1:]) ** 2
+        chance = max(float(image.var()), 1e-300) * image.shape[axis] / image.shape[1 - axis]
+        found.append(_spectrum(power / chance, image.shape[axis], f"pattern_{line}", line))
+    return tuple(found)
+
+
+def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
+    """Return the power of what rows, and columns, do within a frame by frequency, over independent pixels."""
+    lines = (sums.rows, sums.columns)
+    return tuple(
+        _spectrum(_line_power(each, length), length, f"noise_{line}", line)
+        for each, length, line in zip(lines, sums.shape, _LINES, strict=True)
+        if length >= _FEWEST and each.freedom > 1
+    )
+
+
+def _line_power(lines: Lines, length: int) -> FloatArray:
+    """Return the mean power of the sums of lines along the sensor, over that of independent pixels."""
+    values = lines.values.reshape(-1, length)
+    power = (np.abs(np.fft.rfft(values, axis=1)) ** 2).sum(axis=0)[1:] / length
+    groups = lines.variance.size // length
+    return np.asarray(power / max(lines.freedom * groups * float(lines.variance.mean()), 1e-300))
+
+
+def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable:
+    frequency = np.arange(1, power.size + 1) / length
+    return DataTable({"frequency": frequency, "power": power}, {"frequency": f"1/{unit}"}, part)
+
+
+@styled
+def draw_frames(look: Look, *, means: DataTable, power: DataTable) -> Drawing:
+    """Draw the mean of the frames, and its spectrum below.
+
+    Args:
+        look: width and colours.
+        means: of :func:`frame_table`.
+        power: of :func:`power_table`.
+    """
+    drawing, colours = look.empty(88.0), look.palette
+    top, bottom = drawing.subplots(2, 1)
+    centre, error = float(means["mean"].mean()), means["error of chance"]
+    top.fill_between(means["frame"], centre - 2 * error, centre + 2 * error, color=colours.band, linewidth=0)
+    top.plot(means["frame"], means["mean"], color=colours.blue, linewidth=0.7)
+    top.set(xlabel="frame", ylabel="mean (DN)")
+    top.ticklabel_format(useOffset=False)
+    bottom.loglog(power["frequency"], power["largest"], color=colours.sky, linewidth=0.6)
+    bottom.loglog(power["frequency"], power["power"], color=colours.blue)
+    _one(bottom)
+    bottom.set(xlabel="frequency (1/frame)", ylabel="power / chance")
+    return drawing
+
+
+@styled
+def draw_profiles(look: Look, *, tables: tuple[DataTable, ...]) -> Drawing:
+    """Draw the profiles of rows and columns.
+
+    Args:
+        look: width and colours.
+        tables: of :func:`profile_table`.
+    """
+    drawing, colours = look.empty(44.0 * len(tables)), look.palette
+    for axes, table in zip(drawing.subplots(len(tables), 1, squeeze=False)[:, 0], tables, strict=True):
+        name = next(iter(table.columns))
+        axes.fill_between(
+            table[name], table["chance from"], table["chance to"], color=colours.band, linewidth=0
+        )
+        axes.plot(table[name], table["mean signal"], color=colours.blue, linewidth=0.8)
+        axes.set(xlabel=f"{table.part} {name} (pixel)", ylabel="median (DN)")
+        axes.ticklabel_format(useOffset=False)
+    return drawing
+
+
+@styled
+def draw_spectra(look: Look, *, fixed: tuple[DataTable, ...], temporal: tuple[DataTable, ...]) -> Drawing:
+    """Draw spatial spectra of the fixed pattern, and below of the noise of rows and columns.
+
+    Args:
+        look: width and colours.
+        fixed: of :func:`pattern_spectra`.
+        temporal: of :func:`line_spectra`.
+    """
+    drawing = look.empty(88.0)
+    titles = ("fixed pattern", "noise")
+    for axes, tables, title in zip(drawing.subplots(2, 1), (fixed, temporal), titles, strict=True):
+        axes.set_title(title)
+        for table in tables:
+            line = table.part.split("_")[1]
+            colour = look.palette.blue if line == "row" else look.palette.vermilion
+            axes.semilogy(table["frequency"], table["power"], color=colour, linewidth=0.8, label=f"{line}s")
+        _one(axes)
+        axes.set(xlabel="frequency (1/row, 1/column)", ylabel="power / chance", xlim=(0.0, 0.5))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2)
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.09), max(high, 11.0))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    return drawing
+
+
+def _one(axes: Axes) -> None:
+    """Draw the line of chance."""
+    axes.axhline(1.0, color=colours_of(axes).ink, linewidth=0.6, linestyle="--", zorder=1)
