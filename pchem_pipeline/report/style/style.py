@@ -261,7 +261,7 @@ def _compact(svg: bytes) -> bytes:
 def small_png(png: bytes) -> bytes:
     """Return a PNG with a palette of 256 colours: a third of the size, no visible change."""
     with Image.open(io.BytesIO(png)) as image:
-        if image.mode == "RGBA" and image.getextrema()[3][0] < 255:
+        if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] != 255:
             return png  # a palette has no transparent colours
         few = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
