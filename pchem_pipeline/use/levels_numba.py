@@ -18,7 +18,7 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cells_of, component, resolve
 from pchem_pipeline.model.law.electron_laws_numba import FARTHEST, electron_number, normal_tail
 from pchem_pipeline.model.law.mass_numba import _make_room, _theta_of
-from pchem_pipeline.model.law.pixel_numba import FIRST, N_BINS, OWN, SHARE, SHARE_SLOPE, Pixel
+from pchem_pipeline.model.law.pixel_numba import EDGE, FIRST, N_BINS, OWN, SHARE, SHARE_SLOPE, Pixel
 
 __all__ = ["NO_PRIOR", "estimate_exposures", "fill_tables"]
 
@@ -101,10 +101,10 @@ def _tail_between(lower: float, upper: float, mean: float, sd: float, table: Flo
 def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
     """Add the mass of whole codes, each of whose edges is that of the next one."""
     inverse = 1.0 / part.sd
-    before = (cells.edges[low] - part.mean) * inverse if low < high else 0.0
+    before = (cells.bins[EDGE, low] - part.mean) * inverse if low < high else 0.0
     below, _ = normal_tail(before, cells.table)
     for i in range(low, high):
-        z = (cells.edges[i + 1] - part.mean) * inverse
+        z = (cells.bins[EDGE, i + 1] - part.mean) * inverse
         above, _ = normal_tail(z, cells.table)
         inside = above - below
         if before <= 0.0 < z:
@@ -152,8 +152,8 @@ def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
                 whole = math.floor(value + 0.5)
                 aside = value - whole
                 share[place + i - low] += weight * _tail_between(
-                    cells.edges[whole] + aside,
-                    cells.edges[whole + 1] + aside,
+                    cells.bins[EDGE, whole] + aside,
+                    cells.bins[EDGE, whole + 1] + aside,
                     part.mean,
                     part.sd,
                     cells.table,

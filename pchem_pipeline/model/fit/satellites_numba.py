@@ -64,7 +64,8 @@ def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
     own = scratch.small[OWN]
     for j in range(pixel.facts.shape[0]):
         own_theta(pixel, j, theta, own)
-        fill_masses(own, cells_of(pixel, j), np.int64(CORE), scratch.numbers, scratch.cells[j])
+        cells = cells_of(pixel, j)
+        fill_masses(own, cells, np.int64(CORE), scratch.numbers, scratch.edges, scratch.cells[j])
 
 
 @kernel(borrows=True)

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.electron_laws_numba import FARTHEST, electron_number, normal_tail
+from pchem_pipeline.model.law.electron_laws_numba import FARTHEST, electron_number
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     ADDED_WEIGHT,
-    AT_EDGES,
     BIAS,
     BOTTOM,
     CENTRE,
@@ -34,9 +33,11 @@ from pchem_pipeline.model.law.pixel_numba import (
     CURVATURE,
     DAMPING,
     DARK,
+    DENSITY,
     DISPERSION,
     EDGE,
     EDGE_FIRST,
+    EDGES_KEPT,
     EXPECTED,
     EXPOSURE_FACTOR,
     EXPOSURE_WEIGHT,
@@ -59,6 +60,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     OWN,
     PER_ELECTRON,
     PER_ELECTRON2,
+    PER_MASS,
     RATIO,
     RIGHT,
     SATELLITE,
@@ -70,11 +72,24 @@ from pchem_pipeline.model.law.pixel_numba import (
     SHIFT_SIGMA,
     SLOPES,
     STEP,
+    TAIL,
     TOP,
     WEIGHT,
     WIDTH,
+    Z_DENSITY,
     Pixel,
     Scratch,
+)
+from pchem_pipeline.model.law.simd_math_numba import lanes_log, lanes_tail
+from pchem_pipeline.model.law.simd_numba import (
+    LANES,
+    counting,
+    fused,
+    least,
+    load_lanes,
+    most,
+    store_lanes,
+    sum_lanes,
 )
 
 # places in a sample's own parameters
@@ -87,6 +102,7 @@ _OUTLIER = (1e-9, 1e-40, 0.0)
 #: Stages of :func:`fill_masses`: as far out as most samples lie, down to 1e-50, to the ends of the tails.
 CORE, NEAR, EXACT = range(3)
 LEAST_MASS = 1e-300
+_TO_ONE = 1e306  # makes 1 of a mass that counts
 _LEAST_VARIANCE = 1e-6  # DN^2
 _NO_ELECTRONS = -60.0  # log H of a sample without electrons
 
@@ -121,9 +137,8 @@ class Cells(NamedTuple):
     """One sample: its counts, the edges of its cells, and what the law says of it.
 
     Attributes:
-        weights: counts, shape (at least n_bins,).
-        kept: 1 for codes that are not set aside.
-        edges: lower edges of the cells and the upper edge of the last one, less the centre; infinite where
+        bins: counts, lower edges of the cells and the upper edge of the last one, less the centre, and 1 for
+            codes that are not set aside, see :class:`.pixel_numba.Pixel`; an edge is infinite where
             everything beyond is counted in the cell.
         n_bins: cells in use.
         bottom: last edge at minus infinity, -1 without one.
@@ -142,9 +157,7 @@ class Cells(NamedTuple):
         outlier_share, outlier_mass: of samples that can be anything, and in each code.
     """
 
-    weights: NDArray[np.float64]
-    kept: NDArray[np.float64]
-    edges: NDArray[np.float64]
+    bins: NDArray[np.float64]
     n_bins: int
     bottom: int
     top: int
@@ -259,6 +272,8 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
                 edges[i], bottom = -math.inf, i
             elif code + i > facts[CLIP_HIGH]:
                 edges[i], top = math.inf, min(top, i)
+        for i in range(n_bins + 1, n_bins + 1 + LANES):
+            edges[i] = math.inf
         facts[BOTTOM], facts[TOP], facts[MARGIN] = float(bottom), float(top), margin
     set_peaks(law, index, amplitude, pixel)
 
@@ -268,9 +283,7 @@ def cells_of(pixel: Pixel, j: int) -> Cells:
     """Return one sample as the loops below take it."""
     bins, facts = pixel.bins[j], pixel.facts[j]
     return Cells(
-        bins[WEIGHT],
-        bins[KEPT],
-        bins[EDGE],
+        bins,
         int(facts[N_BINS]),
         int(facts[BOTTOM]),
         int(facts[TOP]),
@@ -304,7 +317,7 @@ def _level(k: float, cells: Cells) -> float:
 
 @kernel(borrows=True)
 def component(k: float, peak: int, theta: NDArray[np.float64], cells: Cells, reach: float) -> Component:
-    """Return one electron number at one level; ``low >= high`` where it does not reach the cells."""
+    """Return one electron number at one level; ``low >= high`` where it gives nothing to the cells."""
     a, analog2 = theta[_STEP], math.exp(theta[_VARIANCE])
     peaks = cells.peaks
     charge = _level(k, cells) + peaks[SHIFT_E, peak]
@@ -321,6 +334,8 @@ def component(k: float, peak: int, theta: NDArray[np.float64], cells: Cells, rea
     # what lies beyond the limits belongs to the first or last code that comes out
     high = min(max(high, cells.bottom + 1), cells.n_bins)
     low = max(min(low, cells.top - 1), 0)
+    if peaks[SHARE, peak] + theta[_SATELLITE] * peaks[SHARE_SLOPE, peak] == peaks[SHARE_SLOPE, peak] == 0.0:
+        high = low
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
 
@@ -366,22 +381,81 @@ def _list_numbers(
     return count
 
 
+@kernel(inline=True)
+def _place_for(part: Component, place: int) -> tuple[int, int]:
+    """Return where the edges of a component are kept, and where those of the next one; where only for now."""
+    width = part.high - part.low + 1 + LANES
+    if place + width <= EDGES_KEPT:
+        return place, place + width
+    return EDGES_KEPT, EDGES_KEPT
+
+
 @kernel(borrows=True)
-def _fill_edges(
-    edges: NDArray[np.float64], part: Component, table: NDArray[np.float64], out: NDArray[np.float64]
-) -> int:
-    """Fill tail, density and z times density at the edges within reach; return the cell of the mean."""
-    middle: int = part.low - 1
-    inverse = 1.0 / part.sd
-    for i in range(part.low, part.high + 1):
-        z = (edges[i] - part.mean) * inverse
-        tail, density = normal_tail(z, table)
-        out[0, i] = tail
-        out[1, i] = density
-        out[2, i] = z * density if density > 0.0 else 0.0
-        if z <= 0.0:
-            middle = i
+def _fill_edges(bins: NDArray[np.float64], part: Component, edges: NDArray[np.float64], place: int) -> None:
+    """Fill tail, density and z times density at the edges within reach from column ``place`` on."""
+    mean, inverse = part.mean, 1.0 / part.sd
+    behind = place
+    for i in range(part.low, part.high + 1, LANES):
+        tail, density, by_z = lanes_tail((load_lanes(bins, EDGE, i) - mean) * inverse)
+        store_lanes(edges, TAIL, behind, tail)
+        store_lanes(edges, DENSITY, behind, density)
+        store_lanes(edges, Z_DENSITY, behind, by_z)
+        behind += LANES
+    for row in range(3):  # the last cell of the last lanes has no other edge
+        edges[row, behind] = edges[row, behind - 1]
+
+
+@kernel(inline=True)
+def _cell_of(mean: float, cells: Cells, part: Component) -> int:
+    """Return the cell that holds a mean, if it is one within reach, or one outside."""
+    middle = int(min(max(mean - cells.first, part.low - 1.0), float(part.high)))
+    while middle < part.high and cells.bins[EDGE, middle + 1] <= mean:
+        middle += 1
+    while middle >= part.low and cells.bins[EDGE, middle] > mean:
+        middle -= 1
     return middle
+
+
+@kernel(inline=True)
+def _add_component(
+    row: NDArray[np.float64],
+    peak: int,
+    satellite: float,
+    cells: Cells,
+    part: Component,
+    edges: NDArray[np.float64],
+    place: int,
+    room: NDArray[np.float64],
+) -> None:
+    """Add what an electron number gives at one level to mass and slopes of the cells within reach."""
+    share_slope = cells.peaks[SHARE_SLOPE, peak]
+    share = cells.peaks[SHARE, peak] + satellite * share_slope
+    w, w_exposure, w_satellite = row[1] * share, row[2] * share, row[1] * share_slope
+    by_mean, by_variance = -w / part.sd, -0.5 * w / part.variance
+    step1, step2 = by_mean * part.mean_step, by_variance * part.variance_step
+    log1, log2 = by_mean * part.mean_log, by_variance * part.variance_log
+    for i in range(part.low, part.high, LANES):
+        c = place + i - part.low
+        d0 = load_lanes(edges, TAIL, c + 1) - load_lanes(edges, TAIL, c)
+        d1 = load_lanes(edges, DENSITY, c + 1) - load_lanes(edges, DENSITY, c)
+        d2 = load_lanes(edges, Z_DENSITY, c + 1) - load_lanes(edges, Z_DENSITY, c)
+        store_lanes(room, MASS, i, fused(d0, w, load_lanes(room, MASS, i)))
+        slope = fused(d0, w_exposure, load_lanes(room, SLOPES + _EXPOSURE, i))
+        store_lanes(room, SLOPES + _EXPOSURE, i, slope)
+        slope = fused(d1, step1, fused(d2, step2, load_lanes(room, SLOPES + _STEP, i)))
+        store_lanes(room, SLOPES + _STEP, i, slope)
+        slope = fused(d1, by_mean, load_lanes(room, SLOPES + _BIAS, i))
+        store_lanes(room, SLOPES + _BIAS, i, slope)
+        slope = fused(d1, log1, fused(d2, log2, load_lanes(room, SLOPES + _VARIANCE, i)))
+        store_lanes(room, SLOPES + _VARIANCE, i, slope)
+        if w_satellite != 0.0:
+            slope = fused(d0, w_satellite, load_lanes(room, SLOPES + _SATELLITE, i))
+            store_lanes(room, SLOPES + _SATELLITE, i, slope)
+    middle = _cell_of(part.mean, cells, part)
+    if part.low <= middle < part.high:  # both tails are those beyond its edges
+        room[MASS, middle] += w
+        room[SLOPES + _EXPOSURE, middle] += w_exposure
+        room[SLOPES + _SATELLITE, middle] += w_satellite
 
 
 @kernel(borrows=True)
@@ -390,6 +464,7 @@ def fill_masses(
     cells: Cells,
     stage: int,
     numbers: NDArray[np.float64],
+    edges: NDArray[np.float64],
     room: NDArray[np.float64],
 ) -> int:
     """Fill mass and slopes of all cells; return how many electron numbers there are.
@@ -399,56 +474,39 @@ def fill_masses(
         cells: of the sample.
         stage: how far the tails go, see `CORE`.
         numbers: out, electron numbers in use.
+        edges: out, of the components, see :class:`.pixel_numba.Scratch`.
         room: rows of the sample in a scratch's ``cells``; out: masses and slopes.
     """
     reach, cut = _REACH[stage], _CUT[stage]
-    mass, slopes, at = room[MASS], room[SLOPES:AT_EDGES], room[AT_EDGES:]
-    for i in range(cells.n_bins):
-        mass[i] = 0.0
-        for j in range(N_BLOCK):
-            slopes[j, i] = 0.0
+    for row in range(N_BLOCK + 1):
+        for i in range(0, cells.n_bins, LANES):
+            store_lanes(room, MASS if row == 0 else SLOPES + row - 1, i, 0.0)
     count: int = _list_numbers(theta, cells, reach, cut, numbers)
+    following = count - count
     for row in range(count):
-        k = numbers[row, 0]
         for peak in range(cells.n_peaks):
-            share_slope = cells.peaks[SHARE_SLOPE, peak]
-            share = cells.peaks[SHARE, peak] + theta[_SATELLITE] * share_slope
-            if share == 0.0 and share_slope == 0.0:
-                continue
-            part = component(k, peak, theta, cells, reach)
+            part = component(numbers[row, 0], peak, theta, cells, reach)
             if part.low >= part.high:
                 continue
-            middle = _fill_edges(cells.edges, part, cells.table, at)
-            w = numbers[row, 1] * share
-            w_exposure = numbers[row, 2] * share
-            w_satellite = numbers[row, 1] * share_slope
-            by_mean, by_variance = -w / part.sd, -0.5 * w / part.variance
-            step1, step2 = by_mean * part.mean_step, by_variance * part.variance_step
-            log1, log2 = by_mean * part.mean_log, by_variance * part.variance_log
-            for i in range(part.low, part.high):
-                d0 = at[0, i + 1] - at[0, i]
-                if i == middle:
-                    d0 += 1.0
-                d1 = at[1, i + 1] - at[1, i]
-                d2 = at[2, i + 1] - at[2, i]
-                mass[i] += w * d0
-                slopes[_EXPOSURE, i] += w_exposure * d0
-                slopes[_STEP, i] += step1 * d1 + step2 * d2
-                slopes[_BIAS, i] += by_mean * d1
-                slopes[_VARIANCE, i] += log1 * d1 + log2 * d2
-                slopes[_SATELLITE, i] += w_satellite * d0
+            place, following = _place_for(part, following)
+            _fill_edges(cells.bins, part, edges, place)
+            _add_component(numbers[row], peak, theta[_SATELLITE], cells, part, edges, place, room)
     if cells.outlier_share > 0.0:
         rest = 1.0 - cells.outlier_share
         for i in range(cells.n_bins):
-            mass[i] = rest * mass[i] + cells.outlier_mass
+            room[MASS, i] = rest * room[MASS, i] + cells.outlier_mass
             for j in range(N_BLOCK):
-                slopes[j, i] *= rest
+                room[SLOPES + j, i] *= rest
     return count
 
 
 @kernel(borrows=True)
 def fill_far_enough(
-    theta: NDArray[np.float64], cells: Cells, numbers: NDArray[np.float64], room: NDArray[np.float64]
+    theta: NDArray[np.float64],
+    cells: Cells,
+    numbers: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    room: NDArray[np.float64],
 ) -> tuple[int, float]:
     """Fill mass and slopes of the cells, exact also where an occupied one lies far out.
 
@@ -457,10 +515,10 @@ def fill_far_enough(
     """
     count = stage = np.int64(0)
     while stage < len(_REACH):
-        count = fill_masses(theta, cells, stage, numbers, room)
+        count = fill_masses(theta, cells, stage, numbers, edges, room)
         lowest = 1.0
         for i in range(cells.n_bins):
-            if cells.weights[i] > 0.0:
+            if cells.bins[WEIGHT, i] > 0.0:
                 lowest = min(lowest, room[MASS, i])
         if lowest >= _OUTLIER[stage]:
             break
@@ -476,24 +534,34 @@ def _sum_up(
 
     Given that a sample is in a code that is not set aside, its score is less by that of their whole mass.
     """
-    mass, slopes, ratios = room[MASS], room[SLOPES:AT_EDGES], room[RATIO]
+    total = counting() * 0.0
+    for i in range(0, cells.n_bins, LANES):
+        weight, own = load_lanes(cells.bins, WEIGHT, i), most(load_lanes(room, MASS, i), LEAST_MASS)
+        total = fused(weight, lanes_log(own), total)
+        # a mass that is hardly one has no slope
+        per_mass = least((own - LEAST_MASS) * _TO_ONE, 1.0) / own
+        store_lanes(room, PER_MASS, i, per_mass)
+        store_lanes(room, RATIO, i, weight * per_mass)
+    store_lanes(room, RATIO, cells.n_bins, 0.0)
+    loglik = float(sum_lanes(total))
     for row in range(DAMPING + N_BLOCK):
         for column in range(N_BLOCK):
             out[row, column] = 0.0
-    loglik, rest = 0.0, 1.0 - cells.outlier_share
-    for cell in range(cells.n_bins):
-        weight, own = cells.weights[cell], mass[cell]
-        ratios[cell] = 0.0
-        if weight > 0.0 and not own > LEAST_MASS:
-            loglik += weight * math.log(LEAST_MASS)
-        elif weight > 0.0:
-            loglik += weight * math.log(own)
-            ratio = weight / own
-            ratios[cell] = ratio * rest
-            for i in range(N_BLOCK):
-                out[SCORE, i] += ratio * slopes[i, cell]
-                for j in range(i + 1):
-                    out[DAMPING + i, j] += ratio * slopes[i, cell] * (slopes[j, cell] / own)
+    for row in range(N_BLOCK):
+        score = counting() * 0.0
+        for i in range(0, cells.n_bins, LANES):
+            score = fused(load_lanes(room, RATIO, i), load_lanes(room, SLOPES + row, i), score)
+        out[SCORE, row] = sum_lanes(score)
+        for column in range(row + 1):
+            square = counting() * 0.0
+            for i in range(0, cells.n_bins, LANES):
+                here = load_lanes(room, RATIO, i) * load_lanes(room, SLOPES + row, i)
+                other = load_lanes(room, PER_MASS, i) * load_lanes(room, SLOPES + column, i)
+                square = fused(here, other, square)
+            out[DAMPING + row, column] = sum_lanes(square)
+    if cells.outlier_share > 0.0:
+        for i in range(cells.n_bins):
+            room[RATIO, i] *= 1.0 - cells.outlier_share
     if cells.conditional:
         loglik += _condition(cells, room, change, out)
     for i in range(N_BLOCK):
@@ -511,15 +579,15 @@ def _condition(
     With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean,
     which is that of the law at the maximum.
     """
-    mass, slopes, ratios = room[MASS], room[SLOPES:AT_EDGES], room[RATIO]
+    mass, slopes, ratios = room[MASS], room[SLOPES:], room[RATIO]
     n, rest = cells.frames, 1.0 - cells.outlier_share
     inside = 0.0
     for i in range(N_BLOCK):
         change[i] = 0.0
     for cell in range(cells.n_bins):
-        inside += cells.kept[cell] * mass[cell]
+        inside += cells.bins[KEPT, cell] * mass[cell]
         for i in range(N_BLOCK):
-            change[i] += cells.kept[cell] * slopes[i, cell]
+            change[i] += cells.bins[KEPT, cell] * slopes[i, cell]
     inside = max(inside, LEAST_MASS)
     for i in range(N_BLOCK):
         change[i] /= inside
@@ -534,36 +602,34 @@ def _condition(
     for i in range(N_BLOCK):
         out[SCORE, i] -= n * change[i]
     for cell in range(cells.n_bins):
-        ratios[cell] -= cells.kept[cell] * n / inside * rest
+        ratios[cell] -= cells.bins[KEPT, cell] * n / inside * rest
     return -n * math.log(inside)
 
 
 @kernel(inline=True)
 def _hermite_sums(
-    cells: Cells, part: Component, room: NDArray[np.float64]
+    cells: Cells, part: Component, room: NDArray[np.float64], edges: NDArray[np.float64], place: int
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over cells of ratio times the difference of Phi, phi, z phi, He2 phi, He3 phi."""
-    at, ratio, edges = room[AT_EDGES:], room[RATIO], cells.edges
-    middle = _fill_edges(edges, part, cells.table, at)
-    s0 = s1 = s2 = s3 = s4 = 0.0
-    before = 0.0
-    inverse = 1.0 / part.sd
-    for i in range(part.low, part.high + 1):
-        here = ratio[i] if i < part.high else 0.0
-        if i < part.high:
-            s0 += here * (at[0, i + 1] - at[0, i])
-            if i == middle:
-                s0 += here
-        change = before - here
-        before = here
-        density = at[1, i]
-        if density > 0.0:
-            z = (edges[i] - part.mean) * inverse
-            s1 += change * density
-            s2 += change * at[2, i]
-            s3 += change * (z * z - 1.0) * density
-            s4 += change * (z * z - 3.0) * at[2, i]
-    return s0, s1, s2, s3, s4
+    mean, inverse = part.mean, 1.0 / part.sd
+    s0 = s1 = s2 = s3 = s4 = counting() * 0.0
+    for i in range(part.low, part.high, LANES):
+        c, ratio = place + i - part.low, load_lanes(room, RATIO, i)
+        s0 = fused(ratio, load_lanes(edges, TAIL, c + 1) - load_lanes(edges, TAIL, c), s0)
+        density0, density1 = load_lanes(edges, DENSITY, c), load_lanes(edges, DENSITY, c + 1)
+        by_z0, by_z1 = load_lanes(edges, Z_DENSITY, c), load_lanes(edges, Z_DENSITY, c + 1)
+        s1 = fused(ratio, density1 - density0, s1)
+        s2 = fused(ratio, by_z1 - by_z0, s2)
+        # where an edge is infinite, both are 0
+        z0 = most(least((load_lanes(cells.bins, EDGE, i) - mean) * inverse, FARTHEST), -FARTHEST)
+        z1 = most(least((load_lanes(cells.bins, EDGE, i + 1) - mean) * inverse, FARTHEST), -FARTHEST)
+        s3 = fused(ratio, z1 * by_z1 - density1 - (z0 * by_z0 - density0), s3)
+        s4 = fused(ratio, (z1 * z1 - 3.0) * by_z1 - (z0 * z0 - 3.0) * by_z0, s4)
+    whole = float(sum_lanes(s0))
+    middle = _cell_of(part.mean, cells, part)
+    if part.low <= middle < part.high:
+        whole += room[RATIO, middle]
+    return whole, float(sum_lanes(s1)), float(sum_lanes(s2)), float(sum_lanes(s3)), float(sum_lanes(s4))
 
 
 @kernel(inline=True)
@@ -572,22 +638,25 @@ def _subtract_curvature(
     cells: Cells,
     reach: float,
     numbers: NDArray[np.float64],
+    edges: NDArray[np.float64],
     room: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> None:
     """Take the second derivatives of the masses, times counts over mass, off the information."""
     information = out[INFORMATION:DAMPING]
+    following = numbers.shape[0] - numbers.shape[0]
     for row in range(numbers.shape[0]):
         k, p0, p1, p2 = numbers[row, 0], numbers[row, 1], numbers[row, 2], numbers[row, 3]
         for peak in range(cells.n_peaks):
             slope = cells.peaks[SHARE_SLOPE, peak]
             share = cells.peaks[SHARE, peak] + theta[_SATELLITE] * slope
-            if share == 0.0 and slope == 0.0:
-                continue
             part = component(k, peak, theta, cells, reach)
             if part.low >= part.high:
                 continue
-            s0, s1, s2, s3, s4 = _hermite_sums(cells, part, room)
+            place, following = _place_for(part, following)
+            if place == EDGES_KEPT:
+                _fill_edges(cells.bins, part, edges, place)
+            s0, s1, s2, s3, s4 = _hermite_sums(cells, part, room, edges, place)
             q, sd = part.variance, part.sd
             # derivatives in mean and variance, by the heat equation
             f_m, f_q, f_mm = -s1 / sd, -0.5 * s2 / q, -s2 / q
@@ -631,9 +700,9 @@ def _expect(pixel: Pixel, j: int, cells: Cells, room: NDArray[np.float64]) -> No
     if cells.conditional:
         inside = 0.0
         for i in range(cells.n_bins):
-            inside += cells.kept[i] * room[MASS, i]
+            inside += cells.bins[KEPT, i] * room[MASS, i]
     for i in range(cells.n_bins):
-        pixel.bins[j, EXPECTED, i] = cells.frames * cells.kept[i] * room[MASS, i] / inside
+        pixel.bins[j, EXPECTED, i] = cells.frames * cells.bins[KEPT, i] * room[MASS, i] / inside
 
 
 def evaluate_cells(
@@ -656,9 +725,9 @@ def evaluate_cells(
     for j in range(pixel.facts.shape[0]):
         own_theta(pixel, j, theta, own)
         cells, room = cells_of(pixel, j), scratch.cells[j]
-        count, reach = fill_far_enough(own, cells, scratch.numbers, room)
+        count, reach = fill_far_enough(own, cells, scratch.numbers, scratch.edges, room)
         loglik += _sum_up(cells, room, scratch.small[RIGHT], out[j])
-        _subtract_curvature(own, cells, reach, scratch.numbers[:count], room, out[j])
+        _subtract_curvature(own, cells, reach, scratch.numbers[:count], scratch.edges, room, out[j])
         if expect:
             _expect(pixel, j, cells, room)
         if pixel.facts[j, DARK] > 0.0:

@@ -94,7 +94,7 @@ def score_tile(
         pixel = _at(room, centre)
         resolve(law, index, satellites[index, 0], pixel)
         cells = cells_of(pixel, np.int64(0))
-        fill_far_enough(theta, cells, scratch.numbers, scratch.cells[0])
+        fill_far_enough(theta, cells, scratch.numbers, scratch.edges, scratch.cells[0])
         total = 0.0
         for i in range(cells.n_bins):
             if room.bins[0, WEIGHT, i] > 0.0:
@@ -133,7 +133,8 @@ def mass_tile(
             continue
         pixel = _at(room, first[index])
         resolve(law, index, satellites[index, 0], pixel)
-        fill_masses(theta, cells_of(pixel, np.int64(0)), stage, scratch.numbers, scratch.cells[0])
+        cells = cells_of(pixel, np.int64(0))
+        fill_masses(theta, cells, stage, scratch.numbers, scratch.edges, scratch.cells[0])
         for i in range(n_codes):
             out[index, i] = scratch.cells[0, MASS, i]
         for j in range(N_BLOCK - 1 if slopes.shape[0] > 0 else 0):

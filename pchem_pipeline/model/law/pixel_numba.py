@@ -88,10 +88,12 @@ N_DENSITY_ROWS = 9
 CAPACITY = 256  # columns of the table of an evaluation; a longer histogram goes through in pieces
 MAX_COMPONENTS = 201  # of which a value may be a mixture
 _MIN_COLUMNS = 256  # the frequencies of the starting points, a value's components, a table's columns
-# rows of `Scratch.cells` of a sample: mass, counts over mass, slopes in theta; tail, density and z times the
-# density at each edge
-MASS, RATIO, SLOPES, AT_EDGES = 0, 1, 2, 2 + N_BLOCK
-N_CELL_ROWS = 5 + N_BLOCK
+# rows of `Scratch.cells` of a sample: mass, its inverse, counts over mass, slopes in theta
+MASS, PER_MASS, RATIO, SLOPES = range(4)
+N_CELL_ROWS = 3 + N_BLOCK
+# rows of `Scratch.edges`: tail, density and z times the density; columns in which they are kept
+TAIL, DENSITY, Z_DENSITY = range(3)
+EDGES_KEPT = 8192
 
 
 class Histogram(NamedTuple):
@@ -121,7 +123,7 @@ class Pixel(NamedTuple):
 
     Attributes:
         bins: by sample: counts, their sums before each DN, the counts expected (out of an evaluation), lower
-            edges of the cells, 1 for codes that are not set aside; shape (J, N_BIN_ROWS, bins + 1).
+            edges of the cells, 1 for codes that are not set aside; shape (J, N_BIN_ROWS, bins + 1 + LANES).
         facts: numbers of each sample, shape (J, N_FACTS).
         peaks: satellite peaks of each sample, shape (J, N_PEAK_ROWS, enough); weight 0 where there are fewer.
         mixtures: of exposures, shape (J, N_MIXTURE_ROWS, enough); weight 0 where there are fewer.
@@ -146,7 +148,9 @@ class Scratch(NamedTuple):
         rows: of the density and of the starts, shape (N_DENSITY_ROWS, enough).
         table: a column for each DN, of the density.
         numbers: electron numbers in use with P(k) and its two derivatives, shape (enough, 4).
-        cells: of each sample, shape (J, N_CELL_ROWS, bins + 1).
+        cells: of each sample, shape (J, N_CELL_ROWS, bins + 1 + LANES).
+        edges: of all components of a sample, one after another, as far as there is room; and then of one,
+            shape (3, EDGES_KEPT + bins + 1 + 2 LANES).
         small: vectors and matrices, shape (N_SMALL, J + N_SHARED).
         flags: parameters that stay, shape (2, J + N_SHARED).
         evaluations: shape (3, J, N_ROWS, N_BLOCK).
@@ -156,6 +160,7 @@ class Scratch(NamedTuple):
     table: FloatArray
     numbers: FloatArray
     cells: NDArray[np.float64]
+    edges: NDArray[np.float64]
     small: FloatArray
     flags: NDArray[np.bool_]
     evaluations: NDArray[np.float64]
@@ -164,12 +169,13 @@ class Scratch(NamedTuple):
 @kernel
 def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
     """Return room for so many samples of at most so many bins; ``cells``: also to integrate them."""
-    width = n_bins + 1 if cells else 0
+    width = n_bins + 1 + LANES if cells else 0
     return Scratch(
         np.empty((N_DENSITY_ROWS, n_bins + _MIN_COLUMNS)),
         np.empty((MAX_COMPONENTS + 5, CAPACITY + LANES)),
         np.empty((n_bins + 512 if cells else 0, 4)),
-        np.empty((n_samples, N_CELL_ROWS, width)),
+        np.zeros((n_samples, N_CELL_ROWS, width)),
+        np.zeros((3, EDGES_KEPT + width + LANES if cells else 0)),
         np.zeros((N_SMALL, n_samples + N_SHARED)),
         np.zeros((2, n_samples + N_SHARED), np.bool_),
         np.zeros((3, n_samples, N_ROWS, N_BLOCK)),
@@ -194,7 +200,7 @@ def make_pixel(
     for j in range(n):
         facts[j, DARK] = 1.0 if dark[j] else 0.0
     return Pixel(
-        np.zeros((n, N_BIN_ROWS, n_bins + 1)),
+        np.zeros((n, N_BIN_ROWS, n_bins + 1 + LANES)),
         facts,
         np.zeros((n, N_PEAK_ROWS, n_peaks)),
         np.zeros((n, N_MIXTURE_ROWS, n_exposures)),
@@ -259,6 +265,8 @@ def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray,
         moment += c * i
         if c > 0.0:
             occupied += 1
+    for i in range(n_bins, n_bins + LANES):
+        weights[i] = kept[i] = 0.0
     n = cumulative[n_bins]
     facts[N_BINS], facts[N_FRAMES], facts[OCCUPIED] = float(n_bins), n, float(occupied)
     facts[CONDITIONAL] = 1.0 if aside else 0.0

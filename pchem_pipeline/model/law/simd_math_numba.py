@@ -1,11 +1,20 @@
-"""Exponential and logarithm of eight numbers side by side, to the last bit or so."""
+"""Exponential, logarithm and tail of the normal law of eight numbers side by side, to the last bits."""
 
 from __future__ import annotations
 
 import math
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.simd_numba import Lanes, exponent_of, fused, nearest, scaled
+from pchem_pipeline.model.law.simd_numba import (
+    Lanes,
+    counting,
+    exponent_of,
+    fused,
+    least,
+    most,
+    nearest,
+    scaled,
+)
 
 LN2 = math.log(2.0)
 ROOT2 = math.sqrt(2.0)
@@ -24,6 +33,23 @@ _EXP = (
     (0.001388888893251478, 0.008333333385699212, 0.041666666666573066, 0.16666666666554314),
     (0.5000000000000006, 1.0000000000000067, 1.0),
 )
+# the tail Q(z) of the normal law: exp(z^2 / 2) Q(z) (1 + sqrt(2) z) in t = (z - c) / (z + c) with
+# c = 3.75 sqrt(2) (Shepherd and Laframboise 1981), through Chebyshev's nodes, off by 1.2e-16; odd and even
+# powers
+_TAIL_CENTRE = 3.75 * ROOT2
+_TAIL_ODD = (
+    *(1.5557166904899627e-10, -1.872105040481009e-09, 1.1631754354429562e-08, -2.8609115301612043e-08),
+    *(-4.867799483683875e-07, 1.1192119577541115e-05, -0.00014507704027042086, 0.0008778129264476477),
+    *(0.014181138709478203, 0.04615216058018874, 0.0411383692450726, -0.07012029929277348),
+)
+_TAIL_EVEN = (
+    *(-1.311553673566738e-09, 1.598963335833402e-08, -1.2428563124008372e-07, 8.709910793112408e-07),
+    *(-5.719024016673447e-06, 2.582326487088708e-05, 0.000146857189022479, -0.004873289841632631),
+    *(-0.02934669928832467, -0.05440196507122231, 0.0017927077427395128, 0.6187563154189137),
+)
+_FARTHEST = 37.4  # where exp(-z^2 / 2) is 1e-304
+_STEEP = 1e300  # makes a sign of a number
+_PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @kernel(borrows=True)
@@ -55,3 +81,26 @@ def lanes_exp(x: Lanes) -> Lanes:
     series = fused(y, fused(y, fused(y, top[0], top[1]), top[2]), top[3])
     series = fused(y, fused(y, fused(y, fused(y, series, middle[0]), middle[1]), middle[2]), middle[3])
     return scaled(fused(y, fused(y, fused(y, series, rest[0]), rest[1]), rest[2]), power)
+
+
+@kernel(borrows=True)
+def lanes_tail(z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Return the nearer tail of the normal law, negative above the middle, the density, and z times that.
+
+    As :func:`.electron_laws_numba.normal_tail`, without a table: good to 1e-14 of itself within 8 standard
+    deviations and to 1e-12 at 37.4, beyond which all is as there.
+    """
+    near = least(most(z, -_FARTHEST), _FARTHEST)
+    side = least(most(1.0 - near * _STEEP, -1.0), 1.0)
+    distance = near * (0.0 - side)
+    beside, slope = distance + _TAIL_CENTRE, fused(distance, ROOT2, 1.0)
+    both = 1.0 / (beside * slope)
+    t = (distance - _TAIL_CENTRE) * slope * both
+    square = t * t
+    odd = even = counting() * 0.0
+    for power in range(len(_TAIL_ODD)):
+        odd = fused(odd, square, _TAIL_ODD[power])
+        even = fused(even, square, _TAIL_EVEN[power])
+    bell = lanes_exp(near * near * -0.5)
+    density = bell * _PER_ROOT_2PI
+    return side * bell * fused(odd, t, even) * beside * both, density, near * density

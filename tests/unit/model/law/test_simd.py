@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
+from scipy.stats import norm
 
 import pchem_pipeline
 
@@ -41,10 +43,16 @@ def fill(table):
         y = exp(x)
         store_lanes(table, 5, i, scaled(fraction_of(y), exponent_of(y)) - y)
         store_lanes(table, 6, i, counting() + float(i))
+        tail, density, by_z = functions.lanes_tail(load_lanes(table, 7, i))
+        store_lanes(table, 8, i, tail)
+        store_lanes(table, 9, i, density)
+        store_lanes(table, 10, i, by_z)
         total = total + x
     return sum_lanes(total)
-table = np.zeros((7, 1600))
+table = np.zeros((11, 1600))
 table[0] = np.random.default_rng(1).uniform(-100, 100, 1600)
+table[7] = np.linspace(-37, 37, 1600)
+table[7, :8] = -np.inf, np.inf, 0.0, -1e-250, 1e-250, -300.0, 300.0, 8.5
 np.savez(sys.argv[2], table=table, total=fill(table), lanes=LANES)
 """
 
@@ -62,7 +70,7 @@ def test_the_operations_are_what_they_are_named_after(tmp_path: Path, kind: str,
     assert done.returncode == 0, done.stderr
     assert ("cannot be taught vectors (no such hook)" in done.stderr) == (kind == "scalar")
     with np.load(tmp_path / "found.npz") as found:
-        x, exponential, logarithm, clipped, left, zero, place = found["table"]
+        x, exponential, logarithm, clipped, left, zero, place, z, tail, density, by_z = found["table"]
         assert found["lanes"] == lanes
         assert found["total"] == pytest.approx(x.sum(), abs=1e-9)
     np.testing.assert_allclose(exponential, np.exp(x), rtol=3e-15)
@@ -71,3 +79,9 @@ def test_the_operations_are_what_they_are_named_after(tmp_path: Path, kind: str,
     np.testing.assert_allclose(left, x + 0.5 - np.rint(x), atol=1e-13)
     np.testing.assert_array_equal(zero, 0.0)
     np.testing.assert_array_equal(place, np.arange(1600))
+    np.testing.assert_array_equal(np.sign(tail), np.where(z <= 0.0, 1.0, -1.0))
+    near = np.abs(z) < 8.0
+    np.testing.assert_allclose(np.abs(tail[near]), ndtr(-np.abs(z[near])), rtol=2e-14)
+    np.testing.assert_allclose(np.abs(tail), ndtr(-np.abs(z)), rtol=1e-12, atol=1e-303)
+    np.testing.assert_allclose(density, norm.pdf(z), rtol=1e-12, atol=1e-303)
+    np.testing.assert_allclose(by_z, np.nan_to_num(z) * norm.pdf(z), rtol=1e-12, atol=1e-300)
