@@ -189,6 +189,12 @@ def effects() -> str:
         "fitted with) and in `simulate.effects` (it is simulated), and is a candidate of `pchem discrepancy`",
         "unless its own text says that frames of one constant exposure cannot show it. Each is told by the",
         "statistics that it moves first.",
+        "",
+        "Each may have a place and a time (`region`, `when`). What differs by readout tap or group of",
+        "columns is so described, without effects of its own: several entries of `frame_noise`,",
+        "`bias_drift`, `gain_drift`, `exposure_flicker` or another, each with its own strength and",
+        "`region`, for example `taps=64/1`.",
+        "Bias, gain and read noise that differ by tap and stay are in the maps of the pixels already.",
     ]
     for plane in Plane:
         members = [c for c in own if c.plane is plane]

@@ -199,7 +199,7 @@ def map_of(statistic: str) -> str | None:
     parts = statistic.split(".")
     if parts[0] == "shape" and parts[1] != "goodness":
         return f"score.{parts[1]}"
-    if parts[0] == "space" and parts[1] in ("x", "y"):
+    if parts[0] == "space" and parts[1] in ("x", "y") and parts[2] != "bits":
         return statistic.removeprefix("space.")
     return _longest(_MAP_OF, statistic)
 

@@ -13,17 +13,18 @@ EFFECTS = (
     "signal_dependent_noise", "nonlinearity", "gain_drift", "adc_dnl", "adc_inl", "clipping",
     "interpixel_capacitance", "analog_memory", "exposure_drift", "persistence", "dark_current_rts",
     "exposure_flicker", "overdispersed_counts", "branching_counts", "optical_crosstalk", "cosmic_rays",
-    "repeated_frames",
+    "repeated_frames", "pixel_correction", "bit_errors",
+    "binary_offset", "repeated_lines",
 )  # fmt: skip
 UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
 OUTSIDE = ("trap_limited_lag", "self_trigger_cut", "output_crosstalk", "checkerboard_offset")
 #: left out of the library on purpose; those of ``SEALED`` are for the last look, when nothing changes
 TRIED = (
-    "lost_bit", "corner_glow", "row_repeat", "neighbour_median", "previous_bit", "tap_gain", "black_clamp",
-    "dead_time", "gain_stitch", "missing_codes", "row_swap", "flipped_bit",
+    "temporal_filter", "corner_glow", "slipped_rows", "shifted_rows", "settling_rows", "tap_gain",
+    "black_clamp", "dead_time", "gain_stitch", "missing_codes", "row_swap", "block_mean",
 )  # fmt: skip
 SEALED = (
-    "column_repeat", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
+    "mains_gain", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
     "empty_samples", "loud_column", "negative_ghost", *OUTSIDE,
 )  # fmt: skip
 #: effects that a stationary stack hardly tells apart: the one for the other is no invention

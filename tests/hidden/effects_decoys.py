@@ -12,17 +12,24 @@ import numpy as np
 from hidden.base import Hidden
 
 
-class LostBit(Hidden):
-    """A bit of the converter reads 0 in some of the samples; strength: their share."""
+class TemporalFilter(Hidden):
+    """Samples averaged with the delivered one before, where those are alike; strength: their share."""
 
-    tag: ClassVar[str] = "lost_bit"
-    s95: ClassVar[float] = 1e-3
+    tag: ClassVar[str] = "temporal_filter"
+    s95: ClassVar[float] = 5e-3
+    most: ClassVar[float] = 1.0
 
     def draw(self):
-        self.bit = int(self.pick("bit", 8, 16))
+        self.before = None
 
     def convert(self, t, dn, code):
-        return np.where(self.rng.random(code.shape) < self.strength, code & ~self.bit, code)
+        found = code
+        if self.before is not None:
+            alike = np.abs(code - self.before) < 0.5 * np.median(self.sensor.step)
+            chosen = alike & (self.rng.random(code.shape) < self.strength)
+            found = np.where(chosen, (code + self.before) // 2, code)
+        self.before = found
+        return found
 
 
 class CornerGlow(Hidden):
@@ -41,47 +48,30 @@ class CornerGlow(Hidden):
         return h + self.strength * self.shape * (self.rng.random() < 0.02)
 
 
-class RowRepeat(Hidden):
-    """Rows that repeat the row above; strength: share of the rows."""
+class ShiftedRows(Hidden):
+    """Rows that come one column late; strength: share of the rows."""
 
-    tag: ClassVar[str] = "row_repeat"
-    s95: ClassVar[float] = 2e-3
-
-    def convert(self, t, dn, code):
-        found = code.copy()
-        for y in np.flatnonzero(self.rng.random(code.shape[0] - 1) < self.strength) + 1:
-            found[y] = code[y - 1]
-        return found
-
-
-class NeighbourMedian(Hidden):
-    """A sample far above its eight neighbours becomes their median; strength: share of those replaced."""
-
-    tag: ClassVar[str] = "neighbour_median"
-    s95: ClassVar[float] = 0.05
-    most: ClassVar[float] = 1.0
+    tag: ClassVar[str] = "shifted_rows"
+    s95: ClassVar[float] = 5e-3
+    most: ClassVar[float] = 0.5
 
     def convert(self, t, dn, code):
-        around = np.stack(
-            [np.roll(code, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
-        )
-        median = np.median(around, axis=0)
-        limit = 3.0 * np.sqrt(np.median(self.sensor.exposure)) * np.median(self.sensor.step)
-        replaced = (code - median > limit) & (self.rng.random(code.shape) < self.strength)
-        return np.where(replaced, median.astype(code.dtype), code)
+        late = self.rng.random((code.shape[0], 1)) < self.strength
+        return np.where(late, np.roll(code, 1, axis=1), code)
 
 
-class PreviousBit(Hidden):
-    """An offset that follows the lowest bit of the sample read before in the row; strength: DN."""
+class SettlingRows(Hidden):
+    """Rows whose first pixels settle from the level of the row before; strength: part of it that is left."""
 
-    tag: ClassVar[str] = "previous_bit"
-    s95: ClassVar[float] = 0.1
+    tag: ClassVar[str] = "settling_rows"
+    s95: ClassVar[float] = 0.02
     scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
 
-    def convert(self, t, dn, code):
-        odd = (np.roll(code, 1, axis=1) & 1).astype(float)
-        odd[:, 0] = 0.5
-        return np.floor(dn + self.strength * (odd - 0.5) + 0.5).astype(np.int64)
+    def voltage(self, t, dn):
+        last = (dn[:, -1] - self.sensor.bias[:, -1])[:-1, None]
+        found = dn.copy()
+        found[1:] += self.strength * last * 0.6 ** np.arange(dn.shape[1])
+        return found
 
 
 class TapGain(Hidden):
@@ -165,30 +155,52 @@ class RowSwap(Hidden):
         return found
 
 
-class FlippedBit(Hidden):
-    """A bit of the converter flips in some samples; strength: their share."""
+class SlippedRows(Hidden):
+    """Rows that lose a sample, so that the later ones come one column early; strength: share of rows."""
 
-    tag: ClassVar[str] = "flipped_bit"
-    s95: ClassVar[float] = 1e-3
-
-    def draw(self):
-        self.bit = int(self.pick("bit", 2, 4))
-
-    def convert(self, t, dn, code):
-        return np.where(self.rng.random(code.shape) < self.strength, code ^ self.bit, code)
-
-
-class ColumnRepeat(Hidden):
-    """In some frames a column repeats its left neighbour; strength: share of columns and frames."""
-
-    tag: ClassVar[str] = "column_repeat"
-    s95: ClassVar[float] = 2e-3
+    tag: ClassVar[str] = "slipped_rows"
+    s95: ClassVar[float] = 5e-3
+    most: ClassVar[float] = 0.5
 
     def convert(self, t, dn, code):
         found = code.copy()
-        for x in np.flatnonzero(self.rng.random(code.shape[1] - 1) < self.strength) + 1:
-            found[:, x] = code[:, x - 1]
+        for y in np.flatnonzero(self.rng.random(code.shape[0]) < self.strength):
+            x = int(self.rng.integers(code.shape[1] - 1))
+            found[y, x:-1] = code[y, x + 1 :]
         return found
+
+
+class BlockMean(Hidden):
+    """Blocks of 2 x 2 pixels that come as their mean (lossy compression); strength: their share."""
+
+    tag: ClassVar[str] = "block_mean"
+    s95: ClassVar[float] = 2e-3
+    most: ClassVar[float] = 1.0
+
+    def convert(self, t, dn, code):
+        ny, nx = (size // 2 for size in code.shape)
+        blocks = code[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2)
+        lost = self.rng.random((ny, 1, nx, 1)) < self.strength
+        mean = blocks.sum(axis=(1, 3), keepdims=True) // 4
+        found = code.copy()
+        found[: 2 * ny, : 2 * nx] = np.where(lost, mean, blocks).reshape(2 * ny, 2 * nx)
+        return found
+
+
+class MainsGain(Hidden):
+    """A gain that swings with the mains while rows are read; strength: relative amplitude."""
+
+    tag: ClassVar[str] = "mains_gain"
+    s95: ClassVar[float] = 0.01
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+
+    def draw(self):
+        rows = np.arange(self.sensor.shape[0])[:, None]
+        self.place = 2 * np.pi * self.between("cycles_per_line", 0.03, 0.4) * rows
+        self.per_frame = self.between("cycles_per_frame", 0.05, 0.45)
+
+    def signal(self, t, v):
+        return v * (1 + self.strength * np.sin(self.place + 2 * np.pi * self.per_frame * t))
 
 
 class BlendedFrames(Hidden):
@@ -304,11 +316,11 @@ class NegativeGhost(Hidden):
 
 
 TRIED = (
-    "lost_bit", "corner_glow", "row_repeat", "neighbour_median", "previous_bit", "tap_gain", "black_clamp",
-    "dead_time", "gain_stitch", "missing_codes", "row_swap", "flipped_bit",
+    "temporal_filter", "corner_glow", "slipped_rows", "shifted_rows", "settling_rows", "tap_gain",
+    "black_clamp", "dead_time", "gain_stitch", "missing_codes", "row_swap", "block_mean",
 )  # fmt: skip
 SEALED = (
-    "column_repeat", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
+    "mains_gain", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
     "empty_samples", "loud_column", "negative_ghost", "trap_limited_lag", "self_trigger_cut",
     "output_crosstalk", "checkerboard_offset",
 )  # fmt: skip

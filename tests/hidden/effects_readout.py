@@ -223,3 +223,84 @@ class RepeatedFrames(Hidden):
     def record(self, t, frames):
         if t in self.times:
             frames[t, self.rows] = frames[t - 1, self.rows]
+
+
+class PixelCorrection(Hidden):
+    """A sample far above its eight neighbours becomes their median; strength: share of those replaced.
+
+    Far is so many standard deviations of the samples' own scatter.
+    """
+
+    tag: ClassVar[str] = "pixel_correction"
+    s95: ClassVar[float] = 0.05
+    most: ClassVar[float] = 1.0
+
+    def draw(self):
+        scatter = np.sqrt(np.median(self.sensor.exposure)) * np.median(self.sensor.step)
+        self.limit = int(self.between("threshold_sd", 2.0, 4.0) * scatter)
+        self.parameters["threshold_dn"] = self.limit
+
+    def convert(self, t, dn, code):
+        around = [np.roll(code, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
+        median = np.median(np.stack(around), axis=0).astype(code.dtype)
+        replaced = (code - median > self.limit) & (self.rng.random(code.shape) < self.strength)
+        # at the border some of the eight are missing
+        replaced[[0, -1]] = False
+        replaced[:, [0, -1]] = False
+        return np.where(replaced, median, code)
+
+
+class BitErrors(Hidden):
+    """A bit of the converter reads 0, or its opposite, in some of the samples; strength: their share."""
+
+    tag: ClassVar[str] = "bit_errors"
+    s95: ClassVar[float] = 1e-3
+    most: ClassVar[float] = 1.0
+
+    def draw(self):
+        self.bit = int(self.pick("bit", 2, 3, 4))
+        self.kind = self.pick("fault", "zero", "flip")
+
+    def convert(self, t, dn, code):
+        weight = 2**self.bit
+        is_set = code // weight % 2 == 1
+        wrong = np.where(is_set, code - weight, code if self.kind == "zero" else code + weight)
+        return np.where(self.rng.random(code.shape) < self.strength, wrong, code)
+
+
+class BinaryOffset(Hidden):
+    """An offset that follows one bit of the sample read before in the row; strength: DN."""
+
+    tag: ClassVar[str] = "binary_offset"
+    s95: ClassVar[float] = 0.1
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+
+    def draw(self):
+        self.bit = int(self.pick("bit", 0, 1, 2, 3))
+        self.side = self.sign()
+
+    def convert(self, t, dn, code):
+        found = code.copy()
+        for x in range(1, code.shape[1]):
+            one = found[:, x - 1] // 2**self.bit % 2 == 1
+            found[:, x] = np.floor(dn[:, x] + self.side * self.strength * np.where(one, 0.5, -0.5) + 0.5)
+        return found
+
+
+class RepeatedLines(Hidden):
+    """Rows or columns that repeat the one before; strength: share of them."""
+
+    tag: ClassVar[str] = "repeated_lines"
+    s95: ClassVar[float] = 1e-4
+    scaling: ClassVar[tuple[float, float, float]] = (1.0, 0.0, 1.0)
+    most: ClassVar[float] = 0.2
+
+    def draw(self):
+        self.axis = 0 if self.pick("lines", "rows", "columns") == "rows" else 1
+
+    def convert(self, t, dn, code):
+        lines = np.moveaxis(code, self.axis, 0)
+        found = lines.copy()
+        for y in np.flatnonzero(self.rng.random(len(lines) - 1) < self.strength) + 1:
+            found[y] = lines[y - 1]
+        return np.moveaxis(found, 0, self.axis)

@@ -17,7 +17,10 @@ from pchem_pipeline.discrepancy.observe.vector_frames import FrameView
 N_STACKS, SHAPE, N_FRAMES, BLOCK = 60, (24, 24), 600, 50
 LIMIT = 5.0 / np.sqrt(N_STACKS)
 #: Statistics of events that all but never happen without an effect: always 0.
-SILENT = ("frame.repeated", "frame.repeated_rows", "tail.high.clusters")
+SILENT = (
+    "frame.repeated", "frame.repeated_rows", "tail.high.clusters", "space.repeated.rows",
+    "space.repeated.columns",
+)  # fmt: skip
 #: The fit of four parameters to so few frames takes a little more variance from the scores, and samples from
 #: the tails, than first-order theory says; counts of few pixels are coarse.
 BIAS = {"shape": 0.6, "tail": 0.6, "code": 0.3}

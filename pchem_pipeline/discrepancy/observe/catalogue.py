@@ -134,7 +134,14 @@ def _space() -> list[Statistic]:
         found += [
             Statistic(f"space.{axis}.{p}", c, f"{text}, along {axis}") for p, (c, text) in pairs.items()
         ]
-    return found
+    return [
+        *found,
+        Statistic("space.predicted.equal", "digital", "samples equal what their neighbours predict"),
+        Statistic("space.predicted.above", "digital", "samples far exceed what their neighbours predict"),
+        Statistic("space.x.bits", "digital", "samples follow bits of the sample read before"),
+        Statistic("space.repeated.rows", "digital", "rows repeat the one above exactly"),
+        Statistic("space.repeated.columns", "digital", "columns repeat the one on the left exactly"),
+    ]
 
 
 _GOODNESS = [
@@ -184,4 +191,9 @@ STATISTICS: dict[str, Statistic] = _Catalogue(
 
 #: Statistics that are exact tests, never positive by chance, and by how much each event raises them (rows
 #: come by the dozen).
-EXACT: dict[str, float] = {"frame.repeated": 10.0, "frame.repeated_rows": 160.0}
+EXACT: dict[str, float] = {
+    "frame.repeated": 10.0,
+    "frame.repeated_rows": 160.0,
+    "space.repeated.rows": 10.0,
+    "space.repeated.columns": 10.0,
+}

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.laws import poisson
+from pchem_pipeline.discrepancy.observe.predicted import predicted_samples, predicted_statistics
+from pchem_pipeline.discrepancy.observe.previous_bits import bit_statistics, previous_bits
+from pchem_pipeline.discrepancy.observe.repeated_lines import line_statistics, repeated_lines
 from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
@@ -92,16 +95,26 @@ def observe(
     )
     sums = sum_frames(frames, numbers, edges, laws, pixels)
     view = FrameView(sums, pixels, numbers, edges, block_frames)
-    chance = _chance_of_repeats(counts, outside, frames.shape, sums.consecutive)
+    alike = _log_alike(counts, outside, (shape[0], shape[1]))
+    chance = _chance_of_repeats(alike, sums.consecutive)
     lags = pixel_lags(view)
+    predicted = predicted_samples(frames, edges, maps.usable)
+    spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
+    bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
+    lines = repeated_lines(frames)
     z = {
         **evidence.z,
         "tail.high.clusters": _clusters(sums.hits, laws, frames.shape),
         **time_statistics(view, lags),
         **frame_statistics(view, chance),
         **space_statistics(view),
+        **predicted_statistics(predicted),
+        **bit_statistics(bits),
+        **line_statistics(lines, alike, len(frames)),
     }
-    return replace(evidence, time=_time_series(view, lags, n_run), z=in_order(z))
+    time = _time_series(view, lags, n_run)
+    time = replace(time, predicted=predicted, previous_bits=bits, repeated_lines=lines)
+    return replace(evidence, time=time, z=in_order(z))
 
 
 def observe_histograms(
@@ -274,14 +287,17 @@ def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
     return poisson(pairs, chance)
 
 
-def _chance_of_repeats(
-    counts: NDArray[Any], outside: FloatArray, shape: tuple[int, ...], consecutive: int
-) -> tuple[float, float]:
-    """Return how many frames and rows are expected to repeat the one before by chance."""
+def _log_alike(counts: NDArray[Any], outside: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return the log of the chance that two samples of a pixel are equal, (y, x)."""
     real = counts.astype(np.float32)
     total = np.maximum(real.sum(axis=1) + outside.sum(axis=1), 1.0)
     alike = np.einsum("ib,ib->i", real, real) / total**2
-    same = np.log(np.maximum(alike, 1e-12)).reshape(shape[1:]).sum(axis=1)
+    return np.asarray(np.log(np.maximum(alike, 1e-12)).reshape(shape), np.float64)
+
+
+def _chance_of_repeats(alike: FloatArray, consecutive: int) -> tuple[float, float]:
+    """Return how many frames and rows are expected to repeat the one before by chance."""
+    same = alike.sum(axis=1)
     return consecutive * float(np.exp(min(same.sum(), 0.0))), consecutive * float(
         np.exp(np.minimum(same, 0)).sum()
     )

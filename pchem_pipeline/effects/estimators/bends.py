@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["Bend", "best_bend"]
+__all__ = ["Bend", "SampledPixels", "best_bend", "sampled_tangents"]
 
 _PIXELS = 256
 _PERIODS = 48
@@ -41,7 +41,7 @@ class Bend:
 
 
 @dataclass(frozen=True)
-class _Pixels:
+class SampledPixels:
     """A sample of pixels in their own windows of codes.
 
     Attributes:
@@ -60,10 +60,9 @@ class _Pixels:
 def best_bend(evidence: Evidence) -> list[Bend]:
     """Return the bends that explain the residuals of the codes, the best first; none if none stands out."""
     codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
-    chosen = _sample(evidence.maps)
-    if codes.size < 16 or chosen is None:
+    pixels = sampled_tangents(evidence.maps)
+    if codes.size < 16 or pixels is None:
         return []
-    pixels = _tangents(*chosen)
     samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
     periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(expected), 4.0 * _SHORTEST), _PERIODS)
     turned = np.outer(np.append(codes, codes[-1] + 1) - 0.5, 2.0 * np.pi / periods)
@@ -81,6 +80,12 @@ def best_bend(evidence: Evidence) -> list[Bend]:
             a, b = fits[place][1]
             found.append(Bend(float(np.hypot(a, b)), float(periods[place]), float(np.arctan2(b, a))))
     return found[:2]
+
+
+def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:
+    """Return masses and tangents of pixels spread over the sensor; None where none is usable."""
+    chosen = _sample(maps)
+    return None if chosen is None else _tangents(*chosen)
 
 
 def _in_use(expected: NDArray[np.float64]) -> float:
@@ -107,7 +112,7 @@ def _tangents(
     gain: NDArray[np.float64],
     bias: NDArray[np.float64],
     noise: NDArray[np.float64],
-) -> _Pixels:
+) -> SampledPixels:
     """Return masses and tangents of the pixels' PCDs (exact rounded mass and its derivatives)."""
     from scipy.special import gammaln, ndtr
 
@@ -130,10 +135,10 @@ def _tangents(
     mass = np.maximum(np.diff(cdf, axis=1), 1e-12)
     raw = np.stack([np.diff(part, axis=1) for part in (by_exposure, -density, by_noise, by_gain)], axis=2)
     tangents = np.linalg.qr(raw / np.sqrt(mass)[:, :, None])[0] * np.sqrt(mass)[:, :, None]
-    return _Pixels(first, density, mass, tangents.transpose(0, 2, 1))
+    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
 
 
-def _response(pixels: _Pixels, codes: NDArray[np.int64]) -> NDArray[np.float64]:
+def _response(pixels: SampledPixels, codes: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
 
     Summed over the sample of pixels, with what their fits take up projected out.

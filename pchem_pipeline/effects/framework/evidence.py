@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["SCORES", "CodeResiduals", "Evidence", "PixelMaps", "TimeSeries"]
+__all__ = [
+    "SCORES",
+    "CodeResiduals",
+    "Evidence",
+    "PixelMaps",
+    "PredictedSamples",
+    "PreviousBits",
+    "TimeSeries",
+]
 
 #: Per-pixel efficient scores: products of Hermite (readout) and Charlier (charge) polynomials beyond the four
 #: that are the PCD's own parameters.
@@ -63,6 +71,41 @@ class CodeResiduals:
 
 
 @dataclass(frozen=True)
+class PredictedSamples:
+    """Samples beside what their neighbours predict for them, in their own frame and in others.
+
+    Attributes:
+        equal_z: by how many standard deviations they equal the prediction of their own frame more often.
+        thresholds: DN, increasing, shape (n,).
+        above: samples that exceed the prediction of their own frame by more, shape (n,).
+        above_chance: those that exceed one, two, three given predictions of other frames, as means over the
+            choices, shape (3, n).
+    """
+
+    equal_z: float
+    thresholds: NDArray[np.int64]
+    above: NDArray[np.float64]
+    above_chance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PreviousBits:
+    """Normal equations of samples on the bits of the one read before in the row, beyond its value.
+
+    Differences of successive frames are regressed, each over its pixel's standard deviation.
+
+    Attributes:
+        product: of the bits with the samples, the least significant first, 1/DN, shape (b,).
+        square: of the bits with each other, 1/DN^2, shape (b, b).
+        variance: of the samples, no unit.
+    """
+
+    product: NDArray[np.float64]
+    square: NDArray[np.float64]
+    variance: float
+
+
+@dataclass(frozen=True)
 class TimeSeries:
     """What is kept along time; None of it exists for ready-made histograms.
 
@@ -102,6 +145,9 @@ class TimeSeries:
         repeated: frame numbers that are, sample by sample, the frame before, shape (n_repeated,).
         repeated_rows: number of rows (of frames not in ``repeated``) that are the same row of the frame
             before.
+        predicted: samples beside what their neighbours predict, by kind of prediction.
+        previous_bits: samples beside the bits of those read before; None where there are too few.
+        repeated_lines: number of "rows" and of "columns" that are the one before them in the same frame.
         hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
             20,000.
     """
@@ -132,6 +178,9 @@ class TimeSeries:
     repeated_rows: int
     hits: NDArray[np.int64]
     neighbour_maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    predicted: Mapping[str, PredictedSamples] = field(default_factory=dict)
+    previous_bits: PreviousBits | None = None
+    repeated_lines: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def test_figures_count_and_compare_with_their_targets(capsys):
     failed = record(["row_noise"], "error", error="ValueError: broken")
     null = record([], "consistent", kind="null", level=0.0)
     decoys = [
-        record(["lost_bit"], "unexplained", kind="decoy"),
+        record(["dead_time"], "unexplained", kind="decoy"),
         record(["row_swap"], "named", "rts_noise", kind="decoy"),
     ]
     good[1]["hidden"] = [{"tag": "row_noise", "strength": 0.4, "parameters": {}}]

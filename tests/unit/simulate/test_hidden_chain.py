@@ -276,6 +276,47 @@ def test_repeats_are_exact_and_where_the_key_says():
     assert not (plain[1:] == plain[:-1]).all(axis=(1, 2)).any()
 
 
+def test_corrected_pixels_equal_their_median():
+    hiding, plain = hide(("pixel_correction",), 20.0, SEED, SHAPE, FRAMES), made().frames.astype(int)
+    (effect,) = hiding.effects
+    changed = np.argwhere(hiding.frames != plain)
+    assert len(changed) > 50
+    for t, y, x in changed[:50]:
+        around = np.delete(plain[t, y - 1 : y + 2, x - 1 : x + 2].ravel(), 4)
+        assert hiding.frames[t, y, x] == int(np.median(around)) < plain[t, y, x] - effect.limit
+
+
+def test_wrong_bits_are_the_bit_and_the_share_of_the_key():
+    hiding, plain = made("bit_errors"), made().frames
+    (effect,) = hiding.effects
+    changed = hiding.frames != plain
+    assert set((hiding.frames ^ plain)[changed].tolist()) == {2**effect.bit}
+    possible = np.ones(plain.shape, bool) if effect.kind == "flip" else (plain >> effect.bit & 1) == 1
+    n = int(possible.sum())
+    assert abs(changed.sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
+
+
+def test_offsets_follow_the_bit_before():
+    hiding, plain = hide(("binary_offset",), 20.0, SEED, SHAPE, FRAMES), made().frames.astype(int)
+    (effect,) = hiding.effects
+    moved = (hiding.frames.astype(int) - plain)[:, :, 1:]
+    one = (hiding.frames[:, :, :-1] >> effect.bit & 1) == 1
+    apart = moved[one].mean() - moved[~one].mean()
+    assert abs(apart / (effect.side * effect.strength) - 1) < 0.05
+
+
+def test_repeated_lines_are_those_before_them():
+    for seed in (1, 2, 3):
+        hiding, plain = hide(("repeated_lines",), 20.0, seed, SHAPE, FRAMES), made(seed=seed).frames
+        (effect,) = hiding.effects
+        found, before = (np.moveaxis(f, effect.axis + 1, 1) for f in (hiding.frames, plain))
+        changed = (found != before).any(axis=2)
+        t, y = np.nonzero(changed)
+        np.testing.assert_array_equal(found[t, y], before[t, y - 1])
+        n = changed[:, 1:].size
+        assert abs(changed.sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
+
+
 def test_particles_leave_what_no_electron_count_does():
     hot = View(made("cosmic_rays")).d > 40
     assert 4 <= hot.any(axis=(1, 2)).sum() <= made("cosmic_rays").effects[0].parameters["tracks"]
@@ -316,6 +357,7 @@ def test_every_effect_is_there_and_checked():
         "nonlinearity gain_drift adc_dnl adc_inl clipping interpixel_capacitance analog_memory",
         "exposure_drift persistence dark_current_rts exposure_flicker overdispersed_counts",
         "branching_counts optical_crosstalk cosmic_rays repeated_frames",
+        "pixel_correction bit_errors binary_offset repeated_lines",
     }
     assert set(LIBRARY) == set(" ".join(named).split())
     assert len(OUTSIDE) >= 3

@@ -1,0 +1,90 @@
+"""Repeated lines: a row or column of a frame that is delivered twice, the second time in place of the next.
+
+A line buffer that is read again before the next line is in it, or a lost line that a driver fills with the
+one before. In analog data two lines are never equal by chance, so a single case is proof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence
+
+__all__ = ["RepeatedLines"]
+
+_FEWEST_SHOWN = 8.0  # repeats of each line in a simulation that shows what they do
+
+
+@register_effect
+class RepeatedLines(Effect):
+    """In some frames a row, or a column, is the one before it, sample by sample.
+
+    Signature: lines that equal the one before in the same frame; then also correlations of neighbours across
+    the lines. A pixel's own histogram gets a share of its neighbour's samples, with that one's bias and
+    gain, so it has no law of its own.
+    """
+
+    tag: Literal["repeated_lines"] = Field(default="repeated_lines", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.READOUT
+    title: ClassVar[str] = "repeated rows or columns"
+    source: ClassVar[str] = "exact-equality test of neighbouring lines; GenICam / GigE Vision (packet resend)"
+    signature: ClassVar[tuple[str, ...]] = ("space.repeated.rows", "space.repeated.columns")
+    strength: ClassVar[str] = "share"
+    separate: ClassVar[Mapping[str, str]] = {
+        "interpixel_capacitance": "equality of lines, sample by sample: coupling never makes them equal",
+        "repeated_frames": "equality within a frame: there it is the frame before that is repeated",
+        "row_noise": "equality of lines, sample by sample: noise never makes them equal",
+    }
+    share: float = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
+    lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
+
+    def halo(self) -> int:
+        """Return 1 for rows: the one above."""
+        return 1 if self.lines == "rows" else 0
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the digital numbers (frame, y, x), DN, with repeats; the first line has none before it."""
+        result: NDArray[Any] = values.copy()
+        if self.lines == "rows":
+            repeats = context.random.uniform(("frame", "y"))[:, 1:] < self.share
+            result[:, 1:] = np.where(repeats, values[:, :-1], values[:, 1:])
+        else:
+            repeats = context.random.uniform(("frame", "x"))[:, :, 1:] < self.share
+            result[:, :, 1:] = np.where(repeats, values[:, :, :-1], values[:, :, 1:])
+        return result
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return one row, and one column, in a thousand."""
+        return cls(share=1e-3), cls(share=1e-3, lines="columns")
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the share of lines that equal the one before."""
+        if evidence.time is None:
+            return ()
+        found: list[Self] = []
+        rows, columns = evidence.maps.usable.shape
+        for lines, pairs in (("rows", rows - 1), ("columns", columns - 1)):
+            # in a sensor of one pixel's width or height lines are equal by chance
+            if f"space.repeated.{lines}" in evidence.z and evidence.time.repeated_lines.get(lines, 0):
+                share = evidence.time.repeated_lines[lines] / (pairs * evidence.n_frames)
+                found.append(cls.model_validate({"share": min(share, 0.5), "lines": lines}))
+        return sorted(found, key=lambda one: -one.share)
+
+    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+        """Return rare repeats more often than they are, and how much rarer they are."""
+        shown = min(_FEWEST_SHOWN / max(frames.size, 1), 0.5)
+        if not 0.0 < self.share < shown:
+            return self, 1.0
+        return self.model_copy(update={"share": shown}), self.share / shown
