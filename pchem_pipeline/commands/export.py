@@ -10,10 +10,11 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.base.variables import Variable, variables_of
-from pchem_pipeline.commands.emva import COLUMNS as EMVA_COLUMNS
-from pchem_pipeline.commands.emva import emva_rows
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS
+from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
+from pchem_pipeline.report.pages.emva import MAPS as EMVA_MAPS
+from pchem_pipeline.report.pages.emva import emva_rows
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import run_status
@@ -132,7 +133,8 @@ def _write_csv(folder: Path, store: RunStore) -> list[Path]:
 def _write_emva(folder: Path, target: Target, store: RunStore) -> Path:
     """Write what an EMVA 1288 data sheet can take of the run."""
     config = target.config
-    found = emva_rows(store, config.input.kind, config.maps.outlier_sigmas)
+    maps = {name: store.read(f"maps/{name}") for name in EMVA_MAPS if store.has(f"maps/{name}")}
+    found = emva_rows(maps, store.read("fit/fit_status"), config.input.kind, config.maps.outlier_sigmas)
     return _table(folder / "emva1288.csv", [list(EMVA_COLUMNS), *(row.cells() for row in found)])
 
 

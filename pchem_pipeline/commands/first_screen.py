@@ -138,4 +138,4 @@ def _criteria(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def _headline(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the headline numbers with their errors, a line each."""
     wide = max(len(row["label"]) for row in rows)
-    return [f"median {row['label']:<{wide}}  {row['value']}   ({row['spread']})" for row in rows]
+    return [f"median {row['label']:<{wide}}  {row['value']}   (5 to 95 %: {row['spread']})" for row in rows]

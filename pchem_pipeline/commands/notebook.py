@@ -115,7 +115,7 @@ class Run:
             for each in found["answers"]
         )
         rows = [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
-        return f"<p>{head}</p>{answers}{html_table(('median', 'value', ''), rows)}"
+        return f"<p>{head}</p>{answers}{html_table(('median', 'value', '5 to 95 %'), rows)}"
 
     def _size(self) -> str:
         ny, nx = self.shape

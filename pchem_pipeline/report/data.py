@@ -155,6 +155,7 @@ class ReportData:
 
     Attributes:
         title: heading of the report.
+        kind: what made the charge: dark, light or unknown.
         shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
         n_frames: frames per pixel, or None if pixels differ or it is unknown.
         integration_time: seconds, or None.
@@ -196,6 +197,7 @@ class ReportData:
 
     title: str
     shape: tuple[int, int]
+    kind: str = "unknown"
     n_frames: int | None = None
     integration_time: float | None = None
     maps: Mapping[str, FloatArray] = field(default_factory=dict)

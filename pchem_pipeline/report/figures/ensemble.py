@@ -65,7 +65,7 @@ def ensemble_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     return [
         Figure(
             "ensemble",
-            "ensemble",
+            "summary",
             "Ensemble histogram and its prediction",
             _ENSEMBLE_CAPTION,
             "Ensemble histogram before and after non-uniformity correction with predictions. "

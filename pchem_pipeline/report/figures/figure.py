@@ -49,6 +49,11 @@ class DataTable:
         values = self.columns.get(name)
         return None if values is None else np.asarray(values)
 
+    @property
+    def size(self) -> int:
+        """Numbers in all columns."""
+        return sum(self[name].size for name in self.columns)
+
     def heading(self, name: str) -> str:
         """Return a column's name with its unit."""
         unit = self.units.get(name, "")
@@ -74,7 +79,7 @@ class Figure:
 
     Attributes:
         name: name of its files.
-        section: id of the section that shows it.
+        section: id of the section that shows it; empty for one that only ``pchem figures`` draws.
         title: heading on the page.
         caption: what is drawn and how to read it.
         alt: what a reader who does not see it should know, with the numbers.

@@ -67,7 +67,7 @@ def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
     tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), settings.histogram_bins)
     return Figure(
         f"map_{name}",
-        "maps",
+        "summary" if name == "read_noise_e" else "maps",
         symbol(name)[1].capitalize(),
         _CAPTIONS[name],
         _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
@@ -105,7 +105,7 @@ def read_noise_figures(data: ReportData, settings: ReportSettings) -> list[Figur
     return [
         Figure(
             "read_noise_histogram",
-            "read-noise",
+            "",
             "Read noise of the pixels",
             _READ_NOISE_CAPTION.format(below=below, noun=data.noun),
             _map_alt(data, "read_noise_e", "Histogram")
@@ -196,11 +196,11 @@ def draw_map(
     sign, words, unit = symbol(name)
     label = f"{words} {sign} ({unit})"
     if is_strip(full.shape):
-        return _draw_channels(look, tables, full.ravel(), label, unit)
+        return _draw_channels(look, tables, full.ravel(), label)
     map_height = _map_height(full.shape, look.width_mm - 24.0)
     figure = look.empty(34.0 + map_height)
     top, bottom = figure.subplots(2, 1, height_ratios=(30.0, map_height))
-    _draw_histogram(top, full, tables[1], label, unit)
+    _draw_histogram(top, full, tables[1], label)
     _draw_image(figure, bottom, full, f"{sign} ({unit})", stretch)
     return figure
 
@@ -212,7 +212,7 @@ def _map_height(shape: tuple[int, ...], width_mm: float) -> float:
     return float(np.clip(width_mm * ratio, 28.0, 1.6 * width_mm)) + 10.0
 
 
-def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str, unit: str) -> DisplayRange:
+def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str) -> DisplayRange:
     """Draw the histogram of a map with its median; return the range drawn."""
     colours = colours_of(axes)
     shown = robust_range(values)
@@ -231,8 +231,7 @@ def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str,
     axes.set_xlim(shown.low, shown.high)
     if not shown.logarithmic:
         axes.xaxis.set_major_locator(MaxNLocator(5))
-    words = f"; {shown.remark()}" if shown.remark() else ""
-    axes.set_title(f"median {short(median)} {unit}{words}", fontsize=6.5, color=colours.faint)
+    axes.set_title(shown.remark(), fontsize=6.5, color=colours.faint)
     return shown
 
 
@@ -278,16 +277,14 @@ def show_map(axes: Axes, colour: NDArray[Any], **options: Any) -> AxesImage:
     return image
 
 
-def _draw_channels(
-    look: Look, tables: Sequence[DataTable], values: FloatArray, label: str, unit: str
-) -> Drawing:
+def _draw_channels(look: Look, tables: Sequence[DataTable], values: FloatArray, label: str) -> Drawing:
     """Draw a line of channels as points with error bars, and their histogram if they are many."""
     many, colours = len(tables) > 1, look.palette
     stderr = tables[0]["standard error"].ravel() if "standard error" in tables[0] else None
     figure = look.empty(92.0 if many else 52.0)
     if many:
         top, axes = figure.subplots(2, 1, height_ratios=(1.0, 1.4))
-        _draw_histogram(top, values, tables[1], label, unit)
+        _draw_histogram(top, values, tables[1], label)
     else:
         axes = figure.add_subplot()
     known = np.isfinite(values)
@@ -344,8 +341,11 @@ def draw_read_noise(look: Look, *, values: NDArray[Any], bins: DataTable) -> Dra
     axes = figure.add_subplot()
     sign, words, unit = symbol("read_noise_e")
     known = finite(values)
-    shown = _draw_histogram(axes, np.asarray(values, np.float64), bins, f"{words} {sign} ({unit})", unit)
+    shown = _draw_histogram(axes, np.asarray(values, np.float64), bins, f"{words} {sign} ({unit})")
     axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
+    if known.size:
+        median = f"median {short(float(np.median(known)))} {unit}"
+        axes.set_title("; ".join(filter(None, (median, shown.remark()))), fontsize=6.5, color=colours.faint)
     if known.size and shown.low < 0.5 < shown.high:
         axes.axvline(0.5, color=colours.vermilion, linewidth=0.9, linestyle=":")
         axes.text(

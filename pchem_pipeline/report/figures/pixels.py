@@ -66,7 +66,7 @@ def cell_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     found = [
         Figure(
             "cluster_edges_example",
-            "cells",
+            "",
             "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
             _EXAMPLE_CAPTION,
             "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "

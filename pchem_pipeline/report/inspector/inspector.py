@@ -20,7 +20,17 @@ from pchem_pipeline.report.inspector.packing import pack_counts
 from pchem_pipeline.report.style.palette import MAP_COLOURS
 from pchem_pipeline.report.style.wording import unit_text
 
-__all__ = ["PANEL_MAPS", "Embedded", "content_policy", "embedded", "map_facts", "script", "served_page"]
+__all__ = [
+    "PANEL_MAPS",
+    "Embedded",
+    "content_policy",
+    "embedded",
+    "json_for_html",
+    "map_facts",
+    "script",
+    "served_page",
+    "text_of",
+]
 
 #: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
 _CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
@@ -63,25 +73,24 @@ def embedded(data: ReportData) -> Embedded | None:
     if data.inspector is None:
         return None
     parts = [(name, Markup(text)) for name, text in _blobs(data.inspector)]
-    return Embedded(_json_for_html(_facts(data, data.inspector)), parts, Markup(script()))
+    return Embedded(json_for_html(_facts(data, data.inspector)), parts, Markup(script()))
 
 
 def script() -> str:
     """Return the inspector's script."""
+    return text_of("inspector.js")
+
+
+def text_of(name: str) -> str:
+    """Return a file of the pages' templates."""
     folder = importlib.resources.files("pchem_pipeline.report") / "templates"
-    return (folder / "inspector.js").read_text(encoding="utf-8")
+    return (folder / name).read_text(encoding="utf-8")
 
 
-def content_policy(text: str | None = None) -> str:
-    """Return the page's content security policy: no network at all, and no script but this one.
-
-    Args:
-        text: the page's script, or None where it has none.
-    """
-    scripts = ""
-    if text is not None:
-        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
-        scripts = f"script-src 'sha256-{digest}'; "
+def content_policy(*texts: str) -> str:
+    """Return the page's content security policy: no network at all, and no script but these."""
+    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts]
+    scripts = "script-src " + " ".join(f"'sha256-{each}'" for each in digests) + "; "
     return (
         f"default-src 'none'; {scripts}{_CONNECT_NOWHERE}; img-src data:; style-src 'unsafe-inline'; "
         "base-uri 'none'; form-action 'none'"
@@ -104,7 +113,7 @@ def served_page(page: str) -> str | None:
     return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{told}\n{mark}", 1)
 
 
-def _json_for_html(content: Any) -> Markup:
+def json_for_html(content: Any) -> Markup:
     """Return JSON that may stand inside a ``script`` element: it cannot end it, nor begin a comment."""
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     for sign in "<>&\u2028\u2029":

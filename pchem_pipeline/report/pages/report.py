@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import importlib.resources
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import jinja2
+from markupsafe import Markup
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
-from pchem_pipeline.report.inspector.inspector import content_policy, embedded, script
+from pchem_pipeline.report.figures.figure import Figure, csv_text
+from pchem_pipeline.report.inspector.inspector import content_policy, embedded, json_for_html, script, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
+from pchem_pipeline.report.pages.emva import emva_tables
+from pchem_pipeline.report.pages.glossary import explained
 from pchem_pipeline.report.pages.methods import method_tables
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import report_json
@@ -18,6 +25,8 @@ from pchem_pipeline.report.pages.sections import Material, page_sections
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
 
+#: Numbers of a table that the page keeps.
+_LARGEST_TABLE = 6_000
 _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
@@ -50,14 +59,15 @@ def render_report(
         draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
     settings = settings or ReportSettings()
-    shown, others = report_figures(data, settings), discrepancy_figures(data.discrepancy)
+    shown = [figure for figure in report_figures(data, settings) if figure.section]
+    others = discrepancy_figures(data.discrepancy)
     drawn = (draw or draw_here)([*shown, *others], settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
     pictures, evidence = (
         [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)
     )
     view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, evidence)
-    tables = [*result_tables(data), *method_tables(data)]
+    tables = [*result_tables(data), *method_tables(data), *emva_tables(data)]
     inspector = embedded(data)
     page = template("report.html.j2").render(
         title=data.title,
@@ -65,7 +75,9 @@ def render_report(
         flag_words=_FLAG_WORDS,
         flag_signs=_FLAG_SIGNS,
         inspector=inspector,
-        policy=content_policy(script() if inspector else None),
+        policy=content_policy(page_script(), *([script()] if inspector else [])),
+        page_script=Markup(page_script()),
+        tables=json_for_html(figure_tables([*shown, *others])),
         sections=page_sections(Material(data, settings, pictures, tables, view)),
     )
     pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
@@ -81,6 +93,29 @@ def _discrepancy_page(data: ReportData, view: DiscrepancyView) -> str:
     )
 
 
+def page_script() -> str:
+    """Return the script of files, words and folded parts."""
+    return text_of("page.js")
+
+
+def figure_tables(figures: Sequence[Figure]) -> dict[str, list[tuple[str, str]]]:
+    """Return the tables of figures as the page keeps them: by figure, part and gzip of the CSV in base64.
+
+    Maps of large sensors are not among them: ``pchem export`` and ``pchem figures`` write these.
+    """
+    return {
+        figure.name: [
+            (
+                table.part,
+                base64.b64encode(gzip.compress(csv_text(table).encode(), 6, mtime=0)).decode("ascii"),
+            )
+            for table in figure.tables
+            if table.size <= _LARGEST_TABLE
+        ]
+        for figure in figures
+    }
+
+
 def template(name: str) -> jinja2.Template:
     """Return a template of this package's pages."""
     folder = importlib.resources.files("pchem_pipeline.report") / "templates"
@@ -92,7 +127,13 @@ def template(name: str) -> jinja2.Template:
         loader=jinja2.FunctionLoader(lambda each: (folder / each).read_text(encoding="utf-8")),
     )
     environment.filters["together"] = _together
+    # other pages have no glossary to lead to
+    environment.filters["explained"] = _explained if name == "report.html.j2" else _together
     return environment.get_template(name)
+
+
+def _explained(text: str) -> Markup:
+    return explained(_together(text))
 
 
 def _together(text: str) -> str:

@@ -1,8 +1,8 @@
 """The sections of the report's page, from top to bottom, in one list.
 
-A further section of figures and tables is a row in :data:`SECTIONS`; figures and tables name its id. One of
-another kind is a maker in :data:`PAGE` and a template ``section_<kind>.html.j2``. The table of contents
-follows the list.
+A further section of figures and tables is a row in :data:`OPEN` or :data:`FOLDED`; figures and tables name
+its id. One of another kind is a maker in :data:`PAGE` and a template ``section_<kind>.html.j2``. The
+table of contents follows the list.
 """
 
 from __future__ import annotations
@@ -16,136 +16,99 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
+from pchem_pipeline.report.pages.glossary import GLOSSARY
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
-from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
+from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, pixel_counts, sentence
 from pchem_pipeline.report.pages.tables import Table, provenance_tables
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import symbol
 
-#: (id, heading, introduction, parts that may be missing) of the sections that show figures.
-SECTIONS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    (
-        "pixels",
-        "Single pixels",
-        "Each pixel is described by the photon counting distribution (PCD): a Poisson number of electrons"
-        " with mean H, converted with gain g, on top of the bias μ, with Gaussian read noise σ.",
-        ("pixels",),
-    ),
-    (
-        "goodness",
-        "Does the model describe each pixel?",
-        "The histogram of each pixel is tested against its fitted density by a chi-square of merged bins, "
-        "whose p-values are uniform by chance. Of many thousand tests some look significant: pixels are "
-        "called misfits only as far as the rate of false discoveries allows. Single samples that the model "
-        "does not expect at all (cosmic rays, glitches) are left out of the fit and counted.",
-        (),
-    ),
+#: (id, heading, introduction, parts that may be missing) of the sections that show figures; the first ones
+#: are open.
+OPEN: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    ("maps", "Parameter maps", "", ("maps", "charge_rate")),
     (
         "exposures",
         "Exposures",
-        "Each exposure has its own H; what grows with {against} is the {noun}, and what does not is "
-        "spurious charge (or a bias stack that holds electrons). The exposures of a pixel share the errors "
-        "of its gain and bias, which the line takes into account.",
+        "Each exposure has its own H; what grows with {against} is the {noun}, and what does not is spurious "
+        "charge (or a bias stack that holds electrons).",
         ("samples",),
     ),
     (
         "photon-transfer",
         "Photon transfer",
-        "The same data as moments: where the points leave the curve, the sensor is not linear or the samples "
-        "are not of one gain.",
+        "The same data as moments: points that leave the curve tell of nonlinearity, or of samples of "
+        "different gain.",
         ("samples",),
-    ),
-    (
-        "cells",
-        "From signal to electron number",
-        "The peaks of the PCD are whole electrons. Each signal belongs to the electron number that "
-        "explains it best; the edges between these cells are not half-way between the peaks, since small "
-        "and large numbers are not equally likely.",
-        (),
-    ),
-    (
-        "read-noise",
-        "Read noise",
-        "Read noise in electrons, quantisation included, of every pixel with a fit.",
-        ("maps",),
-    ),
-    (
-        "maps",
-        "Parameter maps",
-        "Histogram and map of each parameter. Structure in a map points to the architecture of the sensor.",
-        (
-            "maps",
-            "charge_rate",
-        ),
     ),
     (
         "stability",
         "Stability and structure",
-        "From sums over all pixels and frames: what moves, and what repeats along rows and columns.",
+        "What moves in time, and what repeats along rows and columns: fixed-pattern noise and row or column "
+        "noise.",
+        (),
+    ),
+    ("status", "Fit status", "", ()),
+)
+FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    (
+        "pixels",
+        "Single pixels",
+        "Histograms with the photon counting distribution that was fitted to each.",
+        ("pixels",),
+    ),
+    (
+        "goodness",
+        "Does the model describe each pixel?",
+        "Chi-square of merged bins; misfits are counted at a rate of false discoveries. Samples that the "
+        "model does not expect at all (cosmic rays, glitches) are left out of the fit.",
+        (),
+    ),
+    (
+        "cells",
+        "From signal to electron number",
+        "The edges between electron numbers are not half-way between the peaks, since small and large "
+        "numbers are not equally likely.",
         (),
     ),
     (
         "ensemble",
         "The sensor as a whole",
-        "If the model holds, the parameters of the pixels predict the distribution of all raw data taken "
-        "together.",
-        (
-            "ensemble",
-            "nuced",
-        ),
+        "If the model holds, the pixels' parameters predict the ensemble.",
+        ("ensemble", "nuced"),
     ),
     (
         "electrons",
         "Electron numbers",
-        "Each raw value of the ensemble frames was turned into a number of electrons.",
+        "Raw values of the ensemble frames as numbers of electrons.",
         ("electrons",),
     ),
     (
         "components",
         "Why the peaks of the ensemble fade",
-        "The ensemble is a sum of components, one for each electron number. Where pixels differ in gain, "
-        "the components become wider with the electron number.",
+        "Where pixels differ in gain, the component of each electron number widens with it.",
         ("components",),
     ),
-    (
-        "uncertainty",
-        "How sure are the numbers?",
-        "Standard errors follow from the curvature of each pixel's likelihood, those of derived "
-        "quantities from the whole covariance of the four parameters.",
-        (),
-    ),
+    ("uncertainty", "How sure are the numbers?", "", ()),
     (
         "methods",
         "Other methods beside PCH-EM",
-        "The same pixels characterised by the methods of the literature, with the smallest errors that any "
-        "method could have.",
+        "The same pixels by methods of the literature, and the smallest errors that any method could have.",
         ("methods",),
     ),
-    (
-        "plan",
-        "How many frames are enough?",
-        "The information of one frame tells how many of them a precision needs, before they are taken.",
-        (),
-    ),
-    (
-        "status",
-        "Fit status",
-        "Pixels that could not be fitted, or whose values deserve caution, and why.",
-        (),
-    ),
+    ("plan", "How many frames are enough?", "", ()),
 )
 
 #: How to read the figures of the section ``maps``, by how they are drawn.
 MAP_READING: dict[str, str] = {
     "beta": (
-        "Colours follow the rank of a pixel (Beta(2,2) stretch), so that a few outliers do not hide the "
-        "structure: the five labels of the colour bar are the minimum, the 15.6, 50 and 84.4 % quantiles "
-        "and the maximum. The blue line in a histogram is the median."
+        "Colours follow the rank of a pixel; the colour bar is labelled at the minimum, the 15.6, 50 and "
+        "84.4 % quantiles and the maximum. Blue line: median."
     ),
     "linear": (
         "Colours are linear between the 1st and the 99th percentile; values beyond have the end colours. "
-        "The blue line in a histogram is the median."
+        "Blue line: median."
     ),
     "channels": (
         "Each point is a channel with its standard error; crosses at the bottom are channels without a value."
@@ -185,12 +148,14 @@ class Section:
         title: heading, also in the table of contents.
         kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
         content: what that template shows.
+        folded: whether it is closed until somebody opens it.
     """
 
     id: str
     title: str
     kind: str
     content: Mapping[str, Any] = field(default_factory=dict)
+    folded: bool = False
 
 
 Maker = Callable[[Material], Section | None]
@@ -203,13 +168,17 @@ def page_sections(material: Material) -> list[Section]:
 
 def _summary(material: Material) -> Section:
     data = material.data
+    remarks = flags(data)
     content = {
         "answers": answers(data),
-        "sentence": sentence(data),
+        "caption": f"unflagged {data.noun}s" if data.often_flagged else f"{data.noun}s",
         "numbers": key_numbers(data),
+        "sentence": "" if pixel_counts(data).fitted else sentence(data),
         "stepped_back": key_numbers(data, with_flagged=True) if data.mostly_flagged else [],
         "next": [(step.of(str(data.run.get("store", "RUN"))), step.why) for step in next_steps(data)],
-        "flags": flags(data),
+        "flags": [flag for flag in remarks if flag.level != "good"],
+        "passed": [flag for flag in remarks if flag.level == "good"],
+        "pictures": [each for each in material.pictures if each.figure.section == "summary"],
         "verdict": material.view,
         "effects": data.discrepancy.found.effects if data.discrepancy else (),
     }
@@ -223,7 +192,7 @@ def _inspector(material: Material) -> Section:
     return Section("inspector", "Look at pixels", "inspector", content)
 
 
-def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> Section | None:
+def _figures(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Material) -> Section | None:
     """Put figures and tables into their section; one without any says why."""
     id_, title, intro, parts = row
     data = material.data
@@ -232,26 +201,26 @@ def _figures(row: tuple[str, str, str, tuple[str, ...]], material: Material) -> 
     shown = [picture for picture in material.pictures if picture.figure.section == id_]
     tables = [table for table in material.tables if table.section == id_]
     missing = [data.missing[part] for part in parts if part in data.missing]
-    if id_ == "read-noise" and data.few_channels and not shown:
-        missing.append("few channels have no histogram; their values are with the parameter maps")
     if not shown and not tables and not missing:
         if data.samples is not None:
             return None  # a joint fit has less to show
         missing = ["this run has no data for it."]
     if id_ == "maps":
         reading = "channels" if min(data.shape) < 2 else material.settings.map_stretch
-        intro = f"{intro} {MAP_READING[reading]}"
+        intro = MAP_READING[reading]
     if id_ == "exposures" and data.samples is not None:
         words = AXES.get(data.samples.against)
         slope = slope_of(data)
         noun = symbol(slope)[1] if slope else "charge"
         intro = intro.format(against=words[0], noun=noun) if words else _NO_LINE
     content = {"intro": intro, "missing": missing, "pictures": shown, "tables": tables}
-    return Section(id_, title, "figures", content)
+    return Section(id_, title, "figures", content, folded)
 
 
 def _discrepancy(material: Material) -> Section:
+    look = material.data.quick_look
     content = {
+        "found": look is not None and bool(look.found),
         "view": material.view,
         "tables": [table for table in material.tables if table.section == "discrepancy"],
         "command": f"pchem discrepancy {material.data.run.get('store', 'RUN')}",
@@ -262,31 +231,47 @@ def _discrepancy(material: Material) -> Section:
 def _tables(material: Material) -> Section:
     tables = [table for table in material.tables if table.section == "tables"]
     nothing = "No pixel has a value; there is nothing to list."
-    return Section("tables", "Tables", "tables", {"tables": tables, "empty": nothing})
+    return Section("tables", "Tables", "tables", {"tables": tables, "empty": nothing}, folded=True)
+
+
+def _emva(material: Material) -> Section | None:
+    tables = [table for table in material.tables if table.section == "emva"]
+    content = {"tables": tables, "empty": ""}
+    return Section("emva", "In the words of EMVA 1288", "tables", content, folded=True) if tables else None
 
 
 def _provenance(material: Material) -> Section:
     tables = provenance_tables(material.data)
     content = {"tables": tables, "empty": "Nothing was recorded."}
-    return Section("provenance", "Origin of the results", "tables", content)
+    return Section("provenance", "Origin of the results", "tables", content, folded=True)
 
 
 def _cite(material: Material) -> Section:
-    return Section("cite", "How to describe and cite this", "cite", {"citation": citation(material.data)})
+    content = {"citation": citation(material.data)}
+    return Section("cite", "How to describe and cite this", "cite", content, folded=True)
 
 
 def _configuration(material: Material) -> Section:
-    return Section("configuration", "Configuration", "text", {"text": material.data.config_yaml})
+    content = {"text": material.data.config_yaml}
+    return Section("configuration", "Configuration", "text", content, folded=True)
+
+
+def _glossary(_: Material) -> Section:
+    return Section("glossary", "Glossary", "glossary", {"terms": GLOSSARY}, folded=True)
 
 
 #: The page from top to bottom.
 PAGE: tuple[Maker, ...] = (
     _summary,
+    partial(_figures, OPEN[0], False),
     _inspector,
-    *(partial(_figures, row) for row in SECTIONS),
+    *(partial(_figures, row, False) for row in OPEN[1:]),
     _discrepancy,
+    *(partial(_figures, row, True) for row in FOLDED),
     _tables,
+    _emva,
     _cite,
     _provenance,
     _configuration,
+    _glossary,
 )

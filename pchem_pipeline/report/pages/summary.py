@@ -35,7 +35,7 @@ _TOO_NOISY = 0.5
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """A number of the first screen: the median over the pixels and the spread between them."""
+    """A number of the first screen: median over the pixels, where 5 to 95 % lie, standard error of one."""
 
     name: str
     label: str
@@ -107,10 +107,8 @@ def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumb
                 name,
                 f"{words}{which}",
                 measured(summary.median, summary.median_stderr, unit),
-                f"5–95 % of the {data.noun}s: {short(low)} to {short(high)} {unit}",
-                f"one {data.noun} is known to ± {short(float(np.median(errors)), 2)} {unit}"
-                if errors.size
-                else "",
+                f"{short(low)} to {short(high)} {unit}",
+                f"± {short(float(np.median(errors)), 2)} {unit}" if errors.size else "",
             )
         )
     return found

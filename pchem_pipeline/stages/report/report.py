@@ -210,6 +210,7 @@ def report_data(
     return ReportData(
         title=config.run.title or run.name,
         shape=sensor.shape,
+        kind=config.input.kind,
         n_frames=n_frames,
         integration_time=integration_time,
         maps=maps,

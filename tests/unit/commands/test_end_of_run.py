@@ -25,7 +25,7 @@ def numbers(level: str) -> dict:
             {"question": "To be believed?", "level": level, "word": word, "text": "60 % flagged: so. More.",
              "criteria": []},
         ],
-        "headline": [{"label": "read noise", "value": "0.280 ± 0.001 e⁻", "spread": "5–95 %: 0.2 to 0.3 e⁻"}],
+        "headline": [{"label": "read noise", "value": "0.280 ± 0.001 e⁻", "spread": "0.2 to 0.3 e⁻"}],
         "flags": [{"level": "caution", "text": "Rounding."}, {"level": "good", "text": "Fine."}],
         "next": [{"command": "pchem view RUN", "why": "look"}],
     }  # fmt: skip
@@ -57,7 +57,7 @@ def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys)
     lines = said.err.splitlines()
     assert "All right? Yes." in lines
     assert "  NOT hot pixels         2 %  (≤ 1 %)" in lines
-    assert "median read noise  0.280 ± 0.001 e⁻   (5–95 %: 0.2 to 0.3 e⁻)" in lines
+    assert "median read noise  0.280 ± 0.001 e⁻   (5 to 95 %: 0.2 to 0.3 e⁻)" in lines
     assert "Caution: Rounding." in lines
     assert lines[-1] == "  pchem view 'my run.yaml'"
 

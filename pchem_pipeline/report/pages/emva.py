@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
-from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.tables import Table
+from pchem_pipeline.report.style.wording import measured, short, unit_text
 
-__all__ = ["COLUMNS", "EmvaRow", "emva_rows"]
+__all__ = ["COLUMNS", "MAPS", "EmvaRow", "emva_rows", "emva_tables"]
 
 COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_here", "where_it_differs")
 
 FloatArray = NDArray[np.float64]
+
+_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
+#: Maps that the rows are made of; the last is there in the dark only.
+MAPS = (*_NAMES, *(f"{name}_stderr" for name in _NAMES), "dark_current")
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,16 @@ class EmvaRow:
     definition_here: str
     where_it_differs: str
 
+    @property
+    def text(self) -> str:
+        """The value with its standard error and unit, for a reader."""
+        if self.value is None or not np.isfinite(self.value):
+            return "not determined"
+        unit = unit_text(self.unit)
+        if self.standard_error is None:
+            return f"{short(self.value, 2)} {unit}"
+        return measured(self.value, self.standard_error, unit)
+
     def cells(self) -> list[str]:
         """Return the row as text; what is not known is empty."""
         numbers = [
@@ -37,24 +55,46 @@ class EmvaRow:
         return [self.quantity, self.symbol, *numbers, self.unit, self.definition_here, self.where_it_differs]
 
 
-def emva_rows(store: RunStore, kind: str, outlier_sigmas: float = 6.0) -> list[EmvaRow]:
+def emva_tables(data: ReportData) -> list[Table]:
+    """Return the table of the report; of a line of channels or without values there is none."""
+    status = data.fit.get("fit_status")
+    if status is None or data.shape[0] == 1 or not all(data.has_values(name) for name in _NAMES):
+        return []
+    if data.mostly_flagged:
+        return []
+    rows = tuple(
+        (row.quantity, row.symbol, row.text, row.definition_here, row.where_it_differs)
+        for row in emva_rows(data.maps, status, data.kind, data.outlier_sigmas)
+    )
+    return [
+        Table(
+            "emva1288",
+            "What a data sheet after EMVA 1288 can take",
+            f"Flagged {data.noun}s are left out. As a file: pchem export "
+            f"{data.run.get('store', 'RUN')} --format emva",
+            ("quantity", "symbol", "value", "here", "where it differs"),
+            rows,
+            "emva",
+        )
+    ]
+
+
+def emva_rows(
+    stored: Mapping[str, NDArray[Any]], status: NDArray[Any], kind: str, outlier_sigmas: float = 6.0
+) -> list[EmvaRow]:
     """Return the table of a run; pixels without a value and flagged ones are left out.
 
     Args:
-        store: a run with maps.
+        stored: the maps of :data:`MAPS`, (y, x).
+        status: status words of the fit, (y, x).
         kind: what made the charge: dark, light or unknown.
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
-
-    Raises:
-        StoreError: the run has no maps.
     """
-    status = store.read("fit/fit_status")
     kept = (status & int(FAILED | FLAGGED)) == 0
-    names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
-    maps = {name: store.read(f"maps/{name}")[kept] for name in names}
-    errors = {name: store.read(f"maps/{name}_stderr")[kept] for name in names}
+    maps = {name: stored[name][kept] for name in _NAMES}
+    errors = {name: stored[f"{name}_stderr"][kept] for name in _NAMES}
     if not kept.any():
-        maps = {name: np.full(1, np.nan) for name in names}
+        maps = {name: np.full(1, np.nan) for name in _NAMES}
         errors = dict(maps)
     gain = maps["conversion_gain"]
     rows = [
@@ -78,9 +118,9 @@ def emva_rows(store: RunStore, kind: str, outlier_sigmas: float = 6.0) -> list[E
             "standard deviation of g between the pixels over its mean, without what their errors add",
             "EMVA has no such quantity: its K is one number; in PRNU gain and sensitivity are together",
         ),
-        _dark_current(store, kept, kind),
+        _dark_current(stored.get("dark_current"), kept, kind),
         EmvaRow(
-            "hot pixels", "", _hot_share(store.read("maps/quanta_exposure"), maps, outlier_sigmas), None, "%",
+            "hot pixels", "", _hot_share(stored["quanta_exposure"], maps, outlier_sigmas), None, "%",
             f"pixels whose H is above the median by more than {outlier_sigmas:g} robust standard deviations",
             "EMVA: defect pixels are by a limit that the application sets, on the logarithmic histogram",
         ),
@@ -156,11 +196,11 @@ def _prnu(maps: dict[str, FloatArray], errors: dict[str, FloatArray], kind: str)
     )  # fmt: skip
 
 
-def _dark_current(store: RunStore, kept: NDArray[np.bool_], kind: str) -> EmvaRow:
+def _dark_current(found: NDArray[Any] | None, kept: NDArray[np.bool_], kind: str) -> EmvaRow:
     value: float | None = None
     error: float | None = None
-    if kind == "dark" and store.has("maps/dark_current") and kept.any():
-        value, error = _mean(store.read("maps/dark_current")[kept])
+    if kind == "dark" and found is not None and kept.any():
+        value, error = _mean(found[kept])
     return EmvaRow(
         "dark current from mean", "mu_I.mean", value, error, "e-/px/s",
         "mean over the pixels of H over the integration time (input.kind: dark), or of its slope",

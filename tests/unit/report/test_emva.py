@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.commands.emva import COLUMNS, emva_rows
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.pages.emva import COLUMNS, emva_rows
 
 SHAPE = (60, 80)
 
 
 class Maps:
-    """As much of a store as the table reads."""
+    """Maps as a store has them."""
 
     def __init__(self):
         rng = np.random.default_rng(3)
@@ -34,11 +34,9 @@ class Maps:
         for name in [name for name in self.arrays if name.startswith("maps")]:
             self.arrays[name][2] = np.nan
 
-    def read(self, path):
-        return self.arrays[path].copy()
-
-    def has(self, path):
-        return path in self.arrays
+    def rows(self, kind):
+        maps = {name.removeprefix("maps/"): values.copy() for name, values in self.arrays.items()}
+        return emva_rows(maps, maps.pop("fit/fit_status"), kind)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +45,7 @@ def store():
 
 
 def table(store, kind):
-    return {row.symbol or row.quantity: row for row in emva_rows(store, kind)}
+    return {row.symbol or row.quantity: row for row in store.rows(kind)}
 
 
 def test_spreads_are_those_of_the_sensor_not_of_its_errors(store):
@@ -85,4 +83,4 @@ def test_a_sensor_without_a_value_has_an_empty_table(store):
     lost = Maps()
     lost.arrays["fit/fit_status"][:] = int(FitStatus.NO_DATA)
     with np.errstate(all="raise"):
-        assert all(row.cells()[2] == "" for row in emva_rows(lost, "dark") if row.quantity != "hot pixels")
+        assert all(row.cells()[2] == "" for row in lost.rows("dark") if row.quantity != "hot pixels")
