@@ -21,6 +21,7 @@ __all__ = [
     "NotBelievedError",
     "PchEmError",
     "StoreError",
+    "error_words",
     "install_hint",
     "one_line",
     "quoted",
@@ -82,6 +83,11 @@ class PchEmError(Exception):
     def __str__(self) -> str:
         """Return the message as one line, whatever a file name or a library's words bring along."""
         return one_line(str(self.args[0])) if self.args else ""
+
+
+def error_words(error: BaseException) -> str:
+    """Return an error in words: our own messages as they are, others with their kind."""
+    return str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
 
 
 class ConfigError(PchEmError):

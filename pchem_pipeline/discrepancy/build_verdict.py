@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
+from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.discrepancy.verdict import (
-    NEGLIGIBLE_REST,
+    CONVINCING_PLACEBO,
     Candidate,
     Change,
     Discrepancy,
@@ -24,6 +25,7 @@ from pchem_pipeline.discrepancy.verdict import (
     Place,
     Pull,
     Rival,
+    Size,
     State,
     Step,
     Verdict,
@@ -34,7 +36,15 @@ from pchem_pipeline.effects.framework.compose import place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["LARGEST_REST", "Added", "Addition", "Findings", "Fitted", "build_verdict", "largest_pulls"]
+__all__ = [
+    "LARGEST_REST",
+    "Added",
+    "Addition",
+    "Findings",
+    "Fitted",
+    "build_verdict",
+    "largest_pulls",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -43,9 +53,6 @@ LARGEST_REST = 0.2
 _MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
-_CONVINCING_PLACEBO = (
-    0.25  # share of the gap closed by an effect that is no relative, that is worth a warning
-)
 _MICRO = 1e-3  # nats: smaller gaps are said in millionths
 
 
@@ -60,8 +67,8 @@ class Addition:
         candidates: those compared, the likeliest first.
         strength_stderr: standard error of its strength.
         before, after: gap on the final samples without and with it.
-        runner_up, placebo: the next best candidate and one that has nothing to do with it, fitted the same
-            way; None where there is none.
+        rivals: the next best candidates, fitted the same way, the best first.
+        placebo: the best of those that have nothing to do with it, or None.
         pulls: the statistics that moved most.
         moved: change of each parameter map by its refit with the effect.
         described: whether it is measured where no known effect explains the data, and not understood.
@@ -74,7 +81,7 @@ class Addition:
     strength_stderr: float
     before: Gap
     after: Gap
-    runner_up: Rival | None
+    rivals: tuple[Rival, ...]
     placebo: Rival | None
     pulls: tuple[Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -92,7 +99,7 @@ class Addition:
             return "described"
         return "unexplained" if not self.fits else "named" if self.alone else "ambiguous"
 
-    def step(self) -> Step:
+    def step(self, size: Size | None) -> Step:
         """Return it as ``discrepancy.json`` holds it."""
         rivals = {c.effect for c in self.candidates}
         separate = dict(type(self.effect).separate)
@@ -107,7 +114,8 @@ class Addition:
             gap_floor=self.after.floor,
             gap_interval_after=self.after.interval,
             families=Families(before=dict(self.before.families), after=dict(self.after.families)),
-            runner_up=self.runner_up,
+            size=size,
+            rivals=self.rivals,
             placebo=self.placebo,
             moved={name: Moved(**change) for name, change in self.moved.items()},
             separate={tag: text for tag, text in separate.items() if tag in rivals or self.named},
@@ -180,11 +188,13 @@ class Findings:
             if self.still:
                 return "unexplained"
             return "cannot_tell" if self.doubt else "consistent"
-        if self.added.unfinished or any(not each.fits for each in additions):
-            return "unexplained"
         if any(each.described for each in additions):
             return "described"
-        return "ambiguous" if any(not each.named for each in additions) else "named"
+        if self.added.unfinished or any(not each.fits for each in additions):
+            return "named_in_part" if self.named else "unexplained"
+        if any(not each.named for each in additions):
+            return "ambiguous"
+        return "named" if self.added.after.at_floor else "named_in_part"
 
     @property
     def named(self) -> tuple[Effect, ...]:
@@ -198,7 +208,7 @@ class Findings:
             present: effects that it had before the search.
             extended: the same, and all that were added.
         """
-        described = [a.effect for a in self.added.additions if a.described and self.state == "described"]
+        described = [each.effect for each in self.added.additions if each.described]
         tags = {effect.tag for effect in (*present, *self.named, *described)}
         return tuple(effect for effect in extended if effect.tag in tags)
 
@@ -210,7 +220,7 @@ def build_verdict(
     looked_at: tuple[Evidence, Examined],
     *,
     untestable: Mapping[str, str],
-    left_out: Mapping[str, str],
+    defects: Mapping[str, str],
     n_replicates: int,
 ) -> Discrepancy:
     """Put the verdict together.
@@ -221,9 +231,13 @@ def build_verdict(
         fitted: the pixels under it.
         looked_at: evidence of the train samples, and what was examined.
         untestable: effects that such data cannot show, and why.
-        left_out: candidates that failed, and why.
+        defects: candidates that failed, and why.
         n_replicates: drawn in all.
     """
+    sizes = {
+        each.effect.tag: size_of(each.effect, fitted.maps, looked_at[1].frames)
+        for each in found.added.additions
+    }
     both = found.z.both
     pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
     rest = sorted(zip(found.last.names, pulls[1].tolist(), strict=True), key=lambda item: -abs(item[1]))
@@ -231,17 +245,17 @@ def build_verdict(
     return Discrepancy(
         verdict=Verdict(
             verdict=found.state,
-            sentence=_sentence(found),
+            sentence=_sentence(found, sizes),
             doubt=found.doubt,
             effects=tuple(effect.tag for effect in found.named),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
-            steps=tuple(each.step() for each in found.added.additions),
+            steps=tuple(each.step(sizes[each.effect.tag]) for each in found.added.additions),
             gap=_gap_change(found.before, found.added),
             where=tuple(found.places),
             unexplained=(*found.added.residuals, *left),
             set_aside=found.added.set_aside if found.named else (),
             untestable=dict(untestable),
-            left_out=dict(left_out),
+            defects=dict(defects),
             examined=looked_at[1],
             p_global=Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
             replicates=n_replicates,
@@ -286,10 +300,10 @@ def _gap_change(before: Gap, added: Added) -> GapChange:
     )
 
 
-def _sentence(found: Findings) -> str:
-    """Return the verdict in one sentence."""
+def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
+    """Return the verdict in one sentence: what, how large, and what it closes beside its rivals."""
     state, data, added = found.state, found.samples, found.added
-    titles = [title_words(effect) for effect in found.named]
+    titles = [_sized(effect, sizes) for effect in found.named]
     if state == "consistent":
         return f"The {data} agree with the model in every statistic tested."
     if state == "cannot_tell":
@@ -298,7 +312,9 @@ def _sentence(found: Findings) -> str:
             f"of what shows in the shape of the histograms this sensor cannot tell: {found.doubt}."
         )
     if state == "unexplained":
-        return f"The {data} disagree with the model{_unexplained(found, titles)}{_left(added)}."
+        lead = f" (largest in {found.places[0].statistic})" if found.places else ""
+        words = f"{lead}, and no known effect explains it{_nearest(found)}{_left(added)}"
+        return f"The {data} disagree with the model{words}."
     if state == "described":
         return _described(found, titles)
     if state == "ambiguous":
@@ -309,12 +325,18 @@ def _sentence(found: Findings) -> str:
     if found.before.at_floor:
         limit = f"{1e6 * found.before.floor:.2g} micronats per sample"
         return f"The model was missing {_and(titles)}; on the final {data} alone its gap is below {limit}."
-    if added.after.value > max(added.after.floor, NEGLIGIBLE_REST * found.before.value):
-        closed = f"{_gaps(found)}{_rest(found)}{_left(added)}{_placebo(added)}"
-        return f"The model was missing {_and(titles)}, which is a part of it: the gap went {closed}."
+    if state == "named_in_part":
+        words = f"{_closed(found)}{_rest(found)}{_nearest(found)}{_left(added)}{_compared(added)}"
+        return f"A part of what the model was missing is {_and(titles)}: {words}."
     them = "them" if len(titles) > 1 else "it"
-    closed = f"{_gaps(found)}{_left(added)}{_placebo(added)}"
-    return f"The model was missing {_and(titles)}; with {them} the gap on unseen {data} went {closed}."
+    words = f"with {them}, {_closed(found)} and what is left is at its floor{_left(added)}{_compared(added)}"
+    return f"The model was missing {_and(titles)}; {words}."
+
+
+def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
+    """Return what an effect is called, with its size."""
+    size = sizes.get(effect.tag)
+    return title_words(effect) if size is None else f"{title_words(effect)} of {size.words()}"
 
 
 def _described(found: Findings, titles: Sequence[str]) -> str:
@@ -323,52 +345,61 @@ def _described(found: Findings, titles: Sequence[str]) -> str:
     besides = f" besides {_and(titles)}" if titles else ""
     return (
         f"No known effect explains the {found.samples}{besides}, but what they hold is measured: {words}; "
-        f"with it the gap on unseen {found.samples} went {_gaps(found)}{_rest(found)}."
+        f"with it {_closed(found)}{_rest(found)}."
     )
 
 
-def _unexplained(found: Findings, titles: Sequence[str]) -> str:
-    """Return what is known of a disagreement that no known effect explains."""
-    lead = f" (largest in {found.places[0].statistic})" if found.places else ""
+def _nearest(found: Findings) -> str:
+    """Return in words which known effects come nearest to what none explains."""
     doubtful = [each.candidates[0].effect for each in found.added.additions if not each.fits]
-    nearest = doubtful or found.added.nearest
-    return (
-        f"{lead}, and no known effect explains it"
-        + (f" besides {_and(titles)}" if titles else "")
-        + (f"; nearest known: {_and(nearest)}" if nearest else "")
-    )
+    nearest = [tag for tag in doubtful or found.added.nearest if tag not in {e.tag for e in found.named}]
+    return f"; nearest known: {_and(nearest)}" if nearest else ""
 
 
-def _gaps(found: Findings) -> str:
-    """Return the gap before and after, and its floor, in words."""
-    after = found.added.after
-    values = [found.before.value, max(after.value, 0.0), after.floor]
-    unit, scale = ("micronats", 1e6) if found.before.value < _MICRO else ("nats", 1.0)
-    before, left, floor = (scale * value for value in values)
-    return f"{before:.3g} -> {left:.3g} {unit} per sample (floor {floor:.2g})"
+def _closed(found: Findings) -> str:
+    """Return the share of the gap that is closed, with the gap before and after and its floor, in words."""
+    before, after = found.before.value, found.added.after
+    unit, scale = ("micronats", 1e6) if before < _MICRO else ("nats", 1.0)
+    left, floor = scale * max(after.value, 0.0), scale * after.floor
+    share = 1.0 - max(after.value, 0.0) / before
+    gaps = f"{scale * before:.3g} -> {left:.3g} {unit} per sample, floor {floor:.2g}"
+    return f"{_share(share)} of the gap on unseen {found.samples} is closed ({gaps})"
+
+
+def _share(share: float) -> str:
+    """Return a share in words; what is not all is never said to be all."""
+    percent = 100.0 * share
+    return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
 
 
 def _rest(found: Findings) -> str:
     """Return how much of the gap is left above its floor, in words; nothing where it is at it."""
     after = found.added.after
-    if after.value <= max(after.floor, NEGLIGIBLE_REST * found.before.value):
+    if after.at_floor or found.before.value <= 0.0:
         return ""
-    return f"; {max(after.value, 0.0) / found.before.value:.0%} of the gap is left unexplained"
+    return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
 
 
-def _placebo(added: Added) -> str:
-    """Return in words where an effect that is no relative of the named one closes much of its gap, too."""
-    words = []
+def _compared(added: Added) -> str:
+    """Return in words what the runner-up and the placebo close in the place of each named effect."""
+    words, doubted = [], []
     for each in added.additions:
         closed = each.before.value - each.after.value
-        if not each.named or each.placebo is None or closed <= 0.0:
+        if not each.named or closed <= 0.0:
             continue
-        share = (each.before.value - each.placebo.gap_after) / closed
-        if share > _CONVINCING_PLACEBO:
-            words.append(
-                f"{each.placebo.effect} in the place of {each.effect.tag} closes {share:.0%} of that"
-            )
-    return f"; but {_and(words)}: take the name with caution" if words else ""
+        own = []
+        for role, rival in (("the runner-up", next(iter(each.rivals), None)), ("a placebo", each.placebo)):
+            if rival is None:
+                continue
+            share = (each.before.value - max(rival.gap_after, 0.0)) / closed
+            own.append(f"{role} ({rival.effect}) closes {_share(min(max(share, 0.0), 1.0))} of that")
+            if role == "a placebo" and share > CONVINCING_PLACEBO:
+                doubted.append(each.effect.tag)
+        if each.placebo is None:
+            own.append("no unrelated effect closes any of it")
+        words.append(f"in the place of {each.effect.tag} {_and(own)}")
+    caution = f": take the name {_and(doubted)} with caution" if doubted else ""
+    return f"; {'; '.join(words)}{caution}" if words else ""
 
 
 def _left(added: Added) -> str:

@@ -36,7 +36,7 @@ class Explainer(Protocol[Explanation]):
         samples: what the data are, for the verdict's sentence ("frames", "histograms").
         most_rounds: of explaining and adding.
         model: effects; those that were there before, and those added since.
-        left_out: candidates that failed, and why.
+        defects: candidates that failed, and why.
         untestable: effects that such data cannot show, and why.
         n_replicates: drawn so far.
     """
@@ -45,7 +45,7 @@ class Explainer(Protocol[Explanation]):
     samples: str
     most_rounds: int
     model: tuple[Effect, ...]
-    left_out: dict[str, str]
+    defects: dict[str, str]
     untestable: dict[str, str]
     n_replicates: int
 
@@ -125,6 +125,6 @@ def search(by: Explainer[Explanation]) -> Discrepancy:
         by.fitted(model),
         (evidence, examined),
         untestable=by.untestable,
-        left_out=by.left_out,
+        defects=by.defects,
         n_replicates=by.n_replicates,
     )

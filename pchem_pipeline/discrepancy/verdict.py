@@ -2,7 +2,7 @@
 
 The keys of the JSON are the names of the fields; a number that is not known is ``null`` there and NaN here.
 Whoever adds a key adds it here, and nowhere else; one that older files lack has a default, or raises
-:data:`SCHEMA_VERSION` and is filled in by :func:`_from_1` or a function like it.
+:data:`SCHEMA_VERSION` and is filled in by :func:`_from_2` or a function like it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
 
 __all__ = [
-    "NEGLIGIBLE_REST",
+    "CONVINCING_PLACEBO",
+    "RARE",
     "SCHEMA_VERSION",
     "VERDICT_FILE",
     "Candidate",
@@ -40,6 +41,7 @@ __all__ = [
     "Place",
     "Pull",
     "Rival",
+    "Size",
     "State",
     "Step",
     "Surveyed",
@@ -49,14 +51,17 @@ __all__ = [
 ]
 
 #: As the field ``schema_version`` of :class:`Verdict` has it.
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
+#: Share of the samples below which the size of an effect is that of the samples that it changes.
+RARE = 0.5
+#: Share of what an effect closes, from which on an unrelated one that closes as much weakens its name.
+CONVINCING_PLACEBO = 0.25
 #: File of the verdict in the folder of a run.
 VERDICT_FILE = "discrepancy.json"
 
-#: Share of the gap below which nothing is said to be left, even above the floor.
-NEGLIGIBLE_REST = 0.01
-
-State = Literal["named", "ambiguous", "described", "unexplained", "consistent", "cannot_tell"]
+State = Literal[
+    "named", "named_in_part", "ambiguous", "described", "unexplained", "consistent", "cannot_tell"
+]
 
 _NAN = float("nan")
 
@@ -67,6 +72,10 @@ def _number(value: Any) -> Any:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %" if share < 1.0 else f"{100.0 * share:.0f} %"
 
 
 Number = Annotated[float, BeforeValidator(_number), PlainSerializer(_finite, when_used="json")]
@@ -116,11 +125,42 @@ class Candidate(_Part):
         )
 
 
+class Size(_Part):
+    """By how much an effect changes the samples, about a pixel's mean change; a rare one those that it does.
+
+    Attributes:
+        electrons: e-.
+        dn: DN.
+        of_read_noise: share of the median read noise.
+        samples: share of the samples that it changes, where and when it acts.
+    """
+
+    electrons: Number
+    dn: Number
+    of_read_noise: Number
+    samples: Number = 1.0
+
+    def words(self) -> str:
+        """Return it for people."""
+        share = _percent(self.of_read_noise)
+        most = f"{self.dn:.2g} DN rms ({self.electrons:.2g} e-, {share} of the read noise)"
+        return most if self.samples >= RARE else f"{most} in {_percent(self.samples)} of the samples"
+
+
 class Rival(_Part):
-    """Another effect added in the place of the named one, and the gap that it leaves, nats per sample."""
+    """Another effect added in the place of the named one, fitted in the same way.
+
+    Attributes:
+        effect: its tag.
+        gap_after: the gap that it leaves, nats per sample.
+        behind: log score behind the chosen one, nats; NaN where it was not scored.
+        why: what it leaves of the data, or why it could not decide.
+    """
 
     effect: str
     gap_after: Number
+    behind: Number = _NAN
+    why: str = ""
 
 
 class Moved(_Part):
@@ -286,9 +326,11 @@ class Step(_Part):
         place: where and when it acts, in words; empty: everywhere, always.
         gap_before, gap_after, gap_floor: on the final samples without and with it, nats per sample.
         gap_interval_after: 95 % interval of the gap with it.
+        size: by how much it changes the samples; None where that is not known.
         families: the gap by family of statistics.
-        runner_up: the next best candidate, fitted in its place.
-        placebo: an effect that has nothing to do with it, fitted in its place.
+        rivals: the next best candidates, the best first, each fitted in its place.
+        placebo: the best of those that have nothing to do with it, fitted in its place; None where none of
+            them would close anything.
         moved: change of each parameter map by its refit with the effect.
         separate: by effect, the measurement that would tell it apart.
         pulls: the statistics that it moves most.
@@ -303,12 +345,24 @@ class Step(_Part):
     gap_after: Number
     gap_floor: Number
     gap_interval_after: Interval = (_NAN, _NAN)
+    size: Size | None = None
     families: Families = Families()
-    runner_up: Rival | None = None
+    rivals: tuple[Rival, ...] = ()
     placebo: Rival | None = None
     moved: dict[str, Moved] = {}
     separate: dict[str, str] = {}
     pulls: tuple[Pull, ...] = ()
+
+    @property
+    def runner_up(self) -> Rival | None:
+        """The best of the rivals."""
+        return self.rivals[0] if self.rivals else None
+
+    def closed_by(self, rival: Rival) -> float:
+        """Return the share of the gap before this step that a rival closes in its place; NaN: no gap."""
+        if not self.gap_before > 0.0:
+            return _NAN
+        return 1.0 - max(rival.gap_after, 0.0) / self.gap_before
 
     @property
     def likeliest(self) -> str:
@@ -320,9 +374,9 @@ class Verdict(_Part):
     """The content of ``discrepancy.json``.
 
     Attributes:
-        verdict: named, ambiguous, described (measured, not understood), unexplained, consistent, or
-            cannot_tell: nothing is found that does not rest on the pixels' parameters, and those are not
-            identified.
+        verdict: named (the gap that is left is at its floor), named_in_part (``gap.closed_fraction`` of it is
+            closed), ambiguous, described (measured, not understood), unexplained, consistent, or cannot_tell:
+            nothing is found that does not rest on the pixels' parameters, and those are not identified.
         doubt: why the pixels are not identified, and what would help; empty where they are.
         sentence: the same for people.
         effects: tags of the named effects.
@@ -334,14 +388,14 @@ class Verdict(_Part):
         set_aside: codes that the fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
             limit.
         untestable: effects that such data cannot show, and why.
-        left_out: candidates that failed, and why.
+        defects: candidates that could not be compared because of an error in them, and which.
         examined: what was looked at.
         p_global: chance of the largest deviation.
         replicates: simulated stacks or histograms in all.
         versions: of what a verdict depends on.
     """
 
-    schema_version: Literal[2] = 2
+    schema_version: Literal[3] = 3
     verdict: State
     sentence: str
     doubt: str = ""
@@ -353,7 +407,7 @@ class Verdict(_Part):
     unexplained: tuple[Place, ...]
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
     untestable: dict[str, str]
-    left_out: dict[str, str]
+    defects: dict[str, str]
     examined: Examined
     p_global: Change
     replicates: int
@@ -388,7 +442,7 @@ class Verdict(_Part):
                 f"{SCHEMA_VERSION}; use the version that wrote it, or {cure}"
             )
         try:
-            return cls.model_validate(_from_1(content) if version == 1 else content)
+            return cls.model_validate(_up_to_date(content, version))
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(str(part) for part in first["loc"])
@@ -396,11 +450,7 @@ class Verdict(_Part):
 
     @property
     def word(self) -> str:
-        """The verdict in a word or two: effects that leave some of the gap are named in part."""
-        gap = self.gap
-        left = gap.after > max(gap.floor, NEGLIGIBLE_REST * gap.before)
-        if self.verdict == "named" and gap.before > gap.floor and left:
-            return f"named in part, {gap.after / gap.before:.0%} of the gap stays"
+        """The verdict in a word or three."""
         return self.verdict.replace("_", " ")
 
     def added(self, step: Step) -> str:
@@ -410,7 +460,7 @@ class Verdict(_Part):
         rivals = list(dict.fromkeys(c.effect for c in step.candidates))[:3]
         if not rivals or self.verdict in ("consistent", "cannot_tell"):
             return ""
-        return f"nearest: {rivals[0]}" if self.verdict == "unexplained" else " or ".join(rivals)
+        return f"nearest: {rivals[0]}" if step.verdict == "unexplained" else " or ".join(rivals)
 
     def on_sensor(
         self,
@@ -453,14 +503,39 @@ def read_verdict(folder: Path) -> Verdict | None:
     return Verdict.from_json(text, str(path))
 
 
+def _up_to_date(content: Mapping[str, Any], version: Any) -> dict[str, Any]:
+    """Return the content of a file of some schema as the present one has it."""
+    found = dict(content)
+    if version == 1:
+        found = _from_1(found)
+    return _from_2(found) if version in (1, 2) else found
+
+
 def _from_1(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a file of version 0.1 as the present schema has it."""
+    """Return the content of a file of version 0.1 as the second schema has it."""
     found = {key: value for key, value in content.items() if key not in ("schema", "untestable_reasons")}
     reasons = content.get("untestable_reasons") or {}
-    found["schema_version"] = SCHEMA_VERSION
     found["untestable"] = {tag: reasons.get(tag, "") for tag in content.get("untestable", ())}
     for key in ("where", "unexplained"):
         found[key] = [{**place, "dn": place.get("dn") or None} for place in content.get(key, ())]
+    return found
+
+
+def _from_2(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of the second schema: there 'named' said nothing of the gap that was left."""
+    found = {**content, "schema_version": SCHEMA_VERSION, "steps": []}
+    if "left_out" in found:
+        found["defects"] = found.pop("left_out")
+    for step in content.get("steps", ()):
+        first = step.get("runner_up")
+        kept = {key: value for key, value in step.items() if key != "runner_up"}
+        found["steps"].append({**kept, "rivals": [] if first is None else [first]})
+    gap = content.get("gap") or {}
+    after, floor = gap.get("after"), gap.get("floor")
+    left = after is not None and floor is not None and after > floor
+    said = content.get("verdict")
+    if content.get("effects") and (said == "unexplained" or (said == "named" and left)):
+        found["verdict"] = "named_in_part"
     return found
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from pchem_pipeline.base.errors import InputError, PchEmError, StoreError
+from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
 from pchem_pipeline.config.tree import RunConfig
@@ -337,7 +337,7 @@ class StageContext:
     def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:
         error = outcome.error
         assert error is not None
-        reason = str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
+        reason = error_words(error)
         self.failed[unit.key] = reason
         self.reporter.event("failed", stage=self.stage, unit=unit.key, reason=reason, trace=outcome.trace)
         full = (isinstance(error, StoreError) and is_fatal(error.__cause__ or error)) or is_fatal(error)

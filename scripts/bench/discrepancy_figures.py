@@ -70,7 +70,8 @@ class Answer:
             return "wrong"
         if self.hidden and self.within:
             return "in set"
-        return {"named": "part", "ambiguous": "other set"}.get(self.verdict, self.verdict)
+        words = {"named": "part", "named_in_part": "part", "ambiguous": "other set"}
+        return words.get(self.verdict, self.verdict)
 
     @property
     def names(self) -> str:
@@ -257,7 +258,7 @@ def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
         worst = Counter(s["placebo"]["effect"] for s in apart if _closed(s, "placebo") > 0.25)
         if worst:
             print("    placebos that close more: " + ", ".join(f"{t} x{n}" for t, n in worst.most_common()))
-    rivals = [s for s, _ in strong if s.get("runner_up") and s["gap_before"] > 0]
+    rivals = [s for s, _ in strong if s.get("rivals") and s["gap_before"] > 0]
     _share("4 s95: the right name closes more than the runner-up", rivals, _better_than_runner_up, least=1.0)
 
 
@@ -270,7 +271,7 @@ def _closed(step: dict[str, Any], who: str) -> float:
 
 
 def _better_than_runner_up(step: dict[str, Any]) -> bool:
-    return bool(step["gap_after"] < step["runner_up"]["gap_after"] or step["gap_after"] <= step["gap_floor"])
+    return bool(step["gap_after"] < step["rivals"][0]["gap_after"] or step["gap_after"] <= step["gap_floor"])
 
 
 def _bias_titles() -> None:

@@ -78,7 +78,7 @@ def _one(seed: int, most_samples: float) -> dict[str, Any]:
         found = find_discrepancies(camera.frames(seed)).verdict
         record |= {
             "verdict": found.verdict, "effects": found.effects, "p": found.p_global.before,
-            "left_out": found.left_out,
+            "defects": found.defects,
         }  # fmt: skip
     except (InputError, PchEmError) as error:
         record |= {"verdict": "refused", "why": str(error)}

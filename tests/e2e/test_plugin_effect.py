@@ -79,7 +79,7 @@ def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_pl
     offset = found["steps"][0]["parameters"]["offset_dn"]
     assert abs(offset["value"] - key["strength"]) < 0.1 * key["strength"]
     for tag, reason in BROKEN.items():
-        assert reason in found["left_out"][tag]
+        assert reason in found["defects"][tag]
         assert any(tag in line and reason in line for line in result.stderr.splitlines())
     assert any("lost_offset" in line for line in result.stderr.splitlines())
     assert "chessboard_offset" in (with_plugin.folder / "run.yaml").read_text()

@@ -26,6 +26,7 @@ __all__ = ["AddedSets"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_MOST_RIVALS = 3
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
 
@@ -151,6 +152,8 @@ class AddedSets:
         if named.equals:
             candidates = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
         chance = self.gaps.chance(self.sets.problem(extended.members), extended.fit)
+        rivals = self._rivals(named, members, chance)
+        kin = {member.tag, *type(member.effect).separate}
         return Addition(
             effect=member.effect,
             alone=not named.equals,
@@ -159,8 +162,8 @@ class AddedSets:
             strength_stderr=_stderr(extended, member, named.apart),
             before=gaps[0],
             after=gaps[1],
-            runner_up=self._in_place(named, members, chance, relatives=True),
-            placebo=self._in_place(named, members, chance, relatives=False),
+            rivals=rivals[:_MOST_RIVALS],
+            placebo=next((r for r in rivals[1:] if r.effect not in kin), None),
             pulls=(),
             moved=_moved(*fits),
         )
@@ -181,25 +184,25 @@ class AddedSets:
             for (e, score, error), w in zip(scored, weights, strict=True)
         )
 
-    def _in_place(
-        self, named: Named, members: tuple[Member, ...], chance: float, *, relatives: bool
-    ) -> Rival | None:
-        """Return a rival (a relative of the effect, or one that has nothing to do with it) and its gap."""
-        kin = set(type(named.member.effect).separate)
-        for rival in named.rivals:
-            other = next((m for m in rival.members if m.tag not in self.found.judged.tags), None)
-            if other is None or (other.tag in kin) != relatives:
-                continue
-            others = tuple(m for m in members if m.tag != named.member.tag)
-            if any(other.excludes(m) for m in others):
+    def _rivals(self, named: Named, members: tuple[Member, ...], chance: float) -> tuple[Rival, ...]:
+        """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
+        others = tuple(m for m in members if m.tag != named.member.tag)
+        judged, found = self.found.judged, []
+        for set_with in named.rivals:
+            other = next((m for m in set_with.members if m.tag not in judged.tags), None)
+            if other is None or any(other.excludes(m) for m in others):
                 continue
             try:
                 fitted = self._refit((*others, other))
             except ValueError:
                 continue
+            behind, error = self.found.sets.difference(set_with, judged)
             gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
-            return Rival(effect=other.tag, gap_after=gap)
-        return None
+            why = f"predicts samples that it was not fitted to worse, by {-behind:.3g} +- {error:.2g} nats"
+            if other.tag in named.equals:
+                why = "predicts as well: these histograms do not tell them apart"
+            found.append(Rival(effect=other.tag, gap_after=gap, behind=behind, why=why))
+        return tuple(sorted(found, key=lambda rival: -rival.behind))
 
 
 def _stderr(extended: FittedSet, member: Member, apart: float) -> float:

@@ -129,7 +129,7 @@ class HistogramExplainer:
     samples: str = "histograms"
     most_rounds: int = 1
     n_replicates: int = 0
-    left_out: dict[str, str] = field(default_factory=dict)
+    defects: dict[str, str] = field(default_factory=dict)
     untestable: dict[str, str] = field(default_factory=dict)
     found: Explanation | None = None
 
@@ -161,7 +161,7 @@ class HistogramExplainer:
         self.parts = tuple(part[self.chosen] for part in parts)
         self.origin = origin[self.chosen]
         self._compare_on_a_line()
-        self.members, untestable, self.left_out = find_members(self.classes, self.evidence, self.present)
+        self.members, untestable, self.defects = find_members(self.classes, self.evidence, self.present)
         always = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         found = {tag: why for tag, why in (always | untestable).items() if tag not in self.classes}
         self.untestable = dict(sorted((found | untestable).items()))
@@ -207,7 +207,7 @@ class HistogramExplainer:
     def explain(self, null: NullModel, z: Measured, disagrees: bool) -> Explanation | None:
         """Find the set of effects that best predicts the test part, on the codes that are understood."""
         found = explain(self.sets, self.members, self._count, self.rng)
-        self.left_out |= self.sets.failed | found.sets.failed
+        self.defects |= self.sets.failed | found.sets.failed
         if not disagrees:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
             if not found.named or rise < max(_CONVINCING, _SIGMAS * error):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -210,7 +211,7 @@ def find_members(
             starts = [*effect.estimate(evidence), *effect.typical()]
             found = [Member.of(start) for start in _distinct(starts) if _changes(start, evidence)]
         except Exception as error:
-            failed[tag] = f"{type(error).__name__}: {error}"
+            failed[tag] = error_words(error)
             continue
         if starts and not found:
             untestable[tag] = f"{NO_ORDER}: {_SAME_LAW}"

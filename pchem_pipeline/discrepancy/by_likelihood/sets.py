@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.base.errors import PchEmError
+from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
@@ -35,6 +35,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+_RIVALS_SHOWN = 3
 
 _SIGMAS = 3.0  # standard errors by which an effect must improve the score, and a set must beat a rival
 _PRICE = 3.0  # nats: and by so much at least
@@ -221,8 +223,7 @@ class SetComparison:
         except ValueError:
             return None  # its fields do not go together where the fit led
         except Exception as error:
-            reason = str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
-            self.failed[members[-1].tag] = reason
+            self.failed[members[-1].tag] = error_words(error)
             return None
 
     def difference(self, one: FittedSet, other: FittedSet) -> tuple[float, float]:
@@ -258,7 +259,7 @@ class SetComparison:
                 slope, step = self._slope(base, theta, member, tangent.log_masses)
             # whatever a stranger's effect raises must not stop the others
             except Exception as error:
-                self.failed[member.tag] = f"{type(error).__name__}: {error}"
+                self.failed[member.tag] = error_words(error)
                 continue
             d = np.concatenate([tangent.derivatives, slope[:, None, :]], axis=1)
             information = (d * weights[:, None, :]) @ d.transpose(0, 2, 1)
@@ -422,4 +423,5 @@ def find_rivals(
     base = sets.attempt(others, best.fit.parameters)
     if base is None:
         return None, []
-    return base, _additions(sets, base, [c for c in candidates if c.tag != member.tag], 2)
+    wanted = [c for c in candidates if c.tag != member.tag]
+    return base, _additions(sets, base, wanted, _RIVALS_SHOWN)

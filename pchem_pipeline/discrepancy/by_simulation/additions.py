@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, unrelated
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Contender,
     Hypothesis,
@@ -21,8 +21,10 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 )
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival
+from pchem_pipeline.effects.framework.effect import Effect
 
 __all__ = ["AddedRounds", "Round"]
 
@@ -32,6 +34,7 @@ _CLEAR_MARGIN = 50.0  # nats
 _REST_OF_NAMED = 0.1  # of the gap that an effect closes, the most that may be left where it gets a name
 _LEFT = 4.0  # deviations that are left of a statistic
 _MOVED = 2.0  # standard deviations by which an effect moves it
+_MOST_RIVALS = 3
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,9 @@ class AddedRounds:
             (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)
             for r in (rivals if named else kept)
         ]
-        runner_up, placebo = _comparisons(this, added, rivals)
+        others = self._others(this, member)
+        ranked = others[:_MOST_RIVALS]
+        placebo = next((o for o in others[1:] if o.closes and unrelated(o.effect, added.effect)), None)
         off = self.z.final - this.null.mean
         return Addition(
             effect=added.effect if named else compared[0][0],
@@ -143,8 +148,8 @@ class AddedRounds:
             strength_stderr=_stderr(added, float(this.added.stderr[member])),
             before=gaps[0],
             after=gaps[1],
-            runner_up=self._in_place(this, member, runner_up),
-            placebo=self._in_place(this, member, placebo),
+            rivals=tuple(self._rival(this, one) for one in ranked),
+            placebo=None if placebo is None else self._rival(this, placebo),
             pulls=largest_pulls(
                 this.null.names,
                 added.fingerprint / this.null.std,
@@ -154,20 +159,63 @@ class AddedRounds:
             moved=this.moved,
         )
 
-    def _in_place(self, this: Round, member: int, rival: Hypothesis | None) -> Rival | None:
-        """Return a rival fitted in the place of a member of the chosen set, with the gap that it leaves."""
-        if rival is None:
-            return None
-        refitted = this.compared.with_rival(this.added.hypotheses[member].tag, rival.tag)
-        if refitted is not None:
-            gap = self.gaps.gap(self.z.final, refitted.mean, this.null.replicates)
-            return Rival(effect=rival.tag, gap_after=gap.value)
-        others = [h for i, h in enumerate(this.added.hypotheses) if i != member]
+    def _others(self, this: Round, member: int) -> list[_Other]:
+        """Return all that could stand in the place of a member of the chosen set, the best first."""
+        compared, added = this.compared, this.added.hypotheses[member]
+        kept = [h for i, h in enumerate(this.added.hypotheses) if i != member]
+        found: dict[str, _Other] = {}
+        for one in compared.tried:
+            new = one.tags - compared.chosen.tags
+            if len(new) == 1 and one.tags == (compared.chosen.tags - {added.tag}) | new:
+                hypothesis = next(h for h in one.hypotheses if h.tag in new)
+                behind = one.score - compared.chosen.score
+                found.setdefault(hypothesis.tag, _Other(hypothesis.effect, behind, one.mean, one.rest, True))
         noise = Noise(this.null.covariance / 2.0, self.settings.model_error)
-        fit = fit_set([*others, rival], self.z.both - this.null.mean, noise)
-        mean = this.null.mean + fit.parts.sum(axis=0)
-        gap = self.gaps.gap(self.z.final, mean, this.null.replicates)
-        return Rival(effect=rival.tag, gap_after=gap.value)
+        shift = self.z.both - this.null.mean
+        best = fit_set(this.added.hypotheses, shift, noise).log_score(shift, noise)
+        refitted = {*compared.chosen.tags, *found}
+        for hypothesis in this.hypotheses:
+            if hypothesis.tag in refitted:
+                continue
+            fit = fit_set([*kept, hypothesis], shift, noise)
+            mean = this.null.mean + fit.parts.sum(axis=0)
+            rest = (self.z.both - mean) / np.sqrt(np.diag(noise.of(fit.parts)))
+            behind = fit.log_score(shift, noise) - best
+            if hypothesis.tag not in found or behind > found[hypothesis.tag].behind:
+                closes = bool(fit.factors[-1] > 0.0)
+                found[hypothesis.tag] = _Other(hypothesis.effect, behind, mean, rest, closes)
+        return sorted(found.values(), key=lambda other: -other.behind)
+
+    def _rival(self, this: Round, other: _Other) -> Rival:
+        """Return a rival with the gap that it leaves, and the statistic that speaks most against it."""
+        gap = self.gaps.gap(self.z.final, other.mean, this.null.replicates)
+        worst = int(np.argmax(np.abs(other.rest)))
+        if not other.closes:
+            why = "at no strength does it explain anything"
+        elif abs(other.rest[worst]) > _LEFT:
+            why = f"leaves {STATISTICS[this.null.names[worst]].sentence} ({other.rest[worst]:+.1f} sd)"
+        else:
+            why = "leaves no single statistic far off, but all of them together fit worse"
+        return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)
+
+
+@dataclass(frozen=True)
+class _Other:
+    """An effect fitted in the place of a chosen one.
+
+    Attributes:
+        effect: at its best strength.
+        behind: its log score against the chosen set, nats.
+        mean: statistics of the model with it, shape (m,).
+        rest: what is left of the data, in its errors, shape (m,).
+        closes: whether a strength above 0 explains anything.
+    """
+
+    effect: Effect
+    behind: float
+    mean: FloatArray
+    rest: FloatArray
+    closes: bool
 
 
 def _implicated(part: FloatArray, rest: FloatArray, null: NullModel) -> bool:
@@ -202,19 +250,3 @@ def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Conten
     # what goes its own way in every simulation is not beaten by a few nats
     erratic = [r for r in rivals if type(r.hypothesis.effect).erratic and r.score > -_CLEAR_MARGIN]
     return kept + [r for r in erratic if r not in kept]
-
-
-def _comparisons(
-    this: Round, added: Hypothesis, rivals: Sequence[Contender]
-) -> tuple[Hypothesis | None, Hypothesis | None]:
-    """Return the runner-up, and a candidate that is no relative of the named effect, for a placebo."""
-    runner_up = next((r.hypothesis for r in rivals if r.hypothesis.tag != added.tag), None)
-    in_set = {h.tag for h in this.added.hypotheses}
-    relatives = set(type(added.effect).separate)
-    pool = [h for h in this.hypotheses if h.tag not in in_set]
-    if runner_up is None:
-        runner_up = next((h for s in this.compared.tried for h in s.hypotheses if h.tag not in in_set), None)
-    placebo = next(
-        (h for h in pool if h.tag not in relatives and added.tag not in type(h.effect).separate), None
-    )
-    return runner_up, placebo

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -47,7 +47,8 @@ def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
     for replicate in replicates:
         try:
             found.append(replicate())
-        except PchEmError as error:
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
             found.append(error)
     return found
 
@@ -106,7 +107,7 @@ class ReplicateSimulator:
         mapper: who does the work.
         prefix: begins the keys of its replicates.
         seed: of the random numbers that all candidates share.
-        left_out: candidates that failed, and why.
+        defects: candidates that failed, and why.
     """
 
     maps: PixelMaps
@@ -116,7 +117,7 @@ class ReplicateSimulator:
     mapper: Mapper
     prefix: str
     seed: int
-    left_out: dict[str, str] = field(default_factory=dict)
+    defects: dict[str, str] = field(default_factory=dict)
     _rows: dict[str, FloatArray] = field(default_factory=dict)
 
     def guesses(
@@ -125,7 +126,7 @@ class ReplicateSimulator:
         evidence: Sequence[Evidence],
         parts: Sequence[tuple[Part, Evidence]] = (),
     ) -> list[Effect]:
-        """Ask every candidate for hypotheses; one that raises is left out.
+        """Ask every candidate for hypotheses; one that raises is a defect.
 
         The first evidence in which a candidate sees anything counts. A guess says only what to look at:
         strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
@@ -133,7 +134,7 @@ class ReplicateSimulator:
         """
         found: list[Effect] = []
         for tag, effect in classes.items():
-            if tag in {present.tag for present in self.model} | self.left_out.keys():
+            if tag in {present.tag for present in self.model} | self.defects.keys():
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(one)) for one in evidence)), [])
@@ -143,11 +144,11 @@ class ReplicateSimulator:
                     found += [each.at_place(part.region, part.when) for each in placed]
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
-                self._leave_out(tag, error)
+                self._note_defect(tag, error)
         return found
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
-        """Simulate effects on the random numbers of the model without them; failures are left out.
+        """Simulate effects on the random numbers of the model without them; failures are defects.
 
         Args:
             effects: with their parameters.
@@ -176,7 +177,7 @@ class ReplicateSimulator:
             elif effect is None:
                 raise result
             else:
-                self._leave_out(effect.tag, result)
+                self._note_defect(effect.tag, result)
 
     def _known(self, effect: Effect | None, repeats: int) -> FloatArray:
         """Return the statistics of the model with an effect, shape (repeat, statistic)."""
@@ -238,11 +239,9 @@ class ReplicateSimulator:
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
 
-    def _leave_out(self, tag: str, error: Any) -> None:
-        self.left_out[tag] = (
-            f"{type(error).__name__}: {error}" if not isinstance(error, PchEmError) else str(error)
-        )
-        _log.warning("effect %s left out: %s", tag, self.left_out[tag])
+    def _note_defect(self, tag: str, error: Any) -> None:
+        self.defects[tag] = error_words(error)
+        _log.warning("a defect in the candidate %s, which is not compared: %s", tag, self.defects[tag])
 
 
 def _without_chance(shifts: FloatArray) -> FloatArray:

@@ -8,13 +8,14 @@ their best fit, do not account for and do not touch.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     PRICE_OF_MORE,
     Choice,
@@ -24,8 +25,9 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.null import look_elsewhere, two_sided
+from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["Comparison", "compare", "leaves_nothing", "own_signature"]
+__all__ = ["Comparison", "compare", "leaves_nothing", "own_signature", "unrelated"]
 
 FloatArray = NDArray[np.float64]
 
@@ -40,6 +42,7 @@ _LEFT = 0.02  # chance of what a complete set may leave, anywhere among the stat
 _SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
 _MOVED = 3.0  # by which that effect must move it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
+_PLACEBO_STEPS = 2  # corrections of its strength
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,12 @@ class Comparison:
     Attributes:
         chosen: the best.
         tried: all, the best first.
+        failed: effects of which the refit failed, and why.
     """
 
     chosen: Refitted
     tried: tuple[Refitted, ...]
+    failed: Mapping[str, str] = field(default_factory=dict)
 
     def rivals_of(self, tag: str) -> tuple[Contender, ...]:
         """Return what could stand in the place of an effect of the chosen set, itself first."""
@@ -90,25 +95,77 @@ def compare(
         choice: how their sets compare by fingerprints.
     """
     tried: list[Refitted] = []
+    failed: dict[str, str] = {}
 
     def refit(members: Sequence[Hypothesis]) -> None:
         dear = [one for one in tried if is_dear(one.effects)]
         if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
             return
         best = max((one.score for one in tried), default=-np.inf)
-        tried.append(refitter.refined((*held, *members), best))
+        try:
+            tried.append(refitter.refined((*held, *members), best))
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            failed[members[-1].tag] = error_words(error)
 
     # dear ones last: they may be beaten by then
     for hypothesis in sorted(_singles(hypotheses, choice), key=lambda h: is_dear([h.effect])):
         if not tried or not _beaten(refitter, hypothesis, max(tried, key=_worth)):
             refit((hypothesis,))
+    if not tried:
+        return None
     best = max(tried, key=_worth)
     if not leaves_nothing(refitter, best):
         for members in _sets(choice, tried):
             refit(members)
     tried.sort(key=_worth, reverse=True)
     chosen = next((one for one in tried if _all_seen(refitter, one, tried)), None)
-    return None if chosen is None else Comparison(chosen, tuple(tried))
+    if chosen is None:
+        return None
+    known = {h.tag for h in held}
+    for member in chosen.hypotheses:
+        if member.tag not in known:
+            tried += _placebo(refitter, hypotheses, chosen, member, tried)
+    return Comparison(chosen, tuple(tried), failed)
+
+
+def unrelated(one: Effect, other: Effect) -> bool:
+    """Tell whether neither of two effects is known to be confused with the other."""
+    return other.tag not in type(one).separate and one.tag not in type(other).separate
+
+
+def _placebo(
+    refitter: Refitter,
+    hypotheses: Sequence[Hypothesis],
+    chosen: Refitted,
+    member: Hypothesis,
+    tried: Sequence[Refitted],
+) -> list[Refitted]:
+    """Return the refit of the best unrelated effect in the place of a member, unless there is one.
+
+    Of all that have nothing to do with it, the one whose fingerprint would explain most: one that cannot
+    close anything, whatever its strength, proves nothing about the name.
+    """
+    others = [h for h in chosen.hypotheses if h.tag != member.tag]
+    kept = {h.tag for h in others}
+    pool = [
+        h
+        for h in hypotheses
+        if h.tag not in chosen.tags and unrelated(h.effect, member.effect) and not is_dear([h.effect])
+    ]
+    if any(one.tags == kept | {h.tag} for one in tried for h in pool):
+        return []
+    noise = refitter.noise(refitter.null.covariance, refitter.null.n_replicates)
+    shift = refitter.target - refitter.null.mean
+    fits = [fit_set([*others, h], shift, noise) for h in pool]
+    closing = [(fit.log_score(shift, noise), i) for i, fit in enumerate(fits) if fit.factors[-1] > 0.0]
+    if not closing:
+        return []
+    best = pool[max(closing)[1]]
+    try:
+        return [replace(refitter, steps=_PLACEBO_STEPS).refined((*others, best))]
+    except Exception:  # its defect is told where it is asked for its guesses
+        return []
 
 
 def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:

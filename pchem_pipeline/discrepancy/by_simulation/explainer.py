@@ -249,7 +249,7 @@ class FrameExplainer:
     mapper: Mapper
     samples: str = "frames"
     n_replicates: int = 0
-    left_out: dict[str, str] = field(default_factory=dict)
+    defects: dict[str, str] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -327,7 +327,7 @@ class FrameExplainer:
             self._counted,
             f"r{number}",
             self._seed("fingerprint", number),
-            dict(self.left_out),
+            dict(self.defects),
         )
         shifts = (z.train - null.mean, z.test - null.mean)
         apart = self.frames.seen_apart(self.plain)
@@ -336,7 +336,7 @@ class FrameExplainer:
         hypotheses = simulator.fingerprints([*guesses, *placebo])
         hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
         choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
-        self.left_out |= simulator.left_out
+        self.defects |= simulator.defects
         if choice is None or not (disagrees or choice.advantage > _CONVINCING):
             return None
         return _Explanation(simulator, tuple(hypotheses), choice)
@@ -350,6 +350,7 @@ class FrameExplainer:
         held = tuple(h for this in self.rounds for h in this.added.hypotheses)
         refitter = self._refitter(z, held)
         found = compare(refitter, held, explanation.hypotheses, explanation.choice)
+        self.defects |= {} if found is None else found.failed
         added = None if found is None else refitter.sharpened(found.chosen, self.settings.extended_replicates)
         while found is not None and added is not None:
             kept = self._established(added, z)
@@ -421,7 +422,7 @@ class FrameExplainer:
         try:
             added = added_exposures(model, frames.stack, frames.numbers, plain.maps)
         except ConfigError as error:
-            self.left_out["added exposure"] = str(error)
+            self.defects["added exposure"] = str(error)
             added = None
         if added is not None:
             seen = frames.seen

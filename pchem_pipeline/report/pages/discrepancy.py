@@ -6,7 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pchem_pipeline.discrepancy.verdict import Candidate, GapChange, Moved, Place, Rival, Step, Verdict
+from pchem_pipeline.discrepancy.verdict import (
+    CONVINCING_PLACEBO,
+    RARE,
+    Candidate,
+    GapChange,
+    Moved,
+    Place,
+    Step,
+    Verdict,
+)
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.discrepancy_gap import gap_text
@@ -19,14 +28,13 @@ from pchem_pipeline.report.style.wording import count, measured, percent, short,
 DISCREPANCY_PAGE = "discrepancy.html"
 #: Longer lists are in ``discrepancy.json`` only.
 _MOST_PLACES, _MOST_CANDIDATES = 12, 8
-#: A placebo that closes more than this share of the gap weakens the verdict.
-_PLACEBO_SHARE = 0.25
 #: Parameters that moved by less than this share of a pixel's standard error did not matter.
 _IMMATERIAL = 0.2
 
 #: Verdict to its level and its name.
 VERDICT_WORDS: dict[str, tuple[Level, str]] = {
     "named": ("note", "Named"),
+    "named_in_part": ("caution", "Named in part"),
     "ambiguous": ("caution", "Ambiguous"),
     "described": ("caution", "Described"),
     "unexplained": ("serious", "Unexplained"),
@@ -180,41 +188,49 @@ def parameter_name(name: str) -> str:
 
 def key_facts(found: Verdict) -> list[KeyFact]:
     """Return the numbers of the first screen."""
-    return [*_gap_fact(found), *_effect_facts(found), *_moved_fact(found), *_chance_fact(found)]
+    return [*_effect_facts(found), *_moved_fact(found), *_chance_fact(found), *_gap_fact(found)]
 
 
 def _gap_fact(found: Verdict) -> list[KeyFact]:
+    """Return how much of the distance between data and model is closed; the distance itself stands below."""
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    value = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
-    more = [f"10⁻⁶ nats per sample; floor {gap_text(gap.floor)}"]
-    if extended and math.isfinite(gap.closed_fraction):
-        more.append(f"{percent(max(gap.closed_fraction, 0.0), 1.0)} of the gap closed{_interval(gap)}")
-    return [KeyFact("gap", value, tuple(more))]
+    nats = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
+    more = (f"{nats} micronats per sample", f"chance alone: up to {gap_text(gap.floor)}{_interval(gap)}")
+    if not extended:
+        return [KeyFact("distance of data and model", more[0], more[1:])]
+    return [KeyFact("of the gap closed", percent(max(gap.closed_fraction, 0.0), 1.0), more)]
 
 
 def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
-    return f"; after: {gap_text(low)} to {gap_text(high)}"
+    return f"; left: {gap_text(low)} to {gap_text(high)}"
 
 
 def _effect_facts(found: Verdict) -> list[KeyFact]:
     facts = []
     for step in found.steps:
         if step.effect and step.parameters:
-            (name, first), *rest = step.parameters.items()
-            facts.append(
-                KeyFact(
-                    f"{step.effect}: {name}",
-                    measured(first.value, first.stderr, unit_text(first.unit)),
-                    tuple(f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}" for name, p in rest[:2]),
-                )
-            )
+            values = [
+                f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}"
+                for name, p in step.parameters.items()
+            ]
+            facts.append(KeyFact(step.effect, *_size_texts(step, values)))
     return facts[:4]
+
+
+def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+    """Return the size of an effect, and the two lines below it; its parameters where no size is known."""
+    size = step.size
+    if size is None:
+        return values[0], tuple(values[1:3])
+    part = "" if size.samples >= RARE else f", in {percent(size.samples, 1.0)} of the samples"
+    share = f"{percent(size.of_read_noise, 1.0)} of the read noise, {short(size.electrons, 2)} e⁻ rms{part}"
+    return f"{short(size.dn, 2)} DN", (share, values[0])
 
 
 def _moved_fact(found: Verdict) -> list[KeyFact]:
@@ -256,7 +272,8 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     flags: list[Flag] = []
     extended = [step for step in found.steps if step.effect]
     if extended:
-        flags += _closing(found, extended[-1])
+        flags += _closing(found)
+        flags += [flag for step in extended for flag in _compared(step)]
         flags += _materiality(extended)
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
@@ -265,41 +282,55 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
         most = found.unexplained[0]
         words = most.sentence or most.statistic
         flags.append(Flag("caution", f"What is left shows most in: {words} ({_signed(most.z)} sd)."))
-    flags += [Flag("caution", f"{name} was left out: {why}.") for name, why in found.left_out.items()]
+    flags += [
+        Flag("serious", f"A defect: the candidate {name} failed and was not compared: {why}.")
+        for name, why in found.defects.items()
+    ]
     if found.untestable:
         flags.append(Flag("note", f"Cannot be tested by these data: {', '.join(found.untestable)}."))
     order = ("serious", "caution", "note", "good")
     return sorted(flags, key=lambda flag: order.index(flag.level))
 
 
-def _closing(found: Verdict, last: Step) -> list[Flag]:
-    """Say whether the gap is at its floor, and whether a wrong effect closes it as well."""
+def _closing(found: Verdict) -> list[Flag]:
+    """Say whether the gap is at its floor."""
     gap, flags = found.gap, []
+    level: Level
     if math.isfinite(gap.after) and math.isfinite(gap.floor):
         if gap.after <= gap.floor:
             flags.append(Flag("good", "The gap that is left is at its floor: chance alone makes as much."))
         else:
-            words = f"{gap_text(gap.after)} against {gap_text(gap.floor)} (10⁻⁶ nats per sample)"
-            flags.append(Flag("note", f"The gap that is left lies above its floor: {words}."))
-    share = _closed(last, last.placebo)
-    if last.placebo is not None and math.isfinite(share):
-        text = f"A placebo ({last.placebo.effect}), fitted in the same way, closes"
-        level: Level = "caution" if share > _PLACEBO_SHARE else "good"
-        flags.append(Flag(level, f"{text} {percent(max(share, 0.0), 1.0)} of the gap."))
-    share = _closed(last, last.runner_up)
-    if last.runner_up is not None and math.isfinite(share):
-        closed = percent(max(share, 0.0), 1.0)
-        text = f"The second-best effect ({last.runner_up.effect}) closes {closed} of the gap"
-        flags.append(Flag("note", f"{text}; {last.effect} leaves {gap_text(last.gap_after)}, it leaves "
-                                  f"{gap_text(last.runner_up.gap_after)}."))  # fmt: skip
+            left = percent(1.0 - max(gap.closed_fraction, 0.0), 1.0)
+            words = f"{gap_text(gap.after)} against {gap_text(gap.floor)} micronats per sample"
+            level = "caution" if found.verdict == "named_in_part" else "note"
+            flags.append(Flag(level, f"{left} of the gap is left, more than chance alone makes: {words}."))
     return flags
 
 
-def _closed(step: Step, rival: Rival | None) -> float:
-    """Return the share of a step's gap that another effect closes."""
-    if rival is None or not step.gap_before > 0:
-        return math.nan
-    return 1.0 - max(rival.gap_after, 0.0) / step.gap_before
+def _compared(step: Step) -> list[Flag]:
+    """Say what the runner-up and the placebo of a step close in the place of the named effect."""
+    own, flags = 1.0 - max(step.gap_after, 0.0) / step.gap_before if step.gap_before > 0.0 else math.nan, []
+    if not own > 0.0:
+        return []
+    runner_up, placebo = step.runner_up, step.placebo
+    if runner_up is not None:
+        share = percent(max(step.closed_by(runner_up), 0.0), 1.0)
+        words = f"; it {runner_up.why}" if runner_up.why else ""
+        text = (
+            f"The runner-up for {step.effect}, {runner_up.effect}, would close {share} of the gap of its step"
+        )
+        flags.append(Flag("note", f"{text}, {step.effect} closes {percent(own, 1.0)}{words}."))
+    if placebo is None:
+        return [
+            *flags,
+            Flag("good", f"No effect unrelated to {step.effect} closes any of the gap in its place."),
+        ]
+    of_that = step.closed_by(placebo) / own
+    doubtful = of_that > CONVINCING_PLACEBO
+    end = ": take the name with caution" if doubtful else ""
+    text = f"A placebo ({placebo.effect}, unrelated to {step.effect} and fitted in its place) closes"
+    words = f"{text} {percent(max(of_that, 0.0), 1.0)} of what {step.effect} closes{end}."
+    return [*flags, Flag("caution" if doubtful else "good", words)]
 
 
 def _materiality(extended: list[Step]) -> list[Flag]:
@@ -325,7 +356,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
         ],
         "shown": [_gaps(found)],
         "parameters": [_parameters(data), _moved(found.steps)],
-        "limits": [_untestable(data), _unexplained(found.unexplained), _left_out(data), _examined(data)],
+        "limits": [_untestable(data), _unexplained(found.unexplained), _defects(found), _examined(data)],
     }
     return {part: [table for table in tables if table.rows] for part, tables in parts.items()}
 
@@ -524,13 +555,13 @@ def _unexplained(places: Sequence[Place]) -> Table:
     )
 
 
-def _left_out(data: DiscrepancyData) -> Table:
+def _defects(found: Verdict) -> Table:
     return Table(
-        "discrepancy-left-out",
-        "Left out",
-        "Effects that could not be used as candidates.",
-        ("effect", "why"),
-        tuple(data.found.left_out.items()),
+        "discrepancy-defects",
+        "Defects",
+        "Candidates that failed and were not compared: the verdict says nothing of them.",
+        ("effect", "error"),
+        tuple(found.defects.items()),
     )
 
 

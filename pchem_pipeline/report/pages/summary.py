@@ -287,6 +287,7 @@ def _discrepancy(data: ReportData) -> list[Flag]:
         "cannot_tell": "caution",
         "ambiguous": "caution",
         "described": "caution",
+        "named_in_part": "caution",
         "unexplained": "serious",
     }
     return [Flag(levels.get(found.verdict, "note"), _as_sentence(found.sentence.replace(" -> ", " → ")))]

@@ -169,5 +169,5 @@ def _write(context: StageContext, found: Discrepancy) -> None:
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
     context.store.write_file(VERDICT_FILE, found.verdict.to_json().encode())
-    for tag, reason in found.verdict.left_out.items():
-        context.note(f"effect {tag} left out: {reason}")
+    for tag, reason in found.verdict.defects.items():
+        context.note(f"defect in the candidate {tag}, which was not compared: {reason}")

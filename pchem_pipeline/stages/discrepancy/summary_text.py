@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Sequence
 
-from pchem_pipeline.discrepancy.verdict import Place, Step, Verdict
+from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict
 
 __all__ = ["verdict_text"]
 
@@ -14,6 +14,7 @@ _WIDTH = 100
 #: Longer lists end with a count.
 _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
 _LEAD = "where: "
+_DEFECT = "DEFECT: the candidate {} failed and was not compared: {}"
 _PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
 
 
@@ -30,7 +31,7 @@ def verdict_text(found: Verdict) -> str:
     lines += _gap(found)
     if found.unexplained:
         lines += _places("left unexplained: ", found.unexplained, _MOST_LEFT)
-    lines += [line for tag, why in found.left_out.items() for line in _wrapped(f"left out: {tag}: {why}")]
+    lines += [line for tag, why in found.defects.items() for line in _wrapped(_DEFECT.format(tag, why))]
     if found.untestable:
         lines += _listed("not testable with such frames", list(found.untestable), 0)
     return "\n".join(lines)
@@ -77,15 +78,16 @@ def _sd(z: float) -> str:
 
 
 def _step(step: Step, number: int, found: Verdict) -> list[str]:
-    """Return the table of candidates of a step and the parameters of what was named."""
+    """Return what was named in a step and why its rivals lost; where nothing was, the candidates' table."""
     lines = []
-    if step.candidates:
-        title = f"step {number}" if number else "candidate"
+    title = f"step {number}" if number else "candidate"
+    if step.effect:
+        lines += [line for rival in step.rivals for line in _beaten(step.effect, rival)]
+    elif step.candidates:
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
-            chosen = " <-" if step.effect and each.effect == step.effect else ""
             row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
-            lines.append(f"{row}{_number(each.probability, 3):>13}{chosen}".translate(_PLAIN)[:_WIDTH])
+            lines.append(f"{row}{_number(each.probability, 3):>13}".translate(_PLAIN)[:_WIDTH])
         more = len(step.candidates) - _MOST_CANDIDATES
         lines += [f"  and {more} more"] if more > 0 else []
     if step.effect and step.parameters:
@@ -98,6 +100,15 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
             for line in _wrapped(f"to tell {rival} apart: {text}")
         ]
     return lines
+
+
+def _beaten(effect: str, rival: Rival) -> list[str]:
+    behind = f" ({_number(-rival.behind)} nats behind)" if math.isfinite(rival.behind) else ""
+    return _wrapped(
+        f"{effect}, not {rival.effect}{behind}: {rival.why}"
+        if rival.why
+        else f"{effect}, not {rival.effect}{behind}"
+    )
 
 
 def _number(value: float, digits: int = 1) -> str:
@@ -120,13 +131,11 @@ def _gap(found: Verdict) -> list[str]:
     if found.steps and math.isfinite(gap.closed_fraction):
         words += f", {100 * gap.closed_fraction:.1f} % closed"
     words += ")"
-    for role, rival in [
-        (role, rival)
-        for step in found.steps[-1:]
-        for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo))
-    ]:
-        if rival is not None:
-            words += f"; {role} {rival.effect} leaves {_micro(rival.gap_after)}"
+    for step in found.steps:
+        for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo)):
+            if rival is not None and step.effect:
+                left = f"{rival.effect} leaves {_micro(rival.gap_after)}"
+                words += f"; in the place of {step.effect} the {role} {left}"
     return _wrapped(words)
 
 

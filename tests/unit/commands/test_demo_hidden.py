@@ -110,7 +110,7 @@ def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
         ("consistent", "row_noise", "not named"),
         ("ambiguous", "periodic_pickup", "among the 3 that these frames leave open"),
         ("ambiguous", "adc_dnl", "not named"),
-        ("unexplained", "periodic_pickup", "not named, and row_noise besides, which is not there"),
+        ("named_in_part", "periodic_pickup", "not named, and row_noise besides, which is not there"),
     ],
 )
 def test_the_judgement(verdict: str, tag: str, words: str) -> None:

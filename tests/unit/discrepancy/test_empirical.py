@@ -85,7 +85,7 @@ def test_it_competes_with_nothing_and_refuses_half_a_table() -> None:
 def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() -> None:
     effect = Empirical(share=0.004, shift_dn=(-8.0,), weight=(1.0,))
     before, after = Gap(2e-3, 5e-5, (0.0, 0.0), {}), Gap(3e-5, 5e-5, (0.0, 0.0), {})
-    addition = Addition(effect, True, True, (), 1e-4, before, after, None, None, (), described=True)
+    addition = Addition(effect, True, True, (), 1e-4, before, after, (), None, (), described=True)
     found = Findings(
         "frames",
         None,
@@ -99,9 +99,9 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
     assert found.state == "described"
     assert found.named == ()
     assert found.model((), (effect,)) == (effect,)
-    step = addition.step()
+    step = addition.step(None)
     assert (step.verdict, step.effect) == ("described", None)
     from pchem_pipeline.discrepancy.build_verdict import _sentence
 
-    assert "0.004 of the samples" in _sentence(found)
-    assert "-8 DN" in _sentence(found)
+    assert "0.004 of the samples" in _sentence(found, {})
+    assert "-8 DN" in _sentence(found, {})

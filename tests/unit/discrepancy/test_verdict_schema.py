@@ -15,7 +15,16 @@ from pchem_pipeline.discrepancy.verdict import SCHEMA_VERSION, Place, Verdict, p
 from pchem_pipeline.effects.framework.registry import effect_class
 
 OPTIONAL = {"schema_version", "set_aside"}
-OPTIONAL_OF_STEP = {"gap_interval_after", "families", "runner_up", "placebo", "moved", "separate", "pulls"}
+OPTIONAL_OF_STEP = {
+    "gap_interval_after",
+    "families",
+    "size",
+    "rivals",
+    "placebo",
+    "moved",
+    "separate",
+    "pulls",
+}
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -42,12 +51,46 @@ def test_numbers_that_are_not_known_are_null_in_the_file() -> None:
 
 
 def test_a_verdict_of_the_first_schema_is_read() -> None:
-    old = result("unexplained")
+    old = {**_as_2(result("unexplained")), "schema": 1}
     del old["schema_version"]
-    old |= {"schema": 1, "untestable": list(UNTESTABLE), "untestable_reasons": UNTESTABLE}
+    old |= {"untestable": list(UNTESTABLE), "untestable_reasons": UNTESTABLE}
     for place in old["where"]:
         place["dn"] = place["dn"] or []
-    assert Verdict.from_json(json.dumps(old)).to_json() == verdict_of("unexplained").to_json()
+    now = json.loads(verdict_of("unexplained").to_json())
+    now["steps"][0]["rivals"] = now["steps"][0]["rivals"][:1]
+    assert json.loads(Verdict.from_json(json.dumps(old)).to_json()) == now
+
+
+def _as_2(content: dict[str, Any]) -> dict[str, Any]:
+    """Return what a verdict of the second schema was: one runner-up, and candidates that were left out."""
+    steps = [{k: v for k, v in step.items() if k != "rivals"} for step in content["steps"]]
+    steps = [
+        step | {"runner_up": next(iter(new["rivals"]), None)}
+        for step, new in zip(steps, content["steps"], strict=True)
+    ]
+    found = {k: v for k, v in content.items() if k != "defects"} | {"left_out": content["defects"]}
+    return found | {"schema_version": 2, "steps": steps}
+
+
+@pytest.mark.parametrize(
+    ("said", "after", "now"),
+    [
+        ("named", 0.5e-6, "named"),
+        ("named", 31e-6, "named_in_part"),
+        ("unexplained", 31e-6, "named_in_part"),
+    ],
+)
+def test_a_verdict_of_the_second_schema_says_how_much_of_its_names_is_all(
+    said: str, after: float, now: str
+) -> None:
+    gap = {**result("named")["gap"], "after": after}
+    old = {**_as_2(result("named")), "verdict": said, "gap": gap}
+    found = Verdict.from_json(json.dumps(old))
+    assert found.verdict == now
+    assert found.word == now.replace("_", " ")
+    assert found.defects == {"odd_plugin": "ValueError: boom"}
+    assert found.steps[0].runner_up is not None
+    assert found.steps[0].runner_up.effect == "periodic_pickup"
 
 
 def test_a_verdict_of_a_later_schema_is_refused_with_the_cure() -> None:

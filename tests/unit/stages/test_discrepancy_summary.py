@@ -11,7 +11,7 @@ from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_the_verdict_comes_first_and_lines_are_short(verdict: str) -> None:
     lines = verdict_text(verdict_of(verdict)).splitlines()
-    assert lines[0].startswith(f"{verdict.upper()}: ")
+    assert lines[0].startswith(f"{verdict.upper().replace('_', ' ')}: ")
     assert len(lines[0]) > len(verdict) + 20
     assert all(0 < len(line) <= 100 for line in lines)
     assert all(line.isascii() for line in lines)
@@ -24,20 +24,23 @@ def test_what_a_named_effect_is_told_with() -> None:
     assert "where: row means of the readout residuals scatter from frame to frame (+84.0 sd)" in text
     assert "148 to 152 DN" in text
     assert "and 1 more" in text
-    assert "step 2" in text
     assert "row_noise_dn = 0.3512 +- 0.0041 DN" in text
-    assert "gap: 477 -> 1.8 micro-nats per sample (floor 0.66, 99.6 % closed)" in text
-    assert "runner-up periodic_pickup leaves 120" in text
+    assert "gap: 477 -> 0.4 micro-nats per sample (floor 0.66, 99.9 % closed)" in text
+    assert "in the place of row_noise the runner-up periodic_pickup leaves 120" in text
     assert "placebo flicker_noise leaves 116" in text
-    assert "left out: odd_plugin: ValueError: boom" in text
-    lines = verdict_text(verdict_of("named")).splitlines()
-    assert [line.split()[0] for line in lines if line.endswith(" <-")] == ["row_noise", "bias_drift"]
+    assert "DEFECT: the candidate odd_plugin failed and was not compared: ValueError: boom" in text
 
 
 def test_an_ambiguous_verdict_says_what_would_decide() -> None:
     text = verdict_text(verdict_of("ambiguous"))
     assert "to tell periodic_pickup apart: a faster or slower row time" in text
-    assert "<-" not in text
+    assert "score" in text
+
+
+def test_a_verdict_says_why_the_next_rivals_lost() -> None:
+    text = " ".join(verdict_text(verdict_of("named_in_part")).split())
+    assert "row_noise, not periodic_pickup (16.8 nats behind): leaves" in text
+    assert "(+9.1 sd)" in text
 
 
 def test_an_unexplained_verdict_says_what_is_left() -> None:
@@ -55,13 +58,13 @@ def test_a_consistent_verdict_has_no_candidates() -> None:
 
 
 def test_a_strangers_message_keeps_the_columns() -> None:
-    text = verdict_text(verdict_of("named", left_out={"a\nb": "x" * 300}))
+    text = verdict_text(verdict_of("named", defects={"a\nb": "x" * 300}))
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
 def test_numbers_that_are_not_known_are_said_so() -> None:
     gap = dict.fromkeys(("before", "after", "floor", "closed_fraction"))
-    steps = [{**step("row_noise", "named", 477.0, 31.0), "runner_up": None, "candidates": []}]
+    steps = [{**step("row_noise", "named", 477.0, 31.0), "rivals": [], "candidates": []}]
     text = verdict_text(verdict_of("named", gap=gap, steps=steps, where=[{"statistic": "code.top"}]))
     assert "gap:" not in text
     assert "code.top (sd not known)" in text

@@ -1,0 +1,82 @@
+"""The size of an effect in the units of the samples: e-, DN, and as a share of the read noise.
+
+An effect changes the values of its own plane of the signal chain. Their difference with and without it, on
+the same random numbers, is taken before anything is rounded; what is alike in all frames is a bias.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import PchEmError
+from pchem_pipeline.discrepancy.by_simulation.replicate import truth_of
+from pchem_pipeline.discrepancy.verdict import RARE, Size
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Effect, Plane
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+__all__ = ["size_of"]
+
+_MOST_ROWS = 12  # and columns: what all pixels of a frame share has one draw a frame
+_BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
+_BITS = 24
+_SEED = 1
+_CHANGED = 1e-9
+_IN_DN = (Plane.ADC, Plane.READOUT)
+
+
+def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
+    """Return the size of an effect where and when it acts; None where its samples cannot be simulated.
+
+    Args:
+        effect: with its strength.
+        maps: fitted parameters, (y, x) each.
+        n_frames: of the run.
+    """
+    maps = PixelMaps(*(np.asarray(getattr(maps, name))[:_MOST_ROWS, :_MOST_ROWS] for name in _FIELDS))
+    if not maps.usable.any():
+        return None
+    seen: list[NDArray[np.float64]] = []
+    shape = maps.usable.shape
+    settings = SimulateSettings(
+        shape=(shape[0], shape[1]), n_frames=n_frames, seed=_SEED, bit_depth=_BITS, effects=()
+    ).model_copy(update={"effects": (_watched(effect, seen),)})
+    truth = truth_of(maps)
+    last = max(n_frames - _BLOCK_FRAMES, 0)
+    try:
+        for first in np.unique(np.linspace(0, last, _BLOCKS).astype(int)).tolist():
+            simulate_block(truth, settings, (first, min(first + _BLOCK_FRAMES, n_frames)), electron_frames=0)
+    except PchEmError:
+        return None
+    if not seen:
+        return None
+    change = np.concatenate(seen)
+    share = float(np.mean(np.abs(change) > _CHANGED))
+    # rare events are as large as they are where they are
+    spread = np.sqrt(np.mean((change - change.mean(axis=0)) ** 2) / (share if 0.0 < share < RARE else 1.0))
+    gain = float(np.median(maps.conversion_gain[maps.usable]))
+    noise = float(np.median(maps.read_noise_dn[maps.usable]))
+    dn = float(spread) if effect.plane in _IN_DN else float(spread) / gain
+    return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise, samples=share)
+
+
+_FIELDS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "usable")
+
+
+def _watched(effect: Effect, seen: list[NDArray[np.float64]]) -> Effect:
+    """Return an effect as it is, everywhere and always, that notes what it changes."""
+    kind = type(effect)
+
+    class Watched(kind):  # type: ignore[misc, valid-type]
+        def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+            changed: NDArray[Any] = super().apply(values, context)
+            seen.append(changed.astype(np.float64) - values.astype(np.float64))
+            return changed
+
+    found: Effect = Watched.model_validate(effect.at_place(None).model_dump())
+    return found

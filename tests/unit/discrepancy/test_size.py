@@ -1,0 +1,50 @@
+"""The size of an effect: as large as its law says, wherever it acts in the signal chain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.size import size_of
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.framework.registry import effect_class
+
+SHAPE = (24, 24)
+GAIN, NOISE, EXPOSURE = 0.1, 3.0, 2.0
+MAPS = PixelMaps(
+    np.full(SHAPE, EXPOSURE), np.full(SHAPE, GAIN), np.full(SHAPE, 100.0), np.full(SHAPE, NOISE),
+    np.ones(SHAPE, bool),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tag", "fields", "electrons", "draws"),
+    [
+        ("row_noise", {"row_noise_dn": 0.5}, 0.5 * GAIN, 12 * 4000),
+        ("frame_noise", {"frame_noise_dn": 0.2}, 0.2 * GAIN, 4000),
+        ("signal_dependent_noise", {"noise_e": 0.1}, 0.1 * np.sqrt(EXPOSURE), 144 * 4000),
+    ],
+)
+def test_the_size_is_what_the_law_of_the_effect_says(
+    tag: str, fields: dict[str, float], electrons: float, draws: int
+) -> None:
+    size = size_of(effect_class(tag).model_validate({"tag": tag, **fields}), MAPS, 4000)
+    assert size is not None
+    assert size.electrons == pytest.approx(electrons, rel=4.0 / np.sqrt(2.0 * draws) + 0.005)
+    assert size.dn == pytest.approx(size.electrons / GAIN)
+    assert size.of_read_noise == pytest.approx(size.dn / NOISE)
+
+
+def test_the_size_in_a_part_is_that_where_it_acts() -> None:
+    effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
+    part = effect.at_place(Region.model_validate({"columns": [[0, 4]]}))
+    assert size_of(part, MAPS, 1000) == size_of(effect, MAPS, 1000)
+
+
+def test_without_usable_pixels_there_is_no_size() -> None:
+    nothing = replace(MAPS, usable=np.zeros(SHAPE, bool))
+    effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
+    assert size_of(effect, nothing, 1000) is None
