@@ -257,6 +257,7 @@ class FrameExplainer:
         self.classes = candidate_classes(self.settings)
         self.untestable = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         self.most_rounds = self.settings.max_rounds
+        self.lost: float | None = None
 
     def split(self) -> tuple[Evidence, Examined]:
         """Observe train and test frames together, then each part near their fit."""
@@ -442,7 +443,9 @@ class FrameExplainer:
         if model:
             fit = refit_maps(frames, plain.maps, own, plain.covariance, numbers=numbers)
         fit = fit or Refit(plain.maps, {}, plain.covariance)
-        return fit, learn_sensor(frames, numbers, fit, own, plain.ambiguous)
+        sensor = learn_sensor(frames, numbers, fit, own, plain.ambiguous, self.lost)
+        self.lost = sensor.lost
+        return fit, sensor
 
     def _replicates(
         self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0

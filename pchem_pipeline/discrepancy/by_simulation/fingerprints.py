@@ -143,20 +143,30 @@ class SetFit:
         return float(np.sqrt(white @ white))
 
 
-def correction(parts: FloatArray, residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+def correction(
+    parts: FloatArray, residual: FloatArray, noise: Noise, scatter: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return relative changes of the strengths that a residual asks for, and standard errors, (e,) each.
 
     Args:
         parts: shifts of the statistics by effect, shape (e, m).
         residual: what the model with all effects leaves, shape (m,).
         noise: of the residual.
+        scatter: deviations like that of the residual, of replicates, shape (b, m): the weights of so many
+            statistics are tuned to a covariance that is itself estimated, and what they make of replicates
+            that had no part in it is the error if it is larger; None: there are too few.
     """
     factor = linalg.cholesky(noise.of(parts), lower=True)
     design = linalg.solve_triangular(factor, parts.T, lower=True)
-    target = linalg.solve_triangular(factor, residual, lower=True)
-    change = np.linalg.lstsq(design, target, rcond=None)[0]
+    weights = np.linalg.pinv(design)
+
+    def asked(rows: FloatArray) -> FloatArray:
+        return np.asarray(weights @ linalg.solve_triangular(factor, rows, lower=True))
+
     stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
-    return np.clip(change, -_LARGEST_DECREASE, _LARGEST_INCREASE), stderr
+    if scatter is not None:
+        stderr = np.maximum(stderr, asked(scatter.T).std(axis=1, ddof=1))
+    return np.clip(asked(residual), -_LARGEST_DECREASE, _LARGEST_INCREASE), stderr
 
 
 def tolerance(parts: FloatArray, model_error: float) -> FloatArray:

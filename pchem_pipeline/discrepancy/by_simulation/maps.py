@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.population import (
     Posterior,
+    lost_variance,
     posterior_of,
     posterior_of_estimates,
 )
@@ -31,6 +32,7 @@ FloatArray = NDArray[np.float64]
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
 _FEWEST_CODES = 3  # that a pixel must have shown
+_MANY_MISTAKEN = 0.3  # share of pixels from which what is learnt does not rest on their maxima
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 
 
@@ -141,11 +143,13 @@ class Sensor:
         posterior: of the pixels that can be simulated.
         drawn: which those are, shape (y, x).
         usable: pixels whose fit can be relied upon, shape (y, x).
+        lost: by how much log sigma_R^2 is learnt too low, which is corrected.
     """
 
     posterior: Posterior
     drawn: NDArray[np.bool_]
     usable: NDArray[np.bool_]
+    lost: float = 0.0
 
     def draw(self, seed: int) -> PixelMaps:
         """Return maps that may be the true ones; ``usable`` are those that can be simulated."""
@@ -166,6 +170,7 @@ def learn_sensor(
     fit: Refit,
     effects: Sequence[Effect],
     mistaken: float,
+    lost: float | None = None,
 ) -> Sensor:
     """Learn what the pixels' true parameters may be.
 
@@ -175,6 +180,7 @@ def learn_sensor(
         fit: their maps under the model.
         effects: of the model.
         mistaken: share of pixels whose bias may be off by an electron.
+        lost: see :class:`Sensor`; None: not known yet.
     """
     maps = fit.maps
     usable = maps.usable.ravel()
@@ -187,6 +193,7 @@ def learn_sensor(
     if law is None or law.free_satellites:
         drawn = usable
         posterior = posterior_of_estimates(parameters[drawn], covariance[drawn])
+        lost = lost or 0.0
     else:
         histograms = histogram_frames(frames)
         counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
@@ -200,7 +207,10 @@ def learn_sensor(
             law.of(drawn),
             mistaken=mistaken,
         )
-    return Sensor(posterior, drawn.reshape(maps.usable.shape), maps.usable)
+        if lost is None:
+            known = mistaken <= _MANY_MISTAKEN
+            lost = lost_variance(posterior, counts[drawn].sum(axis=1), law.of(drawn)) if known else 0.0
+    return Sensor(posterior.raised(lost), drawn.reshape(maps.usable.shape), maps.usable, lost)
 
 
 def _law_of_all(effects: Sequence[Effect], parameters: FloatArray, places: PixelPlaces) -> SampleLaw | None:

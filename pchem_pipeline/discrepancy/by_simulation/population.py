@@ -23,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.mass import sample_slopes
+from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = [
     "Population",
     "Posterior",
+    "lost_variance",
     "posterior_of",
     "posterior_of_estimates",
     "to_parameters",
@@ -65,6 +66,8 @@ _LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
 _USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks are hardly resolved, its scatter
 _MOST_NOISE = 12.0  # of 1/g over what it were without read noise
 _ITERATIONS = 30
+_MOST_DRAWN_AGAIN = 500  # pixels behind what is learnt too low
+_REACH = 7.0  # standard deviations of the samples: their histograms reach no further
 _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not asked
 
 
@@ -103,6 +106,12 @@ class Posterior:
         """Return (H, g, mu, sigma) at the maximum of most weight, shape (n, 4)."""
         best = self.weight.argmax(axis=0)
         return to_parameters(self.theta[best, np.arange(best.size)])
+
+    def raised(self, log_variance: float) -> Posterior:
+        """Return it with so much more log sigma_R^2 in all pixels."""
+        more = np.array([0.0, 0.0, 0.0, log_variance])
+        population = replace(self.population, centre=self.population.centre + more)
+        return replace(self, population=population, theta=self.theta + more)
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error."""
@@ -167,6 +176,34 @@ def posterior_of(
     starts = np.stack([_shifted(start, each) for each in ((0,) if mistaken <= _HARDLY_ANY else _SHIFTS)])
     population = _learn(pixels.of(some), starts[:, some], population)
     return _climb(pixels, starts, population, _LAST_STEPS).posterior(population)
+
+
+def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
+    """Return by how much log sigma_R^2 is learnt too low: where peaks overlap some noise is taken for signal.
+
+    Histograms are drawn from what was learnt, and learnt from again (parametric bootstrap: Efron 1979).
+
+    Args:
+        posterior: of n pixels.
+        totals: samples of each, shape (n,), whole numbers.
+        law: of the samples; the PCD if None.
+    """
+    rng = np.random.default_rng(totals.size)
+    some = rng.permutation(totals.size)[:_MOST_DRAWN_AGAIN]
+    drawn = posterior.draw(rng)[some]
+    own = (law or SampleLaw()).of(some)
+    reach = np.sqrt(drawn[:, 0]) / drawn[:, 1] + drawn[:, 3]
+    centre = drawn[:, 2] + drawn[:, 0] / drawn[:, 1]
+    first = np.floor(centre - _REACH * reach).astype(np.int64)
+    width = int(2.0 * _REACH * np.quantile(reach, 0.99)) + 1
+    codes = first[:, None] + np.arange(width)
+    mass = np.maximum(sample_mass(own, [np.ascontiguousarray(column) for column in drawn.T], codes), 0.0)
+    counts = rng.multinomial(totals[some].astype(np.int64), mass / mass.sum(axis=1, keepdims=True))
+    again = posterior_of(counts, first, drawn, own, mistaken=0.0)
+    off = to_theta(again.draw(rng))[:, 3] - to_theta(drawn)[:, 3]
+    middle = np.median(off)
+    widest = 3.0 * _MAD * np.median(np.abs(off - middle))
+    return -float(np.clip(off, middle - widest, middle + widest).mean())
 
 
 def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Posterior:

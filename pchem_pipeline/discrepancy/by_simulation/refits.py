@@ -25,6 +25,7 @@ __all__ = ["Refitted", "Refitter", "is_dear"]
 FloatArray = NDArray[np.float64]
 
 _FEW = 6  # replicates at each strength on the way
+_ENOUGH = 12  # replicates that tell a scatter
 _MOST_STEPS = 5
 _STEPS_OF_DEAR = 2
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
@@ -175,7 +176,10 @@ class Refitter:
         noise = self.noise(covariance, replicates)
         residual = self.target - mean
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
-        change, stderr = correction(parts, residual, noise)
+        scatter = None
+        if replicates >= _ENOUGH:
+            scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
+        change, stderr = correction(parts, residual, noise, scatter)
         change = np.where(scaling, np.log1p(np.maximum(change, -0.9)), 0.0)
         found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
         allowed = noise.of(parts)
