@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.electrons.electrons import KnownPixels
+from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import FloatArray, usable_pixels
@@ -73,10 +75,14 @@ class Calibration:
         return np.nan_to_num(self.satellites)
 
     @property
+    def known(self) -> KnownPixels:
+        """The pixels as electron numbers are made of."""
+        amplitude, weight = self.own_satellites.T
+        return KnownPixels(list(self.columns.T), self.law, (amplitude, weight))
+
+    @property
     def noise_variance_dn2(self) -> FloatArray:
         """Variance of a sample at a given electron number (at k = H), DN^2: all effects included."""
-        from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
-
         sigma = nearest_pcd(list(self.columns.T), self.law)[3]
         amplitude, weight = self.own_satellites.T
         pattern = np.array(self.law.free_satellite_pattern).reshape(-1, 2)

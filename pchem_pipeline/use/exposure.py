@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.maps.pixels import FloatArray
-from pchem_pipeline.use import levels_numba
+from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
 
 __all__ = ["ExposureMaps", "estimate_exposure"]
@@ -57,7 +57,7 @@ def estimate_exposure(
     n = origin.size
     out = np.full((n, 3), np.nan)
     columns = calibration.columns
-    levels_numba.estimate_exposures(
+    exposure_numba.estimate_exposures(
         kernel_counts(counts.reshape(n, -1)),
         np.ascontiguousarray(origin.ravel(), np.int64),
         parts,

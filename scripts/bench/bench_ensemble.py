@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.residuals import central_window, noise_floor, rmse
-from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_counts
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
@@ -31,6 +31,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -138,7 +139,10 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
         part, use = PixelParameters.from_maps(chunk.fitted)
         began = time.process_time()
         data = tally(chunk.chosen[use], chunk.origin[use], part, dn, axis)
-        numbers += electron_counts(chunk.chosen[use], chunk.origin[use], part, numbers.size)[0]
+        known = KnownPixels(part, SampleLaw())
+        codes = known.codes(chunk.chosen[use], chunk.origin[use])
+        tables = number_tables(*codes, known.exposure, known)
+        numbers += tables.tally(chunk.chosen[use], chunk.origin[use], numbers.size)[0]
         clock.lap("tally data and electron numbers", began)
         raw += data.raw
         nuced += data.nuced
@@ -182,13 +186,15 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
 def electrons(pixels: PixelParameters, numbers: NDArray[np.int64], total: int, clock: Clock) -> None:
     """Print how well the histogram of electron numbers is predicted."""
     began = time.process_time()
-    cells = cell_probabilities(pixels, numbers.size)
-    clock.lap("cell probabilities", began)
-    mass = cells.estimated / len(pixels)
+    known = KnownPixels(pixels, SampleLaw())
+    expected = number_tables(*known.codes(), known.exposure, known, detailed=True)
+    expected = expected.outcomes(numbers.size)
+    clock.lap("expected electron numbers", began)
+    mass = expected.estimated / len(pixels)
     floor = noise_floor(mass * (1 - mass) / total)
     error = rmse(numbers / total, mass)
     print(f"\nelectron numbers: RMSE {error:.3e}, at most {floor:.3e} from counting noise")
-    print(f"expected error rate of the electron numbers {cells.error.mean():.4f}")
+    print(f"expected error rate of the electron numbers {expected.error.mean():.4f}")
 
 
 def verdict(words: str, holds: bool) -> None:

@@ -8,9 +8,10 @@ import pytest
 from scipy.special import roots_genlaguerre
 from scipy.stats import nbinom
 
-from pchem_pipeline.model.electrons.electrons import cell_probabilities
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, ensemble_sums
 from pchem_pipeline.model.ensemble.ensemble_binned import HistogramChoice, epcd_independent
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import PixelParameters
 
 
@@ -62,4 +63,6 @@ def test_error_rate_without_rounding_is_the_bit_error_rate() -> None:
             correct += mpmath.exp(-h) * mpmath.mpf(h) ** k / mpmath.factorial(k) * part
         expected = float(1 - correct)
     # half a DN of rounding moves a threshold by 5e-4 e-, against which the error is stationary
-    assert cell_probabilities(pixels, 20).error[0] == pytest.approx(expected, rel=1e-4)
+    known = KnownPixels(pixels, SampleLaw())
+    outcomes = number_tables(*known.codes(), known.exposure, known, detailed=True).outcomes(20)
+    assert outcomes.error[0] == pytest.approx(expected, rel=1e-4)

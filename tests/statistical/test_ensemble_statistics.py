@@ -8,9 +8,10 @@ from helpers.counting_noise import counting_variance
 from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.checks.residuals import noise_floor, rmse
-from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_numbers
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.components import moment_errors, predicted_moments, sample_moments
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, ensemble_sums, nuced_axis, tally
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import PixelParameters
 
 N_PIXELS, N_FRAMES = 600, 40
@@ -149,9 +150,11 @@ def test_moment_errors_are_those_of_repeated_captures() -> None:
 def test_error_rate_and_electron_histogram_are_as_predicted() -> None:
     pixels, n_frames = make_pixels(), 4000
     frames, true = draw(pixels, n_frames, np.random.default_rng(15))
-    maps = [column[None, :] for column in pixels.columns()]
-    numbers = electron_numbers(frames[:, None, :].astype(np.uint16), *maps)[:, 0].astype(int)
-    expected = cell_probabilities(pixels, 40)
+    data = KnownPixels(pixels, SampleLaw())
+    codes = data.codes(counts_of(frames), np.full(N_PIXELS, DN.start))
+    tables = number_tables(*codes, data.exposure, data, detailed=True)
+    numbers = tables.convert(frames.astype(np.uint16)).number.astype(int)
+    expected = tables.outcomes(40)
     n = frames.size
     error = expected.error
     rate, spread = np.mean(numbers != true), np.sqrt(np.sum(error * (1 - error)) * n_frames) / n
@@ -166,5 +169,6 @@ def test_error_rate_and_electron_histogram_are_as_predicted() -> None:
     np.testing.assert_array_less(np.abs(observed / n - mass), limit)
     # an exposure wrong by 10 % would be seen
     h, *others = pixels.columns()
-    off = cell_probabilities(PixelParameters(1.1 * h, *others), 40).estimated / N_PIXELS
-    assert np.max(np.abs(observed / n - off) / limit) > 4
+    brighter = KnownPixels(PixelParameters(1.1 * h, *others), SampleLaw())
+    off = number_tables(*brighter.codes(), brighter.exposure, brighter, detailed=True).outcomes(40)
+    assert np.max(np.abs(observed / n - off.estimated / N_PIXELS) / limit) > 4

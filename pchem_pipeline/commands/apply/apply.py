@@ -24,6 +24,7 @@ from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_pie
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.formats.map_files import read_image
+from pchem_pipeline.model.electrons.electrons import number_type
 from pchem_pipeline.model.histogram.count import choose_bins, pixels_by_range
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
@@ -37,7 +38,6 @@ from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
-from pchem_pipeline.use.numbers import number_type
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -54,7 +54,7 @@ _SEGMENT_SAMPLES = 1 << 27
 #: Frames that tell the scene while offsets are found, and codes in a DN once they are taken away.
 _SCENE_FRAMES, _PARTS = 256, 4
 #: Bytes that a code of a pixel takes while numbers are looked up.
-_BYTES_OF_CODE = 12
+_BYTES_OF_CODE = 24
 _EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
 
 

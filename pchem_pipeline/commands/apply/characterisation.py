@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pchem_pipeline.base.errors import StoreError, quoted
-from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
-from pchem_pipeline.stages.fit.fitted_model import fitted_added_exposure, fitted_effects, pixel_places
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.stages.fit.fitted_model import fitted_law, fitted_satellites
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
 if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["check_run", "read_calibration", "remaining_effects"]
+__all__ = ["check_run", "read_calibration"]
 
 
 def check_run(store: RunStore) -> str:
@@ -34,11 +32,6 @@ def check_run(store: RunStore) -> str:
     ):
         raise StoreError(f"{store.path} has no complete fit; run: pchem run {quoted(store.path)}")
     return record.fingerprint
-
-
-def remaining_effects(store: RunStore, removed: Sequence[str]) -> tuple[Effect, ...]:
-    """Return the effects of the model of a run, without those whose offsets are taken from the frames."""
-    return tuple(effect for effect in fitted_effects(store) if effect.tag not in removed)
 
 
 def read_calibration(
@@ -62,20 +55,21 @@ def read_calibration(
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
     stderr = np.stack([store.read(f"fit/{name}_stderr", region) for name in PARAMETERS])
     covariance = covariance_of(stderr, store.read("fit/correlation", region))
-    added = fitted_added_exposure(store, region)
-    law = sample_law(
-        remaining_effects(store, removed),
-        pixel_maps(maps, np.ones(maps[0].shape, bool)),
-        added,
-        pixel_places(store, region),
-    )
+    law = fitted_law(store, maps, region, without=removed)
     if extra_variance > 0.0:
         law = law.with_variance(dn2=extra_variance)
     if top is not None:
         law = law.with_clip(0, top)
-    satellites = None
-    if all(store.has(f"fit/{name}") for name in FREE_SATELLITES):
-        satellites = np.stack([store.read(f"fit/{name}", region).ravel() for name in FREE_SATELLITES], axis=1)
+    satellites = fitted_satellites(store, region)
     exposure, gain, bias, sigma = maps
     words = store.read("fit/fit_status", region)
-    return Calibration(exposure, gain, bias, sigma, covariance, words, law, satellites)
+    return Calibration(
+        exposure,
+        gain,
+        bias,
+        sigma,
+        covariance,
+        words,
+        law,
+        None if satellites is None else np.stack(satellites, axis=1),
+    )

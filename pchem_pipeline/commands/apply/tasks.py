@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.commands.apply.characterisation import read_calibration
 from pchem_pipeline.commands.apply.settings import Job, Piece
 from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.model.electrons.electrons import NumberTables, number_tables
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
@@ -19,7 +20,6 @@ from pchem_pipeline.use.common_modes import estimate_offsets
 from pchem_pipeline.use.electrons import electrons
 from pchem_pipeline.use.electrons_numba import add_up, whole_parts
 from pchem_pipeline.use.exposure import estimate_exposure
-from pchem_pipeline.use.numbers import NumberTables, number_tables
 
 __all__ = ["N_SUMS", "convert_piece", "count_piece", "offsets_of", "offsets_piece"]
 
@@ -159,7 +159,9 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
         prior = output.read(place, (rows, _WHOLE))
     elif job.prior == "run":
         prior = calibration.quanta_exposure
-    return number_tables(ends[0], ends[1], prior, calibration, dtype=job.number_type, parts=job.parts)
+    return number_tables(
+        ends[0], ends[1], prior, calibration.known, dtype=job.number_type, parts=job.parts, detailed=True
+    )
 
 
 def _write_numbers(

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.normal_numba import normal_mass
 
 __all__ = [
     "COLUMNS",
@@ -82,17 +83,6 @@ def electron_range(exposure: float, negligible: float) -> tuple[int, int]:
 
 
 @kernel
-def _cell_mass(low: float, high: float) -> float:
-    """Return the standard normal mass between two numbers, exact in both tails."""
-    root = 0.7071067811865476
-    if low > 0.0:
-        return 0.5 * (math.erfc(low * root) - math.erfc(high * root))
-    if high < 0.0:
-        return 0.5 * (math.erfc(-high * root) - math.erfc(-low * root))
-    return 0.5 * (math.erf(high * root) - math.erf(low * root))
-
-
-@kernel
 def _add_peak(
     weight: float,
     one: float,
@@ -126,7 +116,7 @@ def _add_peak(
             series = 1.0 + c2 * (t - 1.0) + c4 * (t * (t - 6.0) + 3.0)
             h0 = cell * density * (series + c6 * (t * (t * (t - 15.0) + 45.0) - 15.0))
         else:
-            h0 = _cell_mass(up - cell, up)
+            h0 = normal_mass(up - cell, up)
         density *= ratio
         ratio *= shrink
         t = up * up

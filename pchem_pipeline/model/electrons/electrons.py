@@ -1,8 +1,8 @@
-"""Electron numbers by largest membership, and the two-point non-uniformity correction.
+"""Electron numbers of samples under the law of their own pixel, and how often they are wrong.
 
-The estimate ``argmax_k gamma_nk`` (Hendrickson et al. 2023, eq. demarg_K_eqn) is a table of thresholds: k + 1
-has the larger membership where x exceeds ``t_k = mu + (k + 1/2)/g + g sigma^2 ln((k + 1)/H)``. The thresholds
-increase with k, so no cell is empty, and a DN's electron number is the number of thresholds below it.
+The most probable k has the largest membership ``P(k; H) P(x | k)`` (Hendrickson et al. 2023, eq.
+demarg_K_eqn), with the mass of the whole code x under any law of the samples. Each pixel has a table from
+code to number; a sample is looked up in it.
 """
 
 from __future__ import annotations
@@ -11,32 +11,106 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.electrons import electrons_numba
-from pchem_pipeline.model.law.inputs import kernel_counts
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters, usable_pixels
+from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR
+from pchem_pipeline.model.law.inputs import Parameters, columns_of, kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.model.maps.pixels import FloatArray, usable_pixels
 
 __all__ = [
     "LARGEST_NUMBER",
     "NO_NUMBER",
-    "CellProbabilities",
+    "NO_PRIOR",
     "ErrorTally",
-    "cell_probabilities",
+    "KnownPixels",
+    "NumberTables",
+    "Numbers",
+    "Outcomes",
     "compare_electron_numbers",
-    "electron_counts",
-    "electron_numbers",
-    "thresholds",
+    "number_tables",
+    "number_type",
 ]
+
+IntArray = NDArray[np.int64]
 
 #: Stored where a pixel has no parameters and so no electron number.
 NO_NUMBER = 65535
 #: Larger electron numbers are cut to this.
 LARGEST_NUMBER = 65534
+#: A pixel's table holds no more codes than this.
+_MOST_CODES = 1 << 17
 
 
 @dataclass(frozen=True)
-class CellProbabilities:
+class KnownPixels:
+    """Pixels whose samples are turned into electron numbers.
+
+    Attributes:
+        parameters: (H, g, mu, sigma), each of the shape of the pixels; NaN where there are none.
+        law: of the samples of the pixels in C order.
+        satellites: amplitude (e-) and weight of their free satellites; None: those of the parameters, if any.
+    """
+
+    parameters: Parameters
+    law: SampleLaw
+    satellites: tuple[ArrayLike, ArrayLike] | None = None
+
+    @property
+    def exposure(self) -> FloatArray:
+        """H, e-, shape (n,); NaN where there are no usable parameters."""
+        columns = columns_of(self.parameters)
+        return np.where(usable_pixels(*columns.T), columns[:, 0], np.nan)
+
+    def kernel_inputs(self) -> tuple[FloatArray, FloatArray, Any]:
+        """Return parameters, free satellites and law as the loops take them."""
+        columns = columns_of(self.parameters)
+        n = len(columns)
+        columns[np.isnan(self.exposure)] = np.nan
+        columns[:, 0] = np.where(columns[:, 0] == 0.0, 1.0, columns[:, 0])  # the prior is given apart
+        return columns, satellites_of(self.parameters, self.satellites, n), pack([self.law], n)
+
+    def codes(
+        self, counts: NDArray[np.integer[Any]] | None = None, origin: NDArray[np.integer[Any]] | None = None
+    ) -> tuple[IntArray, IntArray]:
+        """Return the first and last code that pixels show, DN, shape (n,); none without parameters.
+
+        Args:
+            counts: histograms whose samples are among the codes, too, shape (n, n_bins); None: no samples.
+            origin: DN of their bin 0, shape (n,).
+        """
+        inputs = self.kernel_inputs()
+        reach = np.empty((len(inputs[0]), 2), np.int64)
+        electrons_numba.find_reach(np.nan_to_num(self.exposure), *inputs, reach)
+        low, high = reach.T
+        if counts is None or origin is None:
+            return low, np.minimum(high, low + _MOST_CODES)
+        seen = counts > 0
+        first = origin + seen.argmax(axis=1)
+        last = origin + counts.shape[1] - 1 - seen[:, ::-1].argmax(axis=1)
+        known = high >= low
+        low, high = np.maximum(low, last - _MOST_CODES), np.minimum(high, first + _MOST_CODES)
+        return np.where(known, np.minimum(low, first), first), np.where(known, np.maximum(high, last), last)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Electron numbers of samples, each array (frame, y, x).
+
+    Attributes:
+        number: the most probable one; the largest value of the type where a pixel has no parameters.
+        probability: that it is right; empty where the tables have none.
+        expected: E[k | x], e-; empty where it was not asked for.
+    """
+
+    number: NDArray[np.unsignedinteger[Any]]
+    probability: NDArray[np.float32]
+    expected: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Outcomes:
     """What the estimated electron numbers should show.
 
     Attributes:
@@ -46,6 +120,99 @@ class CellProbabilities:
 
     estimated: FloatArray
     error: FloatArray
+
+
+@dataclass(frozen=True)
+class NumberTables:
+    """What each code of each pixel says of the electron number.
+
+    Attributes:
+        shape: of the pixels.
+        first: first code of each pixel, shape (n,).
+        start: place of its first code in the tables, shape (n + 1,).
+        number: most probable number at each code; the largest value of the type: none.
+        mass: P(code); empty where it was not asked for.
+        right: P(code, and the number is right); likewise.
+        expected: E[k | x], e-; likewise.
+    """
+
+    shape: tuple[int, ...]
+    first: IntArray
+    start: IntArray
+    number: NDArray[np.unsignedinteger[Any]]
+    mass: FloatArray
+    right: FloatArray
+    expected: NDArray[np.float32]
+
+    @property
+    def missing(self) -> int:
+        """What stands for no number."""
+        return int(np.iinfo(self.number.dtype).max)
+
+    def convert(
+        self, frames: NDArray[np.unsignedinteger[Any]], *, expected: bool = False, lift: int = 0
+    ) -> Numbers:
+        """Return the electron numbers of samples; none for codes that are not in the table of their pixel.
+
+        Args:
+            frames: codes, shape (frame, y, x).
+            expected: whether the mean is wanted, too.
+            lift: by which the codes were raised.
+        """
+        n_frames, n = frames.shape[0], self.first.size
+        number = np.empty((n_frames, n), self.number.dtype)
+        probability = np.empty((n_frames, n) if self.mass.size else (0, 0), np.float32)
+        mean = np.empty((n_frames, n) if expected else (0, 0), np.float32)
+        places = self.first + lift, self.start
+        tables = self.number, self.mass, self.right, self.expected, self.missing
+        electrons_numba.convert_frames(
+            frames.reshape(n_frames, n), *places, *tables, number, probability, mean
+        )
+        shape = (n_frames, *self.shape)
+        return Numbers(
+            number.reshape(shape),
+            *(each.reshape(shape) if each.size else each for each in (probability, mean)),
+        )
+
+    def tally(
+        self, counts: NDArray[np.integer[Any]], origin: NDArray[np.integer[Any]], n_k: int
+    ) -> tuple[IntArray, int]:
+        """Return the samples of each electron number, shape (n_k,), and how many have a larger one.
+
+        Args:
+            counts: samples per bin, shape (n, n_bins).
+            origin: DN of bin 0, shape (n,).
+            n_k: number of electron numbers, k = 0 .. n_k - 1.
+        """
+        out = np.zeros(n_k, dtype=np.int64)
+        beyond = electrons_numba.tally_numbers(
+            kernel_counts(counts),
+            np.asarray(origin, dtype=np.int64),
+            self.first,
+            self.start,
+            self.number,
+            self.missing,
+            out,
+        )
+        return out, int(beyond)
+
+    def outcomes(self, n_k: int, data: KnownPixels | None = None) -> Outcomes:
+        """Return the probability of each estimated number and of an error.
+
+        Args:
+            n_k: number of electron numbers in the result.
+            data: what the samples follow, the codes of which should lie within the tables; None: what the
+                tables were made of, with all details.
+        """
+        if data is not None:
+            out, errors = np.zeros(n_k), np.empty(self.first.size)
+            inputs = data.exposure, *data.kernel_inputs()
+            electrons_numba.sum_outcomes(self.first, self.start, self.number, *inputs, out, errors)
+            return Outcomes(out, errors)
+        pixel = np.repeat(np.arange(self.first.size), np.diff(self.start))
+        right = np.bincount(pixel, self.right, self.first.size)
+        estimated = np.bincount(self.number, self.mass, n_k)[:n_k]
+        return Outcomes(np.asarray(estimated, np.float64), np.asarray(1.0 - right))
 
 
 @dataclass(frozen=True)
@@ -59,7 +226,7 @@ class ErrorTally:
     """
 
     n_samples: int
-    by_size: NDArray[np.int64]
+    by_size: IntArray
     signed: int
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
@@ -69,109 +236,49 @@ class ErrorTally:
         )
 
 
-def thresholds(
-    quanta_exposure: FloatArray | float,
-    conversion_gain: FloatArray | float,
-    bias: FloatArray | float,
-    read_noise_dn: FloatArray | float,
-    n_thresholds: int,
-) -> FloatArray:
-    """Boundaries between the electron numbers (Hendrickson et al. 2023, eq. demarg_K_eqn).
+def number_type(largest: float) -> np.dtype[Any]:
+    """Return uint8 where all electron numbers fit, one being kept for 'none', else uint16."""
+    return np.dtype(np.uint8 if largest < np.iinfo(np.uint8).max else np.uint16)
+
+
+def number_tables(
+    minimum: NDArray[np.integer[Any]],
+    maximum: NDArray[np.integer[Any]],
+    prior: FloatArray | None,
+    pixels: KnownPixels,
+    *,
+    dtype: np.dtype[Any] | type[np.unsignedinteger[Any]] = np.uint16,
+    parts: int = 1,
+    detailed: bool = False,
+) -> NumberTables:
+    """Return the electron number of each code that pixels have shown.
+
+    That the most probable k is right has the probability of its share in the sum over all k. Without a prior
+    all k are alike beforehand.
 
     Args:
-        quanta_exposure: H, e-, any shape; the others broadcast with it.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, DN.
-        n_thresholds: number of boundaries.
-
-    Returns:
-        t_k, DN, boundary between k and k + 1, k on the last axis; infinite where H = 0.
+        minimum: smallest code of each pixel, of the shape of the pixels.
+        maximum: largest code, likewise.
+        prior: exposure of each pixel, e-, likewise; NaN: no numbers for the pixel; None: no prior.
+        pixels: what is known of them.
+        dtype: of the numbers; its largest value means none.
+        parts: codes in a DN.
+        detailed: also the probability that each is right, and the mean.
     """
-    exposure, gain, offset, sigma = (
-        np.asarray(v, dtype=np.float64)[..., None]
-        for v in (quanta_exposure, conversion_gain, bias, read_noise_dn)
+    n = minimum.size
+    first = np.array(minimum.ravel(), np.int64)
+    sizes = np.maximum(maximum.ravel().astype(np.int64) - first + 1, 0)
+    start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    number = np.empty(start[-1], np.uint16)
+    mass, right = np.empty((2, start[-1] if detailed else 0))
+    expected = np.empty(mass.size, np.float32)
+    missing = int(np.iinfo(dtype).max)
+    weights = np.full(n, NO_PRIOR) if prior is None else np.ascontiguousarray(prior.ravel(), np.float64)
+    tables = number, mass, right, expected
+    electrons_numba.fill_tables(
+        first, start, parts, weights, *pixels.kernel_inputs(), missing - 1, missing, *tables
     )
-    k = np.arange(n_thresholds)
-    with np.errstate(divide="ignore"):
-        return np.asarray(offset + (k + 0.5) / gain + gain * sigma**2 * np.log((k + 1) / exposure))
-
-
-def electron_numbers(
-    frames: NDArray[np.unsignedinteger[Any]],
-    quanta_exposure: FloatArray,
-    conversion_gain: FloatArray,
-    bias: FloatArray,
-    read_noise_dn: FloatArray,
-) -> NDArray[np.uint16]:
-    """Estimate the electron number of every sample (Hendrickson et al. 2023, eq. demarg_K_eqn).
-
-    Args:
-        frames: DN, shape (n_frames, ny, nx), unsigned integers.
-        quanta_exposure: H, e-, shape (ny, nx).
-        conversion_gain: g, e-/DN, shape (ny, nx).
-        bias: mu, DN, shape (ny, nx).
-        read_noise_dn: sigma, DN, shape (ny, nx).
-
-    Returns:
-        k~, shape (n_frames, ny, nx); ``NO_NUMBER`` for pixels without usable parameters, at most
-        ``LARGEST_NUMBER``.
-    """
-    maps = (quanta_exposure, conversion_gain, bias, read_noise_dn)
-    gain = np.where(usable_pixels(*maps), conversion_gain, np.nan)
-    out = np.empty(frames.shape, dtype=np.uint16)
-    if frames.size:
-        electrons_numba.convert_frames(
-            frames, quanta_exposure, gain, bias, read_noise_dn, LARGEST_NUMBER, NO_NUMBER, out
-        )
-    return out
-
-
-def electron_counts(
-    counts: NDArray[np.integer[Any]],
-    origin: NDArray[np.integer[Any]],
-    pixels: PixelParameters,
-    n_k: int,
-) -> tuple[NDArray[np.int64], int]:
-    """Histogram of the electron numbers of samples that are given as histograms.
-
-    Args:
-        counts: samples per bin, shape (n, n_bins).
-        origin: DN of bin 0, shape (n,).
-        pixels: the n pixels.
-        n_k: number of electron numbers, k = 0 .. n_k - 1.
-
-    Returns:
-        Samples with each k, shape (n_k,), and the number of samples with a larger one.
-    """
-    out = np.zeros(n_k, dtype=np.int64)
-    beyond = electrons_numba.tally_electrons(
-        kernel_counts(counts), np.asarray(origin, dtype=np.int64), *pixels.columns(), out
-    )
-    return out, int(beyond)
-
-
-def cell_probabilities(
-    pixels: PixelParameters, n_k: int, estimator: PixelParameters | None = None
-) -> CellProbabilities:
-    """Probability of each estimated electron number and of an error, summed over the pixels' own cells.
-
-    It takes rounding as it is: ``X`` is an integer, so a cell holds whole DN (Hendrickson et al. 2023, eqs.
-    PCD_RV_definition and demarg_K_eqn).
-
-    Args:
-        pixels: parameters that the data follow.
-        n_k: number of electron numbers in the result.
-        estimator: parameters that the thresholds are made of; None: the same.
-
-    Returns:
-        The sum over pixels of P(k~ = k), and each pixel's P(k~ != K).
-    """
-    out = np.zeros(n_k)
-    errors = np.empty(len(pixels))
-    used = pixels if estimator is None else estimator
-    electrons_numba.sum_cell_probabilities(*pixels.columns(), *used.columns(), out, errors)
-    return CellProbabilities(out, errors)
+    return NumberTables(minimum.shape, first, start, number.astype(dtype, copy=False), mass, right, expected)
 
 
 def compare_electron_numbers(

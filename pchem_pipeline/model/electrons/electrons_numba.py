@@ -1,4 +1,4 @@
-"""Compiled loops of the electron numbers: conversion of frames, tallies, and cell probabilities."""
+"""Loops of :mod:`pchem_pipeline.model.electrons.electrons`: tables from code to electron number."""
 
 from __future__ import annotations
 
@@ -9,102 +9,251 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.ensemble.ensemble_numba import _capacity, poisson_weights
+from pchem_pipeline.model.law.cells_numba import Law, cells_of
+from pchem_pipeline.model.law.levels_numba import (
+    fill_level,
+    number_mass,
+    number_range,
+    place_codes,
+    reach_of_law,
+)
+from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
+from pchem_pipeline.model.law.pixel_numba import OWN
 
-__all__ = ["convert_frames", "count_errors", "electron_of_dn", "sum_cell_probabilities", "tally_electrons"]
+__all__ = [
+    "NO_PRIOR",
+    "convert_frames",
+    "count_errors",
+    "fill_tables",
+    "find_reach",
+    "sum_outcomes",
+    "tally_numbers",
+]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Longest table from DN to electron number kept for a pixel; what lies above is computed one by one.
-LONGEST_TABLE = 4096
+#: Exposure that stands for a prior in which all electron numbers are alike.
+NO_PRIOR = -1.0
+
+_LEAST_MASS = 1e-300
 
 
 @kernel
-def _threshold(k: int, exposure: float, gain: float, bias: float, noise: float) -> float:
-    """Return the boundary between k and k + 1; ``noise`` is g sigma^2."""
-    if exposure == 0.0:
-        return math.inf
-    return bias + (k + 0.5) / gain + noise * math.log((k + 1.0) / exposure)
+def find_reach(
+    exposure: FloatArray, parameters: FloatArray, satellites: FloatArray, law: Law, out: IntArray
+) -> None:
+    """Fill the first and last code that each pixel shows, DN, shape (n, 2); (0, -1) without parameters."""
+    pixel, scratch = pixel_scratch(2, law)
+    theta = scratch.small[OWN]
+    for p in range(exposure.size):
+        out[p, 0], out[p, 1] = 0, -1
+        placed, _ = place_codes(p, 0, 1, 1, law, satellites, pixel)
+        if known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
+            out[p, 0], out[p, 1] = reach_of_law(exposure[p], p, theta, placed, law)
 
 
 @kernel
-def electron_of_dn(dn: float, exposure: float, gain: float, bias: float, noise: float, start: int) -> int:
-    """Return the electron number of a DN: how many thresholds lie below it, tried from ``start``."""
-    k = start
-    while k > 0 and dn <= _threshold(k - 1, exposure, gain, bias, noise):
-        k -= 1
-    while dn > _threshold(k, exposure, gain, bias, noise):
-        k += 1
-    return k
+def _longest(start: IntArray) -> int:
+    """Return the codes of the pixel that has most."""
+    most = 1
+    for p in range(start.size - 1):
+        most = max(most, start[p + 1] - start[p])
+    return most
 
 
 @kernel
-def _guess(dn: float, gain: float, bias: float) -> int:
-    return max(0, int((dn - bias) * gain))
+def fill_tables(
+    first: IntArray,
+    start: IntArray,
+    parts: int,
+    prior: FloatArray,
+    parameters: FloatArray,
+    satellites: FloatArray,
+    law: Law,
+    largest: int,
+    missing: int,
+    number: NDArray[Any],
+    mass: FloatArray,
+    right: FloatArray,
+    expected: NDArray[np.float32],
+) -> None:
+    """Fill, for each code of each pixel, the most probable electron number, how probable, and the mean.
+
+    Args:
+        first: first code of each pixel, in parts of a DN, shape (n,).
+        start: place of its first code in the tables; the last element is their length, shape (n + 1,).
+        parts: codes in a DN.
+        prior: exposure to expect, e-; ``NO_PRIOR``: all numbers alike; shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4).
+        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
+        law: of the samples.
+        largest: electron numbers above are cut to this.
+        missing: what codes of pixels without parameters get.
+        number: out.
+        mass: out, P(code); NaN without parameters. Empty: not wanted.
+        right: out, P(code, and the number is right); likewise.
+        expected: out, E[k | x], e-; likewise, and NaN where the law expects no such code.
+    """
+    most = _longest(start)
+    pixel, scratch = pixel_scratch(most + 2, law)
+    detailed = mass.size > 0
+    theta, sums = scratch.small[OWN], np.empty((4, most))
+    for p in range(first.size):
+        at, n = start[p], start[p + 1] - start[p]
+        for i in range(n):
+            number[at + i] = missing
+            if detailed:
+                mass[at + i] = right[at + i] = math.nan
+                expected[at + i] = np.float32(math.nan)
+        if n == 0 or math.isnan(prior[p]):
+            continue
+        placed, codes = place_codes(p, first[p], n, parts, law, satellites, pixel)
+        if not known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
+            continue
+        cells = cells_of(placed, np.int64(0))
+        for i in range(n):
+            sums[0, i] = sums[1, i] = sums[2, i] = 0.0
+            number[at + i] = 0
+        lowest, end = number_range(theta, cells, codes)
+        for k in range(lowest, end):
+            likely = 1.0 if prior[p] < 0.0 else number_mass(k, prior[p], cells)
+            low, high = fill_level(k, theta, cells, codes, sums[3])
+            for i in range(low, high):
+                joint = likely * sums[3, i - low]
+                sums[0, i] += joint
+                sums[1, i] += k * joint
+                if joint > sums[2, i]:
+                    sums[2, i] = joint
+                    number[at + i] = min(k, largest)
+        rest = 1.0 - cells.outlier_share
+        for i in range(n):
+            if detailed:
+                mass[at + i] = rest * sums[0, i] + cells.outlier_mass
+                right[at + i] = rest * sums[2, i]
+            if sums[0, i] > _LEAST_MASS:
+                if detailed:
+                    expected[at + i] = np.float32(sums[1, i] / sums[0, i])
+            elif prior[p] != 0.0:  # farther from all levels than any sample of the law: the nearest
+                value = (codes.first + i / parts - theta[2]) / theta[1]
+                number[at + i] = min(max(math.floor(value + 0.5), 0), largest)
+
+
+@kernel
+def sum_outcomes(
+    first: IntArray,
+    start: IntArray,
+    number: NDArray[Any],
+    exposure: FloatArray,
+    parameters: FloatArray,
+    satellites: FloatArray,
+    law: Law,
+    out: FloatArray,
+    errors: FloatArray,
+) -> None:
+    """Add, over pixels, the probability that the number in the table is k; ``errors[p]`` that it is wrong.
+
+    Args:
+        first: first code of each pixel, DN, shape (n,).
+        start: place of its first code in the table, shape (n + 1,).
+        number: the table.
+        exposure: of the pixels, e-, shape (n,).
+        parameters: (H, g, mu, sigma) that the data follow, shape (n, 4).
+        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
+        law: of the samples.
+        out: out, by electron number.
+        errors: out, shape (n,); what lies beyond the table counts as wrong; NaN without parameters.
+    """
+    most = _longest(start)
+    pixel, scratch = pixel_scratch(most + 2, law)
+    theta, share = scratch.small[OWN], np.empty(most)
+    for p in range(first.size):
+        at, n = start[p], start[p + 1] - start[p]
+        errors[p] = math.nan
+        placed, codes = place_codes(p, first[p], n, 1, law, satellites, pixel)
+        if n == 0 or not known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
+            continue
+        cells = cells_of(placed, np.int64(0))
+        right, rest = 0.0, 1.0 - cells.outlier_share
+        lowest, end = number_range(theta, cells, codes)
+        for k in range(lowest, end):
+            mass = rest * number_mass(k, exposure[p], cells)
+            low, high = fill_level(k, theta, cells, codes, share)
+            for i in range(low, high):
+                joint = mass * share[i - low]
+                found = np.int64(number[at + i])
+                if found < out.size:
+                    out[found] += joint
+                if found == k:
+                    right += joint
+        errors[p] = 1.0 - right
+
+
+@kernel
+def tally_numbers(
+    counts: NDArray[Any],
+    origin: IntArray,
+    first: IntArray,
+    start: IntArray,
+    number: NDArray[Any],
+    missing: int,
+    out: IntArray,
+) -> np.int64:
+    """Add the electron numbers of per-pixel histograms to ``out[k]``; return how many lie beyond it."""
+    beyond = np.int64(0)
+    for p in range(counts.shape[0]):
+        for b in range(counts.shape[1]):
+            c = np.int64(counts[p, b])
+            i = start[p] + origin[p] + b - first[p]
+            if c == 0 or not start[p] <= i < start[p + 1] or number[i] == missing:
+                continue
+            if number[i] < out.size:
+                out[number[i]] += c
+            else:
+                beyond += c
+    return beyond
 
 
 @kernel
 def convert_frames(
     frames: NDArray[Any],
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    largest: int,
+    first: IntArray,
+    start: IntArray,
+    number: NDArray[Any],
+    mass: FloatArray,
+    right: FloatArray,
+    expected: NDArray[np.float32],
     missing: int,
-    out: NDArray[np.uint16],
+    out_number: NDArray[Any],
+    out_probability: NDArray[np.float32],
+    out_expected: NDArray[np.float32],
 ) -> None:
-    """Turn DN into electron numbers, a row of pixels at a time so that its tables stay in the cache.
+    """Look every sample up in the table of its pixel.
 
     Args:
-        frames: DN, shape (n_frames, ny, nx).
-        exposure: H, shape (ny, nx), as the other parameters; NaN in gain marks a pixel without value.
-        gain: g.
-        bias: mu.
-        sigma: sigma.
-        largest: electron numbers above are cut to this.
-        missing: what pixels without value receive.
-        out: electron numbers, shape of the frames.
+        frames: codes, shape (frame, n).
+        first: first code of each pixel, shape (n,).
+        start: place of its first code in the tables, shape (n + 1,).
+        number: the table of the numbers.
+        mass: that of the codes' probabilities.
+        right: that of the parts of these in which the number is right.
+        expected: that of the means.
+        missing: number of a code that is not in the table.
+        out_number: out, shape of the frames.
+        out_probability: out, likewise; or empty.
+        out_expected: out, likewise; or empty.
     """
-    n_frames, ny, nx = frames.shape
-    table = np.empty((nx, LONGEST_TABLE), dtype=np.uint16)
-    lowest = np.empty(nx, dtype=np.int64)
-    highest = np.empty(nx, dtype=np.int64)
-    length = np.empty(nx, dtype=np.int64)
-    for y in range(ny):
-        lowest[:] = frames[0, y]
-        highest[:] = frames[0, y]
-        for t in range(1, n_frames):
-            for x in range(nx):
-                dn = np.int64(frames[t, y, x])
-                lowest[x] = min(lowest[x], dn)
-                highest[x] = max(highest[x], dn)
-        for x in range(nx):
-            low = lowest[x]
-            length[x] = min(highest[x] - low + 1, LONGEST_TABLE)
-            if math.isnan(gain[y, x]):
-                table[x, : length[x]] = missing
-                continue
-            noise = gain[y, x] * sigma[y, x] * sigma[y, x]
-            k = _guess(float(low), gain[y, x], bias[y, x])
-            for i in range(length[x]):
-                k = electron_of_dn(float(low + i), exposure[y, x], gain[y, x], bias[y, x], noise, k)
-                table[x, i] = min(k, largest)
-        for t in range(n_frames):
-            for x in range(nx):
-                i = np.int64(frames[t, y, x]) - lowest[x]
-                if i < length[x]:
-                    out[t, y, x] = table[x, i]
-                elif math.isnan(gain[y, x]):
-                    out[t, y, x] = missing
-                else:
-                    value = float(frames[t, y, x])
-                    start = _guess(value, gain[y, x], bias[y, x])
-                    noise = gain[y, x] * sigma[y, x] * sigma[y, x]
-                    k = electron_of_dn(value, exposure[y, x], gain[y, x], bias[y, x], noise, start)
-                    out[t, y, x] = min(k, largest)
+    with_probability, with_expected = out_probability.size > 0, out_expected.size > 0
+    for t in range(frames.shape[0]):
+        for p in range(frames.shape[1]):
+            i = start[p] + np.int64(frames[t, p]) - first[p]
+            known = start[p] <= i < start[p + 1]
+            out_number[t, p] = number[i] if known else missing
+            if with_probability:
+                sure = known and mass[i] > _LEAST_MASS
+                out_probability[t, p] = np.float32(right[i] / mass[i] if sure else math.nan)
+            if with_expected:
+                out_expected[t, p] = expected[i] if known else np.float32(math.nan)
 
 
 @kernel
@@ -130,86 +279,3 @@ def count_errors(
         compared += 1
         signed += difference
     return compared, signed
-
-
-@kernel
-def tally_electrons(
-    counts: NDArray[Any],
-    origin: IntArray,
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    out: IntArray,
-) -> np.int64:
-    """Add the electron numbers of per-pixel histograms to ``out[k]``; return how many lie beyond it."""
-    beyond = np.int64(0)
-    for p in range(counts.shape[0]):
-        noise = gain[p] * sigma[p] * sigma[p]
-        k = _guess(float(origin[p]), gain[p], bias[p])
-        for b in range(counts.shape[1]):
-            c = np.int64(counts[p, b])
-            if c == 0:
-                continue
-            k = electron_of_dn(float(origin[p] + b), exposure[p], gain[p], bias[p], noise, k)
-            if k < out.size:
-                out[k] += c
-            else:
-                beyond += c
-    return beyond
-
-
-@kernel
-def _upper_edge(k: int, exposure: float, gain: float, bias: float, noise: float) -> float:
-    """Return the end of cell k on the continuous axis before rounding: its last integer DN plus one half."""
-    threshold = _threshold(k, exposure, gain, bias, noise)
-    return math.floor(threshold) + 0.5 if threshold < math.inf else math.inf
-
-
-@kernel
-def sum_cell_probabilities(
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    used_exposure: FloatArray,
-    used_gain: FloatArray,
-    used_bias: FloatArray,
-    used_sigma: FloatArray,
-    out: FloatArray,
-    errors: FloatArray,
-) -> None:
-    """Add, over pixels, the probability that the estimate is k; ``errors[p]`` is that of an error.
-
-    ``exposure`` .. ``sigma`` make the data, ``used_*`` the thresholds. DN are rounded, so a cell ends
-    half-way between two integers, and the Gaussian in front of the rounding is narrower by 1/12 DN^2.
-    """
-    weights = np.zeros(_capacity(exposure))
-    for p in range(exposure.size):
-        low, high = poisson_weights(exposure[p], weights)
-        analog = math.sqrt(max(sigma[p] * sigma[p] - QUANTISATION_VARIANCE, 1e-12))
-        noise = used_gain[p] * used_sigma[p] * used_sigma[p]
-        correct = 0.0
-        for k in range(low, high + 1):
-            centre = bias[p] + k / gain[p]
-            # the cells that this component reaches
-            cell = electron_of_dn(
-                math.floor(centre - 9.0 * analog + 0.5),
-                used_exposure[p],
-                used_gain[p],
-                used_bias[p],
-                noise,
-                _guess(centre - 9.0 * analog, used_gain[p], used_bias[p]),
-            )
-            below = 0.0
-            while below < 1.0:
-                edge = _upper_edge(cell, used_exposure[p], used_gain[p], used_bias[p], noise)
-                z = (edge - centre) / analog
-                above = 1.0 if z > 8.3 else 0.5 * math.erfc(-z * 0.7071067811865476)
-                if cell < out.size:
-                    out[cell] += weights[k] * (above - below)
-                if cell == k:
-                    correct += weights[k] * (above - below)
-                below = above
-                cell += 1
-        errors[p] = 1.0 - correct

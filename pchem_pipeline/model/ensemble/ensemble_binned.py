@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_pmf
+from pchem_pipeline.model.law.normal_numba import NARROW, REACH
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
 __all__ = [
@@ -156,11 +157,11 @@ def epcd_independent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoic
         joint_cells((column,), choice) for column in (exposure, gain, bias, sigma**2)
     )
     period, origin = _period(exposures, gains, biases, variances, dn)
-    narrow = variances.values[0] < ensemble_numba.NARROW**2
+    narrow = variances.values[0] < NARROW**2
     spread = np.where(
         narrow, np.maximum(variances.values[0] - QUANTISATION_VARIANCE, _NARROWEST**2), variances.values[0]
     )
-    n_frequencies = math.ceil(period * ensemble_numba.REACH / (2 * np.pi * math.sqrt(spread.min())))
+    n_frequencies = math.ceil(period * REACH / (2 * np.pi * math.sqrt(spread.min())))
     folded = np.zeros(period, dtype=np.complex128)
     for start in range(0, n_frequencies + 1, 64):
         order = np.arange(start, min(start + 64, n_frequencies + 1))
@@ -184,7 +185,7 @@ def _electrons_in_dn(t: FloatArray, exposures: Cells, gains: Cells) -> NDArray[n
 
 def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn: DnAxis) -> tuple[int, int]:
     """Choose the period (DN) of the inversion, longer than the density, and its first DN."""
-    reach = (ensemble_numba.REACH + 1.0) * math.sqrt(variances.values[0].max()) + 1.0
+    reach = (REACH + 1.0) * math.sqrt(variances.values[0].max()) + 1.0
     steps = _enough_k(exposures.values[0]) / gains.values[0].min()
     low = min(dn.start, math.floor(biases.values[0].min() - reach))
     high = max(dn.start + dn.size, math.ceil(biases.values[0].max() + min(steps, _LONGEST) + reach))

@@ -1,7 +1,6 @@
 """Compiled loops of the ensemble: sums of PCDs over pixels and tallies of the data.
 
-A component is a Gaussian of weight ``P(K = k)``; it is added only where it counts, within ``REACH`` standard
-deviations, outside of which it is below 2e-16 of its peak.
+A component is a Gaussian of weight ``P(K = k)``.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.normal_numba import REACH, add_component, add_mass
 
 __all__ = [
-    "add_density",
-    "add_mass",
     "curve_variance",
     "poisson_weights",
     "sum_nuced_cells",
@@ -31,11 +28,8 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-REACH = 8.5
 #: Poisson weights below this part of the largest are left out.
 SMALLEST = 1e-18
-#: Below this read noise (DN) the density at the centre of a DN cell is no longer its mass.
-NARROW = 1.0
 
 
 @kernel
@@ -61,53 +55,6 @@ def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
         weights[high + 1] = weights[high] * mean / (high + 1.0)
         high += 1
     return low, high
-
-
-@kernel
-def add_density(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
-    """Add ``weight * phi(base + i; centre, sigma^2)`` to ``out[i]``, by two multiplications a point."""
-    first = max(0, math.ceil(centre - REACH * sigma - base))
-    last = min(out.size - 1, math.floor(centre + REACH * sigma - base))
-    if first > last:
-        return
-    nearest = min(max(math.floor(centre - base + 0.5), first), last)
-    precision = 1.0 / (sigma * sigma)
-    distance = base + nearest - centre
-    peak = weight * 0.3989422804014327 / sigma * math.exp(-0.5 * distance * distance * precision)
-    out[nearest] += peak
-    shrink = math.exp(-precision)
-    value, ratio = peak, math.exp(-(distance + 0.5) * precision)
-    for i in range(nearest + 1, last + 1):
-        value *= ratio
-        ratio *= shrink
-        out[i] += value
-    value, ratio = peak, math.exp((distance - 0.5) * precision)
-    for i in range(nearest - 1, first - 1, -1):
-        value *= ratio
-        ratio *= shrink
-        out[i] += value
-
-
-@kernel
-def add_mass(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
-    """Add ``weight`` times the mass of N(centre, sigma^2) between ``base + i -+ 1/2`` to ``out[i]``."""
-    first = max(0, math.floor(centre - REACH * sigma - base + 0.5))
-    last = min(out.size - 1, math.floor(centre + REACH * sigma - base + 0.5))
-    scale = 1.0 / (sigma * math.sqrt(2.0))
-    below = math.erf((base + first - 0.5 - centre) * scale)
-    for i in range(first, last + 1):
-        above = math.erf((base + i + 0.5 - centre) * scale)
-        out[i] += 0.5 * weight * (above - below)
-        below = above
-
-
-@kernel
-def add_component(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
-    """Add a component of the PCD at the integers ``base + i``: its density, or its mass if narrow."""
-    if sigma >= NARROW:
-        add_density(out, base, weight, centre, sigma)
-    else:  # sigma holds the 1/12 DN^2 of rounding, which the integration over the cell puts back
-        add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - QUANTISATION_VARIANCE, 1e-12)))
 
 
 @kernel

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.ensemble import extended_ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, EnsembleSums, NucedAxis
+from pchem_pipeline.model.law.inputs import satellites_of
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
@@ -35,7 +36,7 @@ class ExtendedSums:
 
 def extended_sums(
     pixels: PixelParameters,
-    satellites: tuple[FloatArray, FloatArray] | None,
+    satellites: tuple[ArrayLike, ArrayLike] | None,
     model: SampleLaw,
     dn: DnAxis,
     nuced: NucedAxis,
@@ -59,11 +60,12 @@ def extended_sums(
     moments = np.zeros(2)
     n = len(pixels)
     columns = pixels.columns()
+    own = satellites_of(pixels, satellites, n)
     step = max(1, _CHUNK // dn.size)
     for first in range(0, n, step):
         part = np.arange(first, min(first + step, n))
-        own = None if satellites is None else (satellites[0][part], satellites[1][part])
-        mass = sample_mass(model.of(part), [c[part] for c in columns], dn.dn, satellites=own)
+        amplitude, weight = own[part].T
+        mass = sample_mass(model.of(part), [c[part] for c in columns], dn.dn, satellites=(amplitude, weight))
         _add(mass, raw, raw_square)
         extended_ensemble_numba.sort_masses(
             mass,

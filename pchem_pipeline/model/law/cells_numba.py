@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.electron_laws_numba import FARTHEST, electron_number
+from pchem_pipeline.model.law.electron_laws_numba import electron_number
+from pchem_pipeline.model.law.normal_numba import FARTHEST
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     ADDED_WEIGHT,

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.model.law import electron_laws_numba
+from pchem_pipeline.model.law import electron_laws_numba, normal_numba
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
@@ -72,8 +72,8 @@ Parameters = HasParameters | Sequence[ArrayLike]
 
 @functools.cache
 def _normal_table() -> FloatArray:
-    table = np.empty((int(electron_laws_numba.FARTHEST * electron_laws_numba.STEPS) + 2, 2))
-    electron_laws_numba.fill_normal_table(table)
+    table = np.empty((int(normal_numba.FARTHEST * normal_numba.STEPS) + 2, 2))
+    normal_numba.fill_normal_table(table)
     return table
 
 

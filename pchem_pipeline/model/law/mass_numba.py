@@ -39,7 +39,7 @@ _LEAST_VARIANCE = 1e-6  # DN^2
 
 
 @kernel
-def _make_room(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
+def pixel_scratch(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
     """Return room for one sample of so many bins."""
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
     n_exposures = max(law.exposures.shape[3], law.added.shape[3])
@@ -54,7 +54,7 @@ def _at(room: Pixel, centre: int) -> Pixel:
 
 
 @kernel
-def _theta_of(parameters: FloatArray, centre: int, weight: float, theta: FloatArray) -> bool:
+def known_theta(parameters: FloatArray, centre: int, weight: float, theta: FloatArray) -> bool:
     """Fill a sample's own theta from (H, g, mu, sigma); False unless they are known."""
     if not math.isfinite(parameters.sum()):
         return False
@@ -85,11 +85,11 @@ def score_tile(
         law: of the samples.
         out: out, nats, shape (n,); comes as NaN.
     """
-    room, scratch = _make_room(counts.shape[1], law)
+    room, scratch = pixel_scratch(counts.shape[1], law)
     mask, theta = np.zeros(counts.shape[1], np.uint8), scratch.small[OWN]
     for index in range(counts.shape[0]):
         centre = origin[index] + load(counts[index], mask, room.bins[0], room.facts[0])
-        if not _theta_of(parameters[index], centre, satellites[index, 1], theta):
+        if not known_theta(parameters[index], centre, satellites[index, 1], theta):
             continue
         pixel = _at(room, centre)
         resolve(law, index, satellites[index, 0], pixel)
@@ -125,11 +125,11 @@ def mass_tile(
             n_codes).
     """
     n_codes = out.shape[1]
-    room, scratch = _make_room(n_codes, law)
+    room, scratch = pixel_scratch(n_codes, law)
     theta = scratch.small[OWN]
     room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_codes), 0.0
     for index in range(parameters.shape[0]):
-        if not _theta_of(parameters[index], first[index], satellites[index, 1], theta):
+        if not known_theta(parameters[index], first[index], satellites[index, 1], theta):
             continue
         pixel = _at(room, first[index])
         resolve(law, index, satellites[index, 0], pixel)

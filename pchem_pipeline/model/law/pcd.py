@@ -25,6 +25,7 @@ __all__ = [
     "pcd",
     "pcd_mass",
     "pcd_moments",
+    "thresholds",
     "total_read_noise",
 ]
 
@@ -164,6 +165,36 @@ def draw_pcd(
     electrons = rng.poisson(exposure, shape)
     signal = electrons + noise * rng.standard_normal(shape)
     return np.asarray(np.rint(signal / gain + offset), dtype=np.int64)
+
+
+def thresholds(
+    quanta_exposure: _Array | float,
+    conversion_gain: _Array | float,
+    bias: _Array | float,
+    read_noise_dn: _Array | float,
+    n_thresholds: int,
+) -> _Array:
+    """Return where the largest membership goes from k to k + 1 (Hendrickson et al. 2023, eq. demarg_K_eqn).
+
+    ``t_k = mu + (k + 1/2)/g + g sigma^2 ln((k + 1)/H)``, of the density; they increase with k.
+
+    Args:
+        quanta_exposure: H, e-, any shape; the others broadcast with it.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        read_noise_dn: sigma, DN.
+        n_thresholds: number of boundaries.
+
+    Returns:
+        t_k, DN, boundary between k and k + 1, k on the last axis; infinite where H = 0.
+    """
+    exposure, gain, offset, sigma = (
+        np.asarray(v, dtype=np.float64)[..., None]
+        for v in (quanta_exposure, conversion_gain, bias, read_noise_dn)
+    )
+    k = np.arange(n_thresholds)
+    with np.errstate(divide="ignore"):
+        return np.asarray(offset + (k + 0.5) / gain + gain * sigma**2 * np.log((k + 1) / exposure))
 
 
 def total_read_noise(analog_read_noise_e: ArrayLike, conversion_gain: ArrayLike) -> _Array:

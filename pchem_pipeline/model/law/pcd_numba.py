@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.normal_numba import normal_mass
 
 _NEGLIGIBLE = 41.0  # nats: exp(-41) is below the resolution of a double
 
@@ -89,17 +90,6 @@ def log_densities(
 
 
 @kernel
-def _cell(low: float, high: float) -> float:
-    """Return the standard normal mass of [low, high], without cancellation in either tail."""
-    root = math.sqrt(0.5)
-    if low > 0.0:
-        return 0.5 * (math.erfc(low * root) - math.erfc(high * root))
-    if high < 0.0:
-        return 0.5 * (math.erfc(-high * root) - math.erfc(-low * root))
-    return 0.5 * (math.erf(high * root) - math.erf(low * root))
-
-
-@kernel
 def masses(
     x: NDArray[np.float64],
     exposure: NDArray[np.float64],
@@ -122,7 +112,7 @@ def masses(
                 weight = 1.0 if k == 0 else 0.0
             d = y - k * step
             if width > 0.0:
-                total += weight * _cell((d - 0.5) / width, (d + 0.5) / width)
+                total += weight * normal_mass((d - 0.5) / width, (d + 0.5) / width)
             elif -0.5 < d <= 0.5:
                 total += weight
         out[i] = total

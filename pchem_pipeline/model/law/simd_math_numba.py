@@ -87,7 +87,7 @@ def lanes_exp(x: Lanes) -> Lanes:
 def lanes_tail(z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Return the nearer tail of the normal law, negative above the middle, the density, and z times that.
 
-    As :func:`.electron_laws_numba.normal_tail`, without a table: good to 1e-14 of itself within 8 standard
+    As :func:`.normal_numba.normal_tail`, without a table: good to 1e-14 of itself within 8 standard
     deviations and to 1e-12 at 37.4, beyond which all is as there.
     """
     near = least(most(z, -_FARTHEST), _FARTHEST)

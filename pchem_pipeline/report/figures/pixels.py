@@ -15,8 +15,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.electrons.electrons import thresholds
-from pchem_pipeline.model.law.pcd import pcd
+from pchem_pipeline.model.law.pcd import pcd, thresholds
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings

@@ -1,8 +1,8 @@
 """Stage ``electrons``: the stack of electron numbers, any number of frames, band by band.
 
-Each sample becomes the electron number of largest membership under its pixel's parameters (Hendrickson et al.
-2023, eq. demarg_K_eqn), those of the nearest PCD where the fit held effects. It is not part of ``run``, since
-the result is as large as the stack.
+Each sample becomes the electron number of largest membership under the law of its pixel (Hendrickson et al.
+2023, eq. demarg_K_eqn), the effects of the fit included. It is not part of ``run``, since the result is as
+large as the stack.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.frames.stream import FrameStream
-from pchem_pipeline.model.electrons.electrons import LARGEST_NUMBER, NO_NUMBER, electron_numbers
+from pchem_pipeline.model.electrons.electrons import (
+    LARGEST_NUMBER,
+    NO_NUMBER,
+    KnownPixels,
+    NumberTables,
+    number_tables,
+)
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
-from pchem_pipeline.stages.fit.fitted_model import (
-    deciding_maps,
-    fitted_added_exposure,
-    fitted_effects,
-    pixel_places,
-)
+from pchem_pipeline.stages.fit.fitted_model import fitted_pixels
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import FrameSource
-    from pchem_pipeline.model.maps.pixels import FloatArray
     from pchem_pipeline.stages.bands import Band
+    from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["electrons_tile", "run"]
+__all__ = ["electrons_tile", "read_tables", "run"]
 
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
@@ -41,17 +41,24 @@ _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
 _BLOCK_BYTES = 64 << 20
 
 
-def electrons_tile(frames: NDArray[Any], parameters: tuple[FloatArray, ...]) -> NDArray[np.uint16]:
-    """Return the electron numbers of some pixels.
+def electrons_tile(
+    minimum: NDArray[np.integer[Any]], maximum: NDArray[np.integer[Any]], pixels: KnownPixels
+) -> NumberTables:
+    """Return the electron number of each code that some pixels have shown, the fitted H being the prior.
 
     Args:
-        frames: DN, (frame, y, x).
-        parameters: maps (H, g, mu, sigma), each (y, x); NaN where the fit failed.
-
-    Returns:
-        Electron numbers (frame, y, x); ``NO_NUMBER`` where a pixel has no parameters.
+        minimum: smallest DN, shape (y, x).
+        maximum: largest DN, likewise.
+        pixels: what the fit says of them.
     """
-    return electron_numbers(frames, *parameters)
+    return number_tables(minimum, maximum, pixels.exposure, pixels)
+
+
+def read_tables(store: RunStore, rows: slice) -> NumberTables:
+    """Return the electron numbers of the codes of some rows of a run."""
+    region = rows, slice(None)
+    low, high = (store.read(f"histogram/{name}", region) for name in ("minimum", "maximum"))
+    return electrons_tile(low, high, fitted_pixels(store, region))
 
 
 def run(context: StageContext) -> None:
@@ -89,12 +96,9 @@ def run(context: StageContext) -> None:
 def _do_band(band: Band, *, store: Path, source: FrameSource, depth: int) -> dict[str, Any]:
     opened = open_store(store)
     rows = slice(band.y0, band.y1)
-    maps = [opened.read(f"fit/{name}", (rows, slice(None))) for name in PARAMETERS]
-    effects = fitted_effects(opened)
-    added = fitted_added_exposure(opened, (rows, slice(None)))
-    parameters = deciding_maps(maps, effects, added, pixel_places(opened, (rows, slice(None))))
+    tables = read_tables(opened, rows)
     with FrameStream(source, [(band.y0, band.y1)], depth) as stream:
         for start, (frames,) in stream:
             region = (slice(start, start + frames.shape[0]), rows, slice(None))
-            opened.write("electrons/electron_number", region, electrons_tile(frames, parameters))
+            opened.write("electrons/electron_number", region, tables.convert(frames).number)
     return {}

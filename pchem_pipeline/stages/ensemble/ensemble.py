@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.stream import FrameStream
-from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers, electron_numbers
+from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers
 from pchem_pipeline.model.electrons.error_rates import error_rates
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.ensemble.curves import components, curves
@@ -34,12 +34,12 @@ from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
+from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
 from pchem_pipeline.stages.fit.fitted_model import (
-    deciding_maps,
-    fitted_added_exposure,
     fitted_effects,
-    pixel_places,
+    fitted_law,
+    fitted_satellites,
 )
 from pchem_pipeline.store.files import without_nan
 
@@ -261,10 +261,6 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     counts = store.read("histogram/counts", (*rows, slice(None)))
     outside = store.read("histogram/under", rows) + store.read("histogram/over", rows)
     maps = tuple(store.read(f"fit/{name}", rows) for name in PARAMETERS)
-    satellites = None
-    if job.effects:
-        satellites = tuple(store.read(f"fit/{name}", rows) for name in FREE_SATELLITES)
-    added = fitted_added_exposure(store, rows)
     covariance = None
     if store.has("fit/correlation"):
         stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)
@@ -272,10 +268,7 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     chosen, chosen_outside = counts, outside
     if job.frames is not None:
         chosen, chosen_outside = _count(job, band, origin, counts)
-    places = pixel_places(store, rows)
-    errors = {}
-    if job.truth is not None:
-        errors = _compare(job, band, deciding_maps(maps, job.effects, added, places))
+    errors = _compare(job, band) if job.truth is not None else {}
     for key in band.keys:
         number, tile = job.tiles[key]
         part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
@@ -286,11 +279,9 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
             PixelHistograms(chosen[part].reshape(n, -1), chosen_outside[part].ravel()),
             PixelHistograms(counts[part].reshape(n, -1), outside[part].ravel()),
             job.axes,
-            job.effects,
-            None if satellites is None else (satellites[0][part].ravel(), satellites[1][part].ravel()),
+            fitted_law(store, [values[part] for values in maps], tile.region),
+            fitted_satellites(store, tile.region),
             None if covariance is None else covariance[part].reshape(n, 4, 4),
-            None if added is None else added.of(part).flat(),
-            pixel_places(store, (slice(tile.y0, tile.y1), slice(tile.x0, tile.x1))),
         )
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size
@@ -320,7 +311,7 @@ def _count(
     return counts, under + over
 
 
-def _compare(job: _Job, band: Band, maps: tuple[NDArray[np.float64], ...]) -> dict[str, ErrorTally]:
+def _compare(job: _Job, band: Band) -> dict[str, ErrorTally]:
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
@@ -331,11 +322,12 @@ def _compare(job: _Job, band: Band, maps: tuple[NDArray[np.float64], ...]) -> di
     if known <= first:
         return found
     columns = slice(x0, x0 + job.source.shape[2])
+    tables = read_tables(store, slice(band.y0, band.y1))
     with _stream(job, band, (first, known)) as stream:
         for t, (block,) in stream:
             times = slice(t0 + t, t0 + t + block.shape[0])
             true = store.read("truth/electron_number", (times, slice(y0 + band.y0, y0 + band.y1), columns))
-            numbers = electron_numbers(block, *maps)
+            numbers = tables.convert(block).number
             for key in band.keys:
                 tile = job.tiles[key][1]
                 part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))

@@ -6,22 +6,18 @@ counts the same: its samples are divided by their number before they are added.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
-from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.electrons.electrons import cell_probabilities, electron_counts
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, tally
 from pchem_pipeline.model.ensemble.extended_ensemble import extended_sums
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps
 
 __all__ = ["PixelHistograms", "ensemble_tile"]
 
@@ -54,11 +50,9 @@ def ensemble_tile(
     chosen: PixelHistograms,
     everything: PixelHistograms,
     axes: EnsembleAxes,
-    effects: Sequence[Effect] = (),
+    law: SampleLaw | None = None,
     satellites: tuple[FloatArray, FloatArray] | None = None,
     covariance: FloatArray | None = None,
-    added: AddedExposure | None = None,
-    places: PixelPlaces | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return what some pixels add to the ensemble.
 
@@ -67,12 +61,10 @@ def ensemble_tile(
         origin: DN of bin 0 of their histograms, shape (n,).
         chosen: histograms of the chosen frames.
         everything: histograms of all frames, on the same bins.
-        axes: axes of the ensemble.
-        effects: of the run's model, the axes being ``extended`` where there are any.
+        axes: axes of the ensemble, ``extended`` where the law is that of a model with effects.
+        law: of the samples; None: that of the PCD.
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
         covariance: of the maps, shape (n, 4, 4); None: not known.
-        added: exposure that the effects add to the pixels, (j, n); None: nothing.
-        places: of the pixels; None: not known.
 
     Returns:
         A row of integers and a row of floats, in the places that ``axes`` gives.
@@ -80,76 +72,65 @@ def ensemble_tile(
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)
     pixels, mask = PixelParameters.from_maps(maps)
-    added = None if added is None else added.of(mask)
-    places = None if places is None else places.of(mask)
-    deciding = PixelParameters(*deciding_maps(pixels.columns(), effects, added, places))
+    law = (law or SampleLaw()).of(mask)
+    satellites = None if satellites is None else (satellites[0][mask], satellites[1][mask])
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
     chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
-    if covariance is not None and not effects:
+    if covariance is not None and not axes.extended:
         errors = curve_errors(pixels, covariance[mask], axes.dn, axes.nuced)
         for name, variance in zip(MODEL_ERRORS, errors, strict=True):
             floats[axes.floats[name]] = variance
     samples, samples_all = chosen.samples, everything.samples
     pairs = np.stack([samples, samples_all], axis=1)
     for n, n_all in np.unique(pairs, axis=0):
+        if n == 0:
+            continue
         group = (samples == n) & (samples_all == n_all)
-        part, decider = (
-            PixelParameters(*(column[group] for column in each.columns())) for each in (pixels, deciding)
-        )
+        part = PixelParameters(*(column[group] for column in pixels.columns()))
+        own = None if satellites is None else (satellites[0][group], satellites[1][group])
         sets = (chosen.of(group), int(n)), (everything.of(group), int(n_all))
-        if n > 0:
-            _add_group(part, decider, origin[group], *sets, axes, integers, floats)
-            if effects:
-                own = None if satellites is None else (satellites[0][mask][group], satellites[1][mask][group])
-                more = None if added is None else added.of(group)
-                law = effects, more, None if places is None else places.of(group)
-                _add_extended(part, own, int(n), axes, law, floats)
+        tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, origin[group], *sets, axes)
+        for name, tallied in tallies.items():
+            integers[axes.integers[name]] += tallied
+        for name, summed in parts.items():
+            floats[axes.floats[name]] += summed
     return integers, floats
 
 
-def _add_extended(
-    pixels: PixelParameters,
-    satellites: tuple[FloatArray, FloatArray] | None,
-    n: int,
-    axes: EnsembleAxes,
-    law: tuple[Sequence[Effect], AddedExposure | None, PixelPlaces | None],
-    floats: FloatArray,
-) -> None:
-    """Add what the extended law predicts of pixels that have the same number of samples."""
-    effects, added, places = law
-    maps = pixel_maps(pixels.columns(), np.ones(len(pixels), bool))
-    model = sample_law(effects, maps, added, places)
-    extended = extended_sums(pixels, satellites, model, axes.dn, axes.nuced)
-    sums = extended.sums
-    parts: dict[str, Any] = {
+def _predicted(known: KnownPixels, pixels: PixelParameters, n: int, axes: EnsembleAxes) -> dict[str, Any]:
+    """Return what the law predicts of pixels that have n samples each."""
+    parts: dict[str, Any] = {}
+    if axes.extended:
+        extended = extended_sums(pixels, known.satellites, known.law, axes.dn, axes.nuced)
+        sums = extended.sums
+        parts["nuced_predicted_sum"] = extended.nuced_sum
+        parts["nuced_predicted_sum_square"] = extended.nuced_sum_square
+    else:
+        sums = ensemble_sums(pixels, axes.dn, axes.nuced)
+    return parts | {
         "pcd": sums.raw,
         "pcd_variance": (sums.raw - sums.raw_square) / n,
         "nuced": sums.nuced,
         "nuced_variance": (sums.nuced - sums.nuced_square) / n,
-        "nuced_predicted_sum": extended.nuced_sum,
-        "nuced_predicted_sum_square": extended.nuced_sum_square,
     }
-    for name, part in parts.items():
-        floats[axes.floats[name]] += part
 
 
-def _add_group(
+def _group_sums(
+    known: KnownPixels,
     pixels: PixelParameters,
-    deciding: PixelParameters,
     origin: NDArray[np.integer[Any]],
     chosen: tuple[PixelHistograms, int],
     everything: tuple[PixelHistograms, int],
     axes: EnsembleAxes,
-    integers: NDArray[np.int64],
-    floats: FloatArray,
-) -> None:
-    """Add pixels that have the same number of samples; ``deciding`` gives their electron numbers."""
+) -> tuple[dict[str, NDArray[np.int64] | int], dict[str, Any]]:
+    """Return the tallies and sums of pixels that have the same number of samples."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
     data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
     data_all = tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
-    numbers, beyond = electron_counts(histograms.counts, origin, deciding, axes.n_k)
-    cells = cell_probabilities(deciding, axes.n_k)
+    tables = number_tables(*known.codes(histograms.counts, origin), known.exposure, known, detailed=True)
+    numbers, beyond = tables.tally(histograms.counts, origin, axes.n_k)
+    expected = tables.outcomes(axes.n_k)
     outside = int(histograms.outside.sum())
     tallies: dict[str, NDArray[np.int64] | int] = {
         "counts": data.raw,
@@ -166,21 +147,10 @@ def _add_group(
         "share_all": data_all.raw / n_all,
         "nuced_share": data.nuced / n,
         "electron_share": numbers / n,
-        "electron_expected": cells.estimated,
+        "electron_expected": expected.estimated,
         "nuced_sum": data.nuced_sum / n,
         "nuced_sum_square": data.nuced_sum_square / n,
-        "error": cells.error.sum(),
-        "error_variance": np.sum(cells.error * (1.0 - cells.error)),
+        "error": expected.error.sum(),
+        "error_variance": np.sum(expected.error * (1.0 - expected.error)),
     }
-    if not axes.extended:
-        sums = ensemble_sums(pixels, axes.dn, axes.nuced)
-        parts |= {
-            "pcd": sums.raw,
-            "pcd_variance": (sums.raw - sums.raw_square) / n,
-            "nuced": sums.nuced,
-            "nuced_variance": (sums.nuced - sums.nuced_square) / n,
-        }
-    for name, tallied in tallies.items():
-        integers[axes.integers[name]] += tallied
-    for name, part in parts.items():
-        floats[axes.floats[name]] += part
+    return tallies, parts | _predicted(known, pixels, n, axes)

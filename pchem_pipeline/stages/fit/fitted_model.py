@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
-from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
+from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.run.model_versions import Region, model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
 
@@ -18,9 +19,17 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.model.law.sample_law import SampleLaw
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["deciding_maps", "fitted_added_exposure", "fitted_effects", "pixel_places"]
+__all__ = [
+    "fitted_added_exposure",
+    "fitted_effects",
+    "fitted_law",
+    "fitted_pixels",
+    "fitted_satellites",
+    "pixel_places",
+]
 
 
 def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
@@ -50,24 +59,37 @@ def pixel_places(store: RunStore, region: Region | None = None) -> PixelPlaces:
     return PixelPlaces.of_block(region, sensor.shape, np.arange(frames))
 
 
-def deciding_maps(
+def fitted_law(
+    store: RunStore,
     maps: Sequence[NDArray[np.float64]],
-    effects: Sequence[Effect],
-    added: AddedExposure | None = None,
-    places: PixelPlaces | None = None,
-) -> tuple[NDArray[np.float64], ...]:
-    """Return the parameters with which electron numbers are decided: the maps themselves without effects.
+    region: Region | None = None,
+    *,
+    without: Sequence[str] = (),
+) -> SampleLaw:
+    """Return the law of the samples of the pixels of a region, under the model of the stored fit.
 
     Args:
-        maps: fitted (H, g, mu, sigma), each of the same shape; NaN where the fit failed.
-        effects: with which they were fitted.
-        added: exposure that these add to the pixels, a pixel for each of the maps; None: nothing.
-        places: of these pixels; None: not known.
-
-    Returns:
-        The four, in that shape; with effects those of the nearest PCD.
+        store: the run.
+        maps: fitted (H, g, mu, sigma) of the region; NaN where the fit failed.
+        region: of the sensor; None: all of it.
+        without: tags of effects to leave out.
     """
-    if not effects:
-        return tuple(maps)
-    model = sample_law(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), added, places)
-    return tuple(values.reshape(maps[0].shape) for values in nearest_pcd(list(maps), model))
+    effects = [effect for effect in fitted_effects(store) if effect.tag not in without]
+    known = pixel_maps(maps, np.ones(maps[0].shape, bool))
+    return sample_law(effects, known, fitted_added_exposure(store, region), pixel_places(store, region))
+
+
+def fitted_satellites(
+    store: RunStore, region: Region | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return amplitude (e-) and weight of the free satellites of a region, shape (n,); None: none."""
+    if not all(store.has(f"fit/{name}") for name in FREE_SATELLITES):
+        return None
+    amplitude, weight = (store.read(f"fit/{name}", region).ravel() for name in FREE_SATELLITES)
+    return amplitude, weight
+
+
+def fitted_pixels(store: RunStore, region: Region | None = None) -> KnownPixels:
+    """Return what the stored fit says of the pixels of a region."""
+    maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
+    return KnownPixels(maps, fitted_law(store, maps, region), fitted_satellites(store, region))

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps
 from pchem_pipeline.stages.report.stored import FittedModel
 
 if TYPE_CHECKING:
@@ -226,7 +227,7 @@ def _multiple_of_exposure(store: RunStore, variable: Variable) -> tuple[str, flo
 def deciding_parameters(
     columns: Sequence[NDArray[np.float64]], model: FittedModel
 ) -> NDArray[np.float64] | None:
-    """Return the parameters that decide electron numbers, (4, n); None where these are the fitted ones.
+    """Return the parameters whose thresholds are drawn, (4, n); None where these are the fitted ones.
 
     Args:
         columns: (H, g, mu, sigma) of n pixels, NaN without parameters.
@@ -239,5 +240,6 @@ def deciding_parameters(
     if known.size:
         some = model.at(known)
         kept = [column[known] for column in columns]
-        deciding[:, known] = deciding_maps(kept, some.effects, some.added, some.places)
+        maps = pixel_maps(kept, np.ones(known.size, bool))
+        deciding[:, known] = nearest_pcd(kept, sample_law(some.effects, maps, some.added, some.places))
     return deciding

@@ -14,11 +14,10 @@ from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
 from pchem_pipeline.effects.framework.compose import model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect, Plane
-from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
+from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.fit.fit import fit_tile
-from pchem_pipeline.stages.fit.fitted_model import deciding_maps
 
 
 class Broken(Effect):
@@ -95,7 +94,7 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
     assert np.isnan(extended["satellite_amplitude_e"]).all()
 
 
-def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> None:
+def test_the_nearest_pcd_has_the_whole_width_of_the_peaks() -> None:
     columns = [
         np.array([2.0, np.nan]),
         np.array([0.1, np.nan]),
@@ -115,7 +114,3 @@ def test_electron_numbers_are_decided_with_the_whole_width_of_the_peaks() -> Non
     # satellites at -1 and 2 DN have the variance 2.25; the electrons' in e-^2 counts a hundredfold in DN^2
     assert sigma[0] ** 2 == pytest.approx(2.5**2 + 1.0 + 2.25 + 100 * (0.01 + 0.01 + 0.004))
     assert np.isnan([gain[1], bias[1], sigma[1]]).all()
-    maps = [np.array([[2.0]]), np.array([[0.1]]), np.array([[100.0]]), np.array([[2.5]])]
-    assert deciding_maps(maps, ()) == tuple(maps)
-    wider = deciding_maps(maps, [RowNoise(row_noise_dn=1.0)])
-    np.testing.assert_allclose([w.item() for w in wider], [2.0, 0.1, 100.0, np.hypot(2.5, 1.0)])

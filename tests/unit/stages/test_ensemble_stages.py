@@ -17,9 +17,10 @@ from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_execu
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.model.electrons.electrons import NO_NUMBER, electron_numbers
+from pchem_pipeline.model.electrons.electrons import NO_NUMBER
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
@@ -255,7 +256,13 @@ def test_electron_stack(finished: StageContext) -> None:
     frames = np.load(finished.base_dir / "frames" / "frames.npy")
     maps = [finished.store.read(f"fit/{name}") for name in PARAMETERS]
     found = finished.store.read("electrons/electron_number")
-    np.testing.assert_array_equal(found, electron_numbers(frames, *maps))
+    # the thresholds of the density, but for codes that lie on one
+    edges = thresholds(*maps, 60)
+    fitted = np.isfinite(edges).all(axis=-1)
+    near = np.abs(edges - frames[..., None]).min(axis=-1) < 0.1
+    sure = fitted & ~near
+    np.testing.assert_array_equal(found[sure], (edges < frames[..., None]).sum(axis=-1)[sure])
+    assert sure.mean() > 0.9
     assert (found[:, *FAILED_PIXEL] == NO_NUMBER).all()
     attributes = dict(finished.store.array("electrons/electron_number").attrs)
     assert attributes["no_number"] == NO_NUMBER

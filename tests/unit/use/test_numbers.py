@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 from helpers.known_camera import KnownCamera
 
+from pchem_pipeline.model.electrons.electrons import number_tables, number_type
 from pchem_pipeline.model.histogram.count import histogram_frames
-from pchem_pipeline.use.numbers import number_tables, number_type
 
 BYTE = np.dtype(np.uint8)
 
 
 def converted(frames, prior, calibration, dtype=BYTE):
     ends = frames.min(axis=0), frames.max(axis=0)
-    return number_tables(*ends, prior, calibration, dtype=dtype).convert(frames, expected=True)
+    return number_tables(*ends, prior, calibration.known, dtype=dtype, detailed=True).convert(
+        frames, expected=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +111,9 @@ def test_parts_of_a_dn_give_the_same_as_whole_ones():
     calibration, prior = camera.calibration(), np.full((5, 6), 2.0)
     whole = converted(frames, prior, calibration)
     fine = frames.astype(np.uint32) * 4
-    tables = number_tables(fine.min(axis=0), fine.max(axis=0), prior, calibration, dtype=BYTE, parts=4)
+    tables = number_tables(
+        fine.min(axis=0), fine.max(axis=0), prior, calibration.known, dtype=BYTE, parts=4, detailed=True
+    )
     parts = tables.convert(fine, expected=True)
     np.testing.assert_array_equal(parts.number, whole.number)
     np.testing.assert_allclose(parts.probability, whole.probability, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Electron numbers: the threshold table against the memberships it stands for."""
+"""Electron numbers: the tables against plain sums over k and codes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from scipy.stats import norm, poisson
 from pchem_pipeline.model.electrons.electrons import (
     LARGEST_NUMBER,
     NO_NUMBER,
-    cell_probabilities,
+    KnownPixels,
     compare_electron_numbers,
-    electron_counts,
-    electron_numbers,
-    electrons_numba,
-    thresholds,
+    number_tables,
 )
-from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.model.law.pcd import thresholds
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 CASES = [
     (0.05, 0.1, 100.0, 3.0),
@@ -28,10 +26,28 @@ CASES = [
 
 
 def membership_argmax(x: np.ndarray, h: float, g: float, mu: float, sigma: float) -> np.ndarray:
-    """Largest membership by trying all k, eq. gamma_nk."""
+    """Largest membership by trying all k, eq. gamma_nk, of the density."""
     k = np.arange(400)
     log_weight = poisson.logpmf(k, h) + norm.logpdf(x[:, None], mu + k / g, sigma)
     return np.asarray(log_weight.argmax(axis=1))
+
+
+def joint_masses(x: np.ndarray, h: float, g: float, mu: float, sigma: float, n_k: int = 400) -> np.ndarray:
+    """P(k, x) of whole codes, shape (k, code), by differences of the nearer tail."""
+    k, analog = np.arange(n_k)[:, None], np.sqrt(sigma**2 - 1 / 12)
+    low, high = ((x + side - mu - k / g) / analog for side in (-0.5, 0.5))
+    inside = np.where(low > 0, norm.sf(low) - norm.sf(high), norm.cdf(high) - norm.cdf(low))
+    return np.asarray(poisson.pmf(k, h) * inside)
+
+
+def known(*columns: np.ndarray) -> KnownPixels:
+    return KnownPixels(columns, SampleLaw())
+
+
+def converted(frames: np.ndarray, pixels: KnownPixels) -> np.ndarray:
+    """Electron numbers of frames (frame, y, x) under their fitted exposure."""
+    ends = frames.min(axis=0), frames.max(axis=0)
+    return number_tables(*ends, pixels.exposure, pixels).convert(frames).number
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -50,18 +66,18 @@ def test_the_paper_s_example_is_not_centred() -> None:
     assert edges[0] < 0.5 < edges[2] - 2
 
 
-def frames_of(case: tuple[float, ...], rng: np.random.Generator, spread: int) -> np.ndarray:
-    return rng.integers(int(case[2]) - 30, int(case[2]) + spread, size=(50, 3, 4)).astype(np.uint16)
-
-
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("spread", [200, 6000])
-def test_frames_are_converted_by_the_table(case: tuple[float, ...], spread: int) -> None:
-    # 6000 DN is longer than the table of a pixel, so both ways through the kernel are taken
-    frames = frames_of(case, np.random.default_rng(5), spread)
-    maps = [np.full((3, 4), value) for value in case]
-    expected = np.searchsorted(thresholds(*case, 1000), frames.ravel()).reshape(frames.shape)
-    np.testing.assert_array_equal(electron_numbers(frames, *maps), expected)
+def test_codes_have_the_number_of_largest_joint_mass(case: tuple[float, ...]) -> None:
+    x = np.arange(int(case[2]) - 30, int(case[2]) + 300)
+    joint = joint_masses(x, *case)
+    found = converted(x[:, None, None].astype(np.uint16), known(*(np.full((1, 1), v) for v in case))).ravel()
+    seen = joint.max(axis=0) > 1e-290  # the others are never seen: any number will do
+    np.testing.assert_array_equal(found[seen], joint.argmax(axis=0)[seen])
+    assert seen.sum() > 50
+    # the thresholds of the density differ by no more than what they lie from a code
+    edges = thresholds(*case, 399)
+    near = np.abs(edges[:, None] - x).min(axis=0) < 0.1
+    np.testing.assert_array_equal(found[seen & ~near], np.searchsorted(edges, x)[seen & ~near])
 
 
 def test_pixels_without_parameters_have_no_number() -> None:
@@ -69,75 +85,96 @@ def test_pixels_without_parameters_have_no_number() -> None:
     maps = [np.array([[v, v, v]]) for v in (2.0, 0.1, 100.0, 3.0)]
     maps[1][0, 1] = np.nan
     maps[0][0, 2] = np.inf
-    result = electron_numbers(frames, *maps)
-    np.testing.assert_array_equal(result[:, 0], [[3, NO_NUMBER, NO_NUMBER]] * 2)
+    np.testing.assert_array_equal(converted(frames, known(*maps))[:, 0], [[3, NO_NUMBER, NO_NUMBER]] * 2)
 
 
 def test_no_exposure_means_no_electrons_and_huge_numbers_are_cut() -> None:
-    frames = np.array([[[100, 65535]]], dtype=np.uint16)
     one = np.ones((1, 2))
-    np.testing.assert_array_equal(electron_numbers(frames, 0 * one, 0.1 * one, 50 * one, 3 * one), [[[0, 0]]])
-    large = electron_numbers(frames, 1000 * one, 2.0 * one, 50 * one, 0.1 * one)
+    frames = np.array([[[100, 5000]]], dtype=np.uint16)
+    np.testing.assert_array_equal(converted(frames, known(0 * one, 0.1 * one, 50 * one, 3 * one)), [[[0, 0]]])
+    frames = np.array([[[100, 65535]]], dtype=np.uint16)
+    large = converted(frames, known(1000 * one, 2.0 * one, 50 * one, 0.1 * one))
     assert large[0, 0, 1] == LARGEST_NUMBER
-    assert electron_numbers(frames[:0], one, one, one, one).shape == (0, 1, 2)
+
+
+def test_codes_beyond_the_table_have_no_number() -> None:
+    one = np.ones((1, 1))
+    low, high = np.full((2, 1, 1), [[[90]], [[130]]])
+    pixels = known(2 * one, 0.1 * one, 100 * one, 3 * one)
+    tables = number_tables(low, high, pixels.exposure, pixels)
+    frames = np.array([89, 90, 130, 131], np.uint16)[:, None, None]
+    np.testing.assert_array_equal(tables.convert(frames).number.ravel(), [NO_NUMBER, 0, 3, NO_NUMBER])
 
 
 def test_a_tie_goes_to_the_smaller_number() -> None:
     # H = 1: the boundary between 0 and 1 is exactly half-way, mu + 1/(2 g) = 105
     frames = np.array([[[105, 106]]], dtype=np.uint16)
-    maps = [np.full((1, 2), v) for v in (1.0, 0.1, 100.0, 3.0)]
-    np.testing.assert_array_equal(electron_numbers(frames, *maps), [[[0, 1]]])
-
-
-def test_compiled_and_plain_conversion_agree() -> None:
-    frames = frames_of(CASES[1], np.random.default_rng(6), 5000)[:8]
-    maps = [np.full((3, 4), value) for value in CASES[1]]
-    maps[1][0, 0] = np.nan
-    plain = np.empty(frames.shape, dtype=np.uint16)
-    electrons_numba.convert_frames.py_func(frames, *maps, LARGEST_NUMBER, NO_NUMBER, plain)
-    np.testing.assert_array_equal(electron_numbers(frames, *maps), plain)
+    maps = [np.full((1, 2), v) for v in (1.0, 0.125, 101.0, 3.0)]
+    np.testing.assert_array_equal(converted(frames, known(*maps)), [[[0, 1]]])
 
 
 def test_histograms_and_frames_give_the_same_numbers() -> None:
     rng = np.random.default_rng(7)
     frames = rng.integers(60, 250, size=(300, 1, 5)).astype(np.uint16)
     rows = np.array(CASES).T[:, None, :]
-    numbers = electron_numbers(frames, *rows)
-    pixels = PixelParameters(*(row[0] for row in rows))
+    numbers = converted(frames, known(*rows))
+    pixels = known(*rows[:, 0])
     counts = np.stack([np.bincount(frames[:, 0, x] - 60, minlength=200) for x in range(5)])
-    found, beyond = electron_counts(counts, np.full(5, 60), pixels, 12)
+    origin = np.full(5, 60)
+    codes = pixels.codes(counts, origin)
+    assert (codes[0] <= frames.min(axis=0)[0]).all()
+    assert (codes[1] >= frames.max(axis=0)[0]).all()
+    found, beyond = number_tables(*codes, pixels.exposure, pixels).tally(counts, origin, 12)
     everything = np.bincount(numbers.ravel(), minlength=12)
     np.testing.assert_array_equal(found, everything[:12])
     assert beyond == everything[12:].sum()
 
 
-def test_cell_probabilities_are_those_of_all_integers() -> None:
-    pixels = PixelParameters(*np.array(CASES).T.copy())
-    other = PixelParameters(
-        pixels.quanta_exposure * 1.1,
-        pixels.conversion_gain * 1.02,
-        pixels.bias + 0.7,
-        pixels.read_noise_dn * 0.9,
-    )
-    k = np.arange(200)
-    for used in (pixels, other):
+def test_outcomes_are_those_of_all_integers() -> None:
+    truth = np.array(CASES).T.copy()
+    other = truth * np.array([1.1, 1.02, 1.0, 0.9])[:, None] + np.array([0, 0, 0.7, 0])[:, None]
+    data = known(*truth)
+    for used in (truth, other):
         total, errors = np.zeros(60), []
-        for true, guess in zip(
-            zip(*pixels.columns(), strict=True), zip(*used.columns(), strict=True), strict=True
-        ):
-            h, g, mu, sigma = true
-            x = np.arange(int(mu) - 150, int(mu) + 1500)
-            analog = np.sqrt(sigma**2 - 1 / 12)
-            centres = mu + k[:, None] / g
-            joint = poisson.pmf(k, h)[:, None] * (
-                norm.cdf(x + 0.5, centres, analog) - norm.cdf(x - 0.5, centres, analog)
-            )
-            cell = np.searchsorted(thresholds(*guess, 399), x)
-            total += np.bincount(cell, weights=joint.sum(axis=0), minlength=60)[:60]
-            errors.append(1.0 - joint[cell.clip(max=199), np.arange(x.size)].sum())
-        result = cell_probabilities(pixels, 60, used)
+        for true, guess in zip(truth.T, used.T, strict=True):
+            x = np.arange(int(true[2]) - 150, int(true[2]) + 1500)
+            joint = joint_masses(x, *true, n_k=200)
+            number = joint_masses(x, *guess, n_k=200).argmax(axis=0)
+            total += np.bincount(number, weights=joint.sum(axis=0), minlength=60)[:60]
+            errors.append(1.0 - joint[number, np.arange(x.size)].sum())
+        decided = known(*used)
+        result = number_tables(*data.codes(), decided.exposure, decided).outcomes(60, data)
         np.testing.assert_allclose(result.estimated, total, atol=1e-11)
         np.testing.assert_allclose(result.error, errors, atol=1e-11)
+    whole = number_tables(*data.codes(), data.exposure, data, detailed=True)
+    own, again = whole.outcomes(60), whole.outcomes(60, data)
+    np.testing.assert_allclose(own.estimated, again.estimated, atol=1e-13)
+    np.testing.assert_allclose(own.error, again.error, atol=1e-13)
+
+
+def test_numbers_are_decided_with_the_effects_of_the_law() -> None:
+    # side peaks of half of the weight at 0.5 e- above, and an exposure added to half of the frames
+    h, g, mu, sigma = 0.8, 0.1, 100.0, 1.2
+    law = SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])
+    law = law.with_added_exposure([[0.0, 1.5]], [[0.5, 0.5]])
+    x = np.arange(92, 480)
+    joint = sum(
+        0.25 * joint_masses(x - 5 * side, lam, g, mu, sigma, 40) for side in (0, 1) for lam in (h, h + 1.5)
+    )
+    columns = [np.array([v]) for v in (h, g, mu, sigma)]
+    pixels = KnownPixels(columns, law)
+    tables = number_tables(x[:1], x[-1:], pixels.exposure, pixels, detailed=True)
+    np.testing.assert_array_equal(tables.number, joint.argmax(axis=0))
+    np.testing.assert_allclose(tables.mass, joint.sum(axis=0), rtol=1e-6, atol=1e-16)
+    np.testing.assert_allclose(tables.right, joint.max(axis=0), rtol=1e-6, atol=1e-16)
+    mean = (np.arange(40)[:, None] * joint).sum(axis=0) / joint.sum(axis=0)
+    np.testing.assert_allclose(tables.expected, mean, rtol=1e-6, atol=1e-12)
+    result = number_tables(*pixels.codes(), pixels.exposure, pixels).outcomes(10, pixels)
+    assert result.error[0] == pytest.approx(1.0 - joint.max(axis=0).sum(), abs=1e-10)
+    # the PCD alone errs more often in these data
+    plain = known(*columns)
+    wrong = number_tables(*pixels.codes(), plain.exposure, plain).outcomes(10, pixels)
+    assert wrong.error[0] > result.error[0] + 0.02
 
 
 def test_comparison_with_the_truth() -> None:

@@ -15,6 +15,7 @@ from pchem_pipeline.model.ensemble.ensemble import (
     nuced_axis,
     tally,
 )
+from pchem_pipeline.model.law import normal_numba
 from pchem_pipeline.model.maps.pixels import PixelParameters, usable_pixels
 
 
@@ -105,7 +106,7 @@ def test_compiled_and_plain_kernels_agree() -> None:
         kernel(*pixels.columns(), 50, raw, square, axis.width, axis.start, bins, bins_square)
         results.append(np.concatenate([raw, square, bins, bins_square]))
     np.testing.assert_allclose(*results, rtol=1e-13)
-    for kernel in (ensemble_numba.add_density, ensemble_numba.add_mass):
+    for kernel in (normal_numba.add_density, normal_numba.add_mass):
         outs = np.zeros((2, 60))
         kernel(outs[0], 3.0, 0.7, 20.2, 2.5)
         kernel.py_func(outs[1], 3.0, 0.7, 20.2, 2.5)

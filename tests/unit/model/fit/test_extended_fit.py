@@ -10,7 +10,7 @@ from helpers.extended_reference import LAWS
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from pchem_pipeline.model.electrons.extended_electrons import nearest_pcd
+from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
@@ -210,7 +210,6 @@ def test_exposure_that_is_added_leaves_h_as_it_is_without() -> None:
     assert ((plain.quanta_exposure - truth[0]) / stderr(extended)[:, 0])[every < 4].mean() > 10
     same = fit_histograms(counts, origins(100), law=SampleLaw(), start=plain)
     np.testing.assert_array_equal(columns(extended)[every == 4], columns(same)[every == 4])
-    # electron numbers are decided with the mean exposure
     mean = nearest_pcd(columns(extended).T.tolist(), model.of(every))[0]
     np.testing.assert_allclose(mean, columns(extended)[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
 

@@ -13,17 +13,16 @@ from scipy.stats import norm
 
 from pchem_pipeline.model.fit.api import satellite_threshold
 from pchem_pipeline.model.law import cells_numba, pixel_numba
-from pchem_pipeline.model.law.electron_laws_numba import (
-    FARTHEST,
-    STEPS,
-    _one_law,
-    electron_number,
-    fill_normal_table,
-    normal_tail,
-)
+from pchem_pipeline.model.law.electron_laws_numba import _one_law, electron_number
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
 from pchem_pipeline.model.law.mass import log_likelihood, sample_mass
+from pchem_pipeline.model.law.normal_numba import (
+    FARTHEST,
+    STEPS,
+    fill_normal_table,
+    normal_tail,
+)
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

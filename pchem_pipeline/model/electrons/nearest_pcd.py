@@ -1,4 +1,4 @@
-"""The PCD that comes nearest to an extended law: what electron numbers are decided with."""
+"""The PCD that comes nearest to an extended law: thresholds of a drawing, and the width of peaks."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ __all__ = ["nearest_pcd"]
 def nearest_pcd(parameters: Parameters, model: SampleLaw) -> tuple[FloatArray, ...]:
     """Return (H, g, mu, sigma) of the PCD whose peaks lie and widen as the extended law's do near k = H.
 
-    The thresholds between electron numbers (Hendrickson et al. 2023, eq. demarg_K_eqn) need the levels and
-    the whole width of the peaks, that of the named effects included, which the fitted read noise leaves out.
-    Free satellites are levels beside the peaks, not part of their width.
+    It has the levels and the whole width of the peaks, that of the named effects included, which the fitted
+    read noise leaves out. Free satellites are levels beside the peaks, not part of their width.
 
     Args:
         parameters: fitted (H, g, mu, sigma) of the n pixels of the law, NaN where there are none.

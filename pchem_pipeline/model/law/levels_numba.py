@@ -1,0 +1,247 @@
+"""What each electron number of a known pixel gives to its codes.
+
+With g, mu and sigma held, ``P(x) = sum_k P(k; H) W_k(x)`` under any law of the samples
+(:mod:`pchem_pipeline.model.law.sample_law`), and only P(k; H) depends on the exposure. W is made once for a
+pixel. A code may be a whole DN or a fraction of one (``1 / parts``) where an offset was taken from the
+samples: the cell of a sample is still 1 DN wide.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cells_of, component, resolve
+from pchem_pipeline.model.law.electron_laws_numba import electron_number
+from pchem_pipeline.model.law.normal_numba import FARTHEST, REACH, normal_tail, tail_difference
+from pchem_pipeline.model.law.pixel_numba import (
+    ADDED_EXPOSURE,
+    CLIP_HIGH,
+    CLIP_LOW,
+    EDGE,
+    EXPOSURE_FACTOR,
+    FIRST,
+    N_BINS,
+    SHARE,
+    SHARE_SLOPE,
+    Pixel,
+)
+
+__all__ = [
+    "Codes",
+    "Levels",
+    "fill_level",
+    "list_levels",
+    "number_mass",
+    "number_range",
+    "place_codes",
+    "reach_of_law",
+]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_TOP_REACH = 12.0
+_SEEN = 7.5  # standard deviations within which samples are seen
+_NO_EXPOSURE = 1e-300  # e-; stands for none
+_LEAST_MASS = 1e-14  # of an electron number that is looked at
+
+
+class Codes(NamedTuple):
+    """Codes of a pixel: ``first + i / parts`` DN after a whole code, i < n."""
+
+    first: float
+    parts: int
+    n: int
+
+
+class Levels(NamedTuple):
+    """What electron numbers give to codes.
+
+    Attributes:
+        number: electron numbers that reach the codes, increasing, shape (m,).
+        low, high: first code of each, and the one after its last.
+        start: place of its first code in ``share``.
+        share: P(code | electron number), one number after the other.
+    """
+
+    number: IntArray
+    low: IntArray
+    high: IntArray
+    start: IntArray
+    share: FloatArray
+
+
+@kernel
+def place_codes(
+    index: int,
+    first: int,
+    n: int,
+    parts: int,
+    law: Law,
+    satellites: FloatArray,
+    pixel: Pixel,
+) -> tuple[Pixel, Codes]:
+    """Fill what the law says of a pixel whose codes are ``(first + i) / parts`` DN; return both."""
+    value = first / parts
+    whole = math.floor(value + 0.5)
+    codes = Codes(value - whole, parts, n)
+    n_whole = math.floor(codes.first + (n - 1) / parts + 0.5) + 1
+    pixel.facts[0, N_BINS], pixel.facts[0, FIRST] = float(n_whole), 0.0
+    found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.table, whole, 0.0)
+    resolve(law, index, satellites[index, 0], found)
+    return found, codes
+
+
+@kernel
+def number_mass(k: int, exposure: float, cells: Cells) -> float:
+    """Return P(k; H) of a pixel; H may be 0."""
+    mass: float = electron_number(
+        cells.count_law, cells.dispersion, k, max(exposure, _NO_EXPOSURE), cells.mixtures
+    )[0]
+    return mass
+
+
+@kernel
+def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, int, float]:
+    """Return the codes that an electron number reaches, ends excluded, and how far up it lies at least."""
+    low, high = codes.n, 0
+    nearest = math.inf
+    for peak in range(cells.n_peaks):
+        if cells.peaks[SHARE, peak] == 0.0 and cells.peaks[SHARE_SLOPE, peak] == 0.0:
+            continue
+        part = component(float(k), peak, theta, cells, REACH)
+        reach = min(FARTHEST, max(REACH, theta[1] / part.sd)) * part.sd + 0.5 + cells.margin
+        bottom, top = part.mean - reach - codes.first, part.mean + reach - codes.first
+        nearest = min(nearest, bottom + codes.first)
+        low = min(low, int(min(max(math.ceil(bottom * codes.parts), 0.0), float(codes.n))))
+        high = max(high, int(min(max(math.floor(top * codes.parts) + 1.0, 0.0), float(codes.n))))
+    # beyond the limits of the ADC all is counted at the limit
+    if cells.bottom >= 0:
+        high = max(high, min(codes.n, (cells.bottom + 1) * codes.parts))
+        low = 0 if high > 0 and nearest < codes.first else low
+    if cells.top <= cells.n_bins:
+        low = max(0, min(low, (cells.top - 1) * codes.parts - codes.parts // 2))
+        high = codes.n
+    return low, high, nearest
+
+
+@kernel
+def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, law: Law) -> tuple[int, int]:
+    """Return the first and last whole code that samples of a pixel show, after its centre."""
+    cells = cells_of(pixel, np.int64(0))
+    factor = added = 0.0
+    for i in range(cells.mixtures.shape[1]):
+        factor = max(factor, cells.mixtures[EXPOSURE_FACTOR, i])
+        added = max(added, cells.mixtures[ADDED_EXPOSURE, i])
+    margin = 1.0
+    row = index if law.edge_shift.shape[1] > 1 else 0
+    for i in range(law.edge_shift.shape[2]):
+        margin = max(margin, 1.0 + abs(law.edge_shift[0, row, i]))
+    low, high = math.inf, -math.inf
+    k = 0
+    while True:
+        seen = number_mass(k, exposure, cells) > _LEAST_MASS
+        if not seen and k > exposure * factor + added:
+            break
+        for peak in range(cells.n_peaks if seen else 0):
+            part = component(float(k), peak, theta, cells, REACH)
+            reach = _SEEN * part.sd + margin
+            low, high = min(low, part.mean - reach), max(high, part.mean + reach)
+        k += 1
+    facts = pixel.facts[0]
+    bottom, top = facts[CLIP_LOW] - pixel.centre, facts[CLIP_HIGH] - pixel.centre
+    low, high = min(max(low, bottom), top), max(min(high, top), bottom)
+    return math.floor(low), math.ceil(high)
+
+
+@kernel
+def _tail_between(lower: float, upper: float, mean: float, sd: float, table: FloatArray) -> float:
+    """Return the mass of a normal law between two values."""
+    z0, z1 = (lower - mean) / sd, (upper - mean) / sd
+    # `normal_tail` takes infinity as no tail
+    below, _ = normal_tail(z0, table)
+    above, _ = normal_tail(z1, table)
+    inside: float = tail_difference(below, above, z0, z1)
+    return inside
+
+
+@kernel
+def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
+    """Add the mass of whole codes, each of whose edges is that of the next one."""
+    inverse = 1.0 / part.sd
+    before = (cells.bins[EDGE, low] - part.mean) * inverse if low < high else 0.0
+    below, _ = normal_tail(before, cells.table)
+    for i in range(low, high):
+        z = (cells.bins[EDGE, i + 1] - part.mean) * inverse
+        above, _ = normal_tail(z, cells.table)
+        share[i - low] += weight * tail_difference(below, above, before, z)
+        before, below = z, above
+
+
+@kernel
+def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, int]:
+    """Return the first electron number that reaches the codes, and the one after the last."""
+    last = codes.first + (codes.n - 1) / codes.parts
+    to_top = cells.top <= cells.n_bins
+    most = max((last - theta[2]) / theta[1], 0.0)
+    most = most + _TOP_REACH * math.sqrt(most + 1.0) + _TOP_REACH
+    first, end = -1, 0
+    k = 0
+    while True:
+        low, high, nearest = _span(k, theta, cells, codes)
+        if (nearest > last + 1.0 and not to_top) or k > 4.0 * most + 1e3 or (to_top and k > most):
+            break
+        if low < high:
+            first = k if first < 0 else first
+            end = k + 1
+        k += 1
+    return max(first, 0), end
+
+
+@kernel
+def fill_level(k: int, theta: FloatArray, cells: Cells, codes: Codes, share: FloatArray) -> tuple[int, int]:
+    """Fill P(code | k) of the codes that an electron number reaches; return these, the end excluded.
+
+    ``share[0]`` is that of the first of them.
+    """
+    low, high, _ = _span(k, theta, cells, codes)
+    for i in range(high - low):
+        share[i] = 0.0
+    for peak in range(cells.n_peaks if low < high else 0):
+        weight = cells.peaks[SHARE, peak] + theta[4] * cells.peaks[SHARE_SLOPE, peak]
+        if weight == 0.0:
+            continue
+        part = component(float(k), peak, theta, cells, REACH)
+        if codes.parts == 1:
+            _add_whole(cells, part, weight, low, high, share)
+            continue
+        for i in range(low, high):
+            value = codes.first + i / codes.parts
+            whole = math.floor(value + 0.5)
+            aside = value - whole
+            lower, upper = cells.bins[EDGE, whole] + aside, cells.bins[EDGE, whole + 1] + aside
+            share[i - low] += weight * _tail_between(lower, upper, part.mean, part.sd, cells.table)
+    return low, max(low, high)
+
+
+@kernel
+def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
+    """Return what each electron number gives to the codes of a pixel."""
+    first, end = number_range(theta, cells, codes)
+    n, total = max(end - first, 0), 0
+    for k in range(first, end):
+        low, high, _ = _span(k, theta, cells, codes)
+        total += max(high - low, 0)
+    number, share = np.empty(n, np.int64), np.empty(total)
+    lows, highs, start = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    place = 0
+    for row in range(n):
+        low, high = fill_level(first + row, theta, cells, codes, share[place:])
+        number[row], lows[row], highs[row], start[row] = first + row, low, high, place
+        place += high - low
+    return Levels(number, lows, highs, start, share)

@@ -1,0 +1,213 @@
+"""Loops of :mod:`pchem_pipeline.use.exposure`: the exposure of largest likelihood of known pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.cells_numba import Cells, Law, cells_of
+from pchem_pipeline.model.law.electron_laws_numba import electron_number
+from pchem_pipeline.model.law.levels_numba import Codes, Levels, list_levels, place_codes
+from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
+from pchem_pipeline.model.law.pixel_numba import OWN, Pixel
+
+__all__ = ["estimate_exposures"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_LEAST_EXPOSURE = 1e-7  # e-; less is none
+_LEAST_MASS = 1e-300
+_MOST_STEPS = 200
+_PRECISION = 1e-9
+_OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
+
+
+@kernel
+def _evaluate(
+    exposure: float, cells: Cells, levels: Levels, counts: FloatArray, sums: FloatArray
+) -> tuple[float, float, float]:
+    """Return log-likelihood, its slope in log H, and the information, of histograms at an exposure.
+
+    Args:
+        exposure: H, e-.
+        cells: of the pixel.
+        levels: of the pixel.
+        counts: samples at each code.
+        sums: room, shape (3, codes).
+    """
+    for i in range(counts.size):
+        sums[0, i] = sums[1, i] = sums[2, i] = 0.0
+    for row in range(levels.number.size):
+        mass, slope, bend = electron_number(
+            cells.count_law, cells.dispersion, levels.number[row], exposure, cells.mixtures
+        )
+        low, start = levels.low[row], levels.start[row]
+        for i in range(low, levels.high[row]):
+            share = levels.share[start + i - low]
+            sums[0, i] += mass * share
+            sums[1, i] += slope * share
+            sums[2, i] += bend * share
+    loglik = score = information = 0.0
+    rest = 1.0 - cells.outlier_share
+    for i in range(counts.size):
+        if counts[i] > 0.0:
+            mass = rest * sums[0, i] + cells.outlier_mass
+            if mass > _LEAST_MASS:
+                ratio = rest * sums[1, i] / mass
+                loglik += counts[i] * math.log(mass)
+                score += counts[i] * ratio
+                information += counts[i] * (ratio * ratio - rest * sums[2, i] / mass)
+            else:
+                loglik += counts[i] * math.log(_LEAST_MASS)
+    return loglik, score, information
+
+
+@kernel
+def _climb(start: float, cells: Cells, levels: Levels, counts: FloatArray, sums: FloatArray) -> float:
+    """Return the exposure of largest likelihood; 0 where none is better than any."""
+    total = 0.0
+    for i in range(counts.size):
+        total += counts[i]
+    here = max(start, 1e-3)
+    best, height = here, -math.inf
+    for _ in range(_MOST_STEPS):
+        loglik, score, information = _evaluate(here, cells, levels, counts, sums)
+        if loglik < height - 1e-9 * abs(height):
+            here = math.sqrt(here * best)
+            if abs(here - best) < _PRECISION * best:
+                break
+            continue
+        best, height = here, loglik
+        if information > 0.0:
+            step = min(max(score / information, -1.0), 1.0)
+            ahead = here * math.exp(step)
+        else:
+            ahead = max(here + score / total, 0.1 * here)  # the EM step of a Poisson law
+        if ahead < _LEAST_EXPOSURE:
+            return 0.0
+        if abs(ahead - here) < _PRECISION * here:
+            return ahead
+        here = ahead
+    return best
+
+
+@kernel
+def _score_at(
+    exposure: float,
+    parameters: FloatArray,
+    weight: float,
+    codes: Codes,
+    pixel: Pixel,
+    theta: FloatArray,
+    counts: FloatArray,
+    sums: FloatArray,
+) -> float:
+    """Return the slope of the log-likelihood in H under other parameters."""
+    known_theta(parameters, pixel.centre, weight, theta)
+    cells = cells_of(pixel, np.int64(0))
+    levels = list_levels(theta, cells, codes)
+    _, score, _ = _evaluate(exposure, cells, levels, counts, sums)
+    slope: float = score / exposure
+    return slope
+
+
+@kernel
+def estimate_exposures(
+    counts: NDArray[Any],
+    first: IntArray,
+    parts: int,
+    parameters: FloatArray,
+    covariance: FloatArray,
+    satellites: FloatArray,
+    law: Law,
+    out: FloatArray,
+) -> None:
+    """Fill the exposure of largest likelihood with g, mu and sigma held, and its two standard errors.
+
+    Args:
+        counts: histograms, shape (n, codes).
+        first: code of bin 0, in parts of a DN, shape (n,).
+        parts: codes in a DN.
+        parameters: (H, g, mu, sigma), shape (n, 4); NaN where there are none.
+        covariance: of (g, mu, sigma), shape (n, 3, 3).
+        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
+        law: of the samples.
+        out: out, H, its standard error by counting, and that from the calibration, shape (n, 3); comes as
+            NaN.
+    """
+    n_codes = counts.shape[1]
+    room, scratch = pixel_scratch(n_codes + 2, law)
+    theta, sums, weights = scratch.small[OWN], np.empty((3, n_codes)), np.empty(n_codes)
+    moved = np.empty(4)
+    for index in range(counts.shape[0]):
+        low, high, total, moment = n_codes, 0, 0.0, 0.0
+        for i in range(n_codes):
+            weights[i] = 0.0
+            if counts[index, i] > 0:
+                low, high = min(low, i), i + 1
+                total += counts[index, i]
+        if total == 0.0:
+            continue
+        n = high - low
+        for i in range(n):
+            weights[i] = float(counts[index, low + i])
+            moment += weights[i] * i
+        pixel, codes = place_codes(index, first[index] + low, n, parts, law, satellites, room)
+        if not known_theta(parameters[index], pixel.centre, satellites[index, 1], theta):
+            continue
+        cells = cells_of(pixel, np.int64(0))
+        levels = list_levels(theta, cells, codes)
+        seen = weights[:n]
+        start = (codes.first + moment / total / parts - theta[2]) / theta[1]
+        exposure = _climb(start, cells, levels, seen, sums)
+        near = max(exposure, _LEAST_EXPOSURE)
+        _, score, information = _evaluate(near, cells, levels, seen, sums)
+        curvature = (information + score) / (near * near)
+        out[index, 0] = exposure
+        if not curvature > 0.0:
+            continue
+        out[index, 1] = 1.0 / math.sqrt(curvature)
+        out[index, 2] = _from_calibration(
+            near, score / near, curvature, parameters[index], covariance[index], satellites[index, 1],
+            codes, pixel, theta, moved, seen, sums,
+        )  # fmt: skip
+
+
+@kernel
+def _from_calibration(
+    exposure: float,
+    score: float,
+    curvature: float,
+    parameters: FloatArray,
+    covariance: FloatArray,
+    weight: float,
+    codes: Codes,
+    pixel: Pixel,
+    theta: FloatArray,
+    moved: FloatArray,
+    counts: FloatArray,
+    sums: FloatArray,
+) -> float:
+    """Return the standard error of H from those of g, mu and sigma, by the implicit function theorem."""
+    slopes = np.zeros(3)
+    for j in range(3):
+        step = _OUTSIDE * math.sqrt(covariance[j, j])
+        if not step > 0.0:
+            if step == 0.0:
+                continue
+            return math.nan
+        for i in range(4):
+            moved[i] = parameters[i]
+        moved[1 + j] += step
+        ahead = _score_at(exposure, moved, weight, codes, pixel, theta, counts, sums)
+        slopes[j] = (ahead - score) / (step * curvature)
+    variance = 0.0
+    for i in range(3):
+        for j in range(3):
+            variance += slopes[i] * covariance[i, j] * slopes[j]
+    return math.sqrt(max(variance, 0.0))
