@@ -37,6 +37,7 @@ IntArray = NDArray[np.int64]
 NO_PRIOR = -1.0
 
 _LEAST_MASS = 1e-300
+_LEAST_LIKELY = 1e-17  # of an electron number
 
 
 @kernel
@@ -118,7 +119,9 @@ def fill_tables(
         lowest, end = number_range(theta, cells, codes)
         for k in range(lowest, end):
             likely = 1.0 if prior[p] < 0.0 else number_mass(k, prior[p], cells)
-            low, high = fill_level(k, theta, cells, codes, sums[3])
+            if likely < _LEAST_LIKELY:
+                continue
+            low, high = fill_level(k, likely, theta, cells, codes, sums[3])
             for i in range(low, high):
                 joint = likely * sums[3, i - low]
                 sums[0, i] += joint
@@ -178,7 +181,9 @@ def sum_outcomes(
         lowest, end = number_range(theta, cells, codes)
         for k in range(lowest, end):
             mass = rest * number_mass(k, exposure[p], cells)
-            low, high = fill_level(k, theta, cells, codes, share)
+            if mass < _LEAST_LIKELY:
+                continue
+            low, high = fill_level(k, mass, theta, cells, codes, share)
             for i in range(low, high):
                 joint = mass * share[i - low]
                 found = np.int64(number[at + i])

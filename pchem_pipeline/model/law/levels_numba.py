@@ -97,7 +97,7 @@ def place_codes(
     return found, codes
 
 
-@kernel
+@kernel(borrows=True)
 def number_mass(k: int, exposure: float, cells: Cells) -> float:
     """Return P(k; H) of a pixel; H may be 0."""
     mass: float = electron_number(
@@ -106,8 +106,8 @@ def number_mass(k: int, exposure: float, cells: Cells) -> float:
     return mass
 
 
-@kernel
-def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, int, float]:
+@kernel(borrows=True)
+def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes, reach: float) -> tuple[int, int, float]:
     """Return the codes that an electron number reaches, ends excluded, and how far up it lies at least."""
     low, high = codes.n, 0
     nearest = math.inf
@@ -115,8 +115,8 @@ def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, i
         if cells.peaks[SHARE, peak] == 0.0 and cells.peaks[SHARE_SLOPE, peak] == 0.0:
             continue
         part = component(float(k), peak, theta, cells, REACH)
-        reach = min(FARTHEST, max(REACH, theta[1] / part.sd)) * part.sd + 0.5 + cells.margin
-        bottom, top = part.mean - reach - codes.first, part.mean + reach - codes.first
+        width = min(FARTHEST, max(reach, theta[1] / part.sd)) * part.sd + 0.5 + cells.margin
+        bottom, top = part.mean - width - codes.first, part.mean + width - codes.first
         nearest = min(nearest, bottom + codes.first)
         low = min(low, int(min(max(math.ceil(bottom * codes.parts), 0.0), float(codes.n))))
         high = max(high, int(min(max(math.floor(top * codes.parts) + 1.0, 0.0), float(codes.n))))
@@ -130,7 +130,7 @@ def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, i
     return low, high, nearest
 
 
-@kernel
+@kernel(borrows=True)
 def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, law: Law) -> tuple[int, int]:
     """Return the first and last whole code that samples of a pixel show, after its centre."""
     cells = cells_of(pixel, np.int64(0))
@@ -159,7 +159,7 @@ def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, l
     return math.floor(low), math.ceil(high)
 
 
-@kernel
+@kernel(borrows=True)
 def _tail_between(lower: float, upper: float, mean: float, sd: float, table: FloatArray) -> float:
     """Return the mass of a normal law between two values."""
     z0, z1 = (lower - mean) / sd, (upper - mean) / sd
@@ -170,7 +170,7 @@ def _tail_between(lower: float, upper: float, mean: float, sd: float, table: Flo
     return inside
 
 
-@kernel
+@kernel(borrows=True)
 def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
     """Add the mass of whole codes, each of whose edges is that of the next one."""
     inverse = 1.0 / part.sd
@@ -183,7 +183,7 @@ def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int
         before, below = z, above
 
 
-@kernel
+@kernel(borrows=True)
 def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, int]:
     """Return the first electron number that reaches the codes, and the one after the last."""
     last = codes.first + (codes.n - 1) / codes.parts
@@ -193,7 +193,7 @@ def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, in
     first, end = -1, 0
     k = 0
     while True:
-        low, high, nearest = _span(k, theta, cells, codes)
+        low, high, nearest = _span(k, theta, cells, codes, REACH)
         if (nearest > last + 1.0 and not to_top) or k > 4.0 * most + 1e3 or (to_top and k > most):
             break
         if low < high:
@@ -203,13 +203,16 @@ def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, in
     return max(first, 0), end
 
 
-@kernel
-def fill_level(k: int, theta: FloatArray, cells: Cells, codes: Codes, share: FloatArray) -> tuple[int, int]:
+@kernel(borrows=True)
+def fill_level(
+    k: int, likely: float, theta: FloatArray, cells: Cells, codes: Codes, share: FloatArray
+) -> tuple[int, int]:
     """Fill P(code | k) of the codes that an electron number reaches; return these, the end excluded.
 
-    ``share[0]`` is that of the first of them.
+    ``share[0]`` is that of the first of them. A number of the probability ``likely`` is given fewer of them.
     """
-    low, high, _ = _span(k, theta, cells, codes)
+    reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(likely), 0.0))
+    low, high, _ = _span(k, theta, cells, codes, reach)
     for i in range(high - low):
         share[i] = 0.0
     for peak in range(cells.n_peaks if low < high else 0):
@@ -235,13 +238,13 @@ def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
     first, end = number_range(theta, cells, codes)
     n, total = max(end - first, 0), 0
     for k in range(first, end):
-        low, high, _ = _span(k, theta, cells, codes)
+        low, high, _ = _span(k, theta, cells, codes, REACH)
         total += max(high - low, 0)
     number, share = np.empty(n, np.int64), np.empty(total)
     lows, highs, start = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     place = 0
     for row in range(n):
-        low, high = fill_level(first + row, theta, cells, codes, share[place:])
+        low, high = fill_level(first + row, 1.0, theta, cells, codes, share[place:])
         number[row], lows[row], highs[row], start[row] = first + row, low, high, place
         place += high - low
     return Levels(number, lows, highs, start, share)
