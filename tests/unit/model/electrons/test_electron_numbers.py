@@ -157,7 +157,7 @@ def test_numbers_are_decided_with_the_effects_of_the_law() -> None:
     h, g, mu, sigma = 0.8, 0.1, 100.0, 1.2
     law = SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])
     law = law.with_added_exposure([[0.0, 1.5]], [[0.5, 0.5]])
-    x = np.arange(92, 480)
+    x = np.arange(92, 300)
     joint = sum(
         0.25 * joint_masses(x - 5 * side, lam, g, mu, sigma, 40) for side in (0, 1) for lam in (h, h + 1.5)
     )
