@@ -10,7 +10,6 @@ probability is the union bound over the places of the family, the families, mode
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +29,8 @@ BoolArray = NDArray[np.bool_]
 
 _PERIODS = (2, 4, 8, 16, 32)
 _FEWEST_LINES = 2  # of a period
+#: Guesses that are held against the scatter of the frames, the most significant first.
+_MEASURED = 6
 #: Families of places: bands of lines, bands across them, rectangles, periods.
 _FAMILIES = 4
 
@@ -90,36 +91,37 @@ def scan_pairs(
     limits = limits or Limits()
     found: list[Shared] = []
     while len(found) < most and samples.usable.sum() > 2 * limits.fewest:
-        candidates = [
-            each
-            for channel in range(len(CHANNELS))
-            for mode, pairs in pairs_of(samples, channel).items()
-            for each in _places(samples, channel, mode, pairs, limits, math.log(significance))
-        ]
-        if not candidates:
+        best = _most_significant(samples, math.log(significance), limits)
+        if best is None:
             break
-        best = min(candidates, key=lambda each: each.place.log_p)
         found.append(best)
         shape = samples.usable.shape[0], samples.usable.shape[1]
         samples = samples.without(best.place.region.mask(shape))
     return found
 
 
-def _places(
-    samples: Samples, channel: int, mode: str, pairs: Pairs, limits: Limits, log_limit: float
-) -> Iterator[Shared]:
-    """Yield the best place of each family of a mode that is no chance."""
+def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Shared | None:
+    """Return the place of the smallest probability that holds against the scatter of the frames, too."""
     shape = samples.usable.shape[0], samples.usable.shape[1]
-    for best in (*_boxes(pairs, samples.usable, limits), *_periods(pairs, limits)):
-        # a first guess without the error that the frames' scatter gives
-        if _log_p(best.z, best.places) > log_limit:
-            continue
+    guesses = sorted(
+        (
+            (_log_p(best.z, best.places), channel, pairs, best)
+            for channel, modes in enumerate(pairs_of(samples))
+            for pairs in modes.values()
+            for best in (*_boxes(pairs, samples.usable, limits), *_periods(pairs))
+        ),
+        key=lambda guess: guess[0],
+    )
+    for log_p, channel, pairs, best in guesses[:_MEASURED]:
+        if log_p > log_limit:
+            break
         region = _region(best, pairs, shape)
         if region is None:
             continue
-        place = _measured(samples, channel, mode, pairs, region.mask(shape), best)
+        place = _measured(samples, channel, pairs.mode, region, best)
         if place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside:
-            yield Shared(replace(place, region=region), channel, mode)
+            return Shared(place, channel, pairs.mode)
+    return None
 
 
 def _log_p(z: float, places: float) -> float:
@@ -141,10 +143,9 @@ def _region(best: _Best, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
     return None if mask.all() else Region.of_mask(mask)
 
 
-def _measured(
-    samples: Samples, channel: int, mode: str, pairs: Pairs, inside: BoolArray, best: _Best
-) -> Suspect:
+def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _Best) -> Suspect:
     """Return a place with its significance by theory or by the scatter of the frames, whichever is less."""
+    inside = region.mask((samples.usable.shape[0], samples.usable.shape[1]))
     usable = samples.usable
     energy, total = (samples.energies(channel, mode, part) for part in (usable & inside, usable))
     n = energy.size
@@ -159,7 +160,6 @@ def _measured(
     freedom = 2.0 * n * own / max(partners - 1.0, 1e-9) ** 2
     z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
     rest = (float(total.sum()) - float(energy.sum())) / max(n * (every - own), 1.0)
-    region = Region(columns=((0, 1),))  # told by the caller
     return Suspect(region, best.family, z, _log_p(z, best.places), float(energy.sum()) / (n * own), rest)
 
 
@@ -224,7 +224,7 @@ def _areas(usable: BoolArray, lines: IntArray, across: IntArray) -> FloatArray:
     return np.asarray(total[np.ix_(lines, across)], np.float64)
 
 
-def _periods(pairs: Pairs, limits: Limits) -> list[_Best]:
+def _periods(pairs: Pairs) -> list[_Best]:
     """Return the best set of every n-th column, and of every n-th row where they share the line."""
     ways = {"row": ("columns",), "column": ("rows",), "frame": ("columns", "rows")}[pairs.mode]
     best, tried = _Best("period", 0.0, 1.0), 0

@@ -30,8 +30,8 @@ class DiscrepancySettings(Section):
     max_samples: int = Field(
         default=1 << 25,
         ge=1 << 14,
-        description="frames x pixels looked at; of a larger stack, a window in its middle and blocks of "
-        "frames spread over the run",
+        description="frames x pixels compared with simulations; of a larger stack, a window where it stands "
+        "out most, else its middle, and blocks of frames spread over the run",
     )
     significance: float = Field(
         default=0.005,

@@ -274,8 +274,9 @@ class Surveyed(_Part):
     """A part of the sensor where a map of all pixels, from all frames, stands out.
 
     Attributes:
-        map: next_x or next_y (covariance with the next pixel), lag (with the frame before) or spread (means
-            over blocks of frames scatter).
+        map: next_x or next_y (covariance with the next pixel), lag (with the frame before), spread (means
+            over blocks of frames scatter), score.* and goodness (shape of the histograms), pairs.row.readout
+            and so on (pixels that share a row, a column or a frame move together).
         region: as ``model.effects`` takes a region.
         p: probability of such a place by chance, anywhere.
     """
@@ -294,7 +295,9 @@ class Examined(_Part):
         train, test, final: frames (of histograms: samples) to find with, to score on, and for the last gap.
         histograms: number of those compared, where frames are not known; of several samples all count.
         share: of the run's samples that were compared with simulations.
-        surveyed: of the run's samples by whose sums these were chosen; without such sums as ``share``.
+        surveyed: of the run's samples that were looked at in every way of ``surveyed_by``, or compared.
+        surveyed_by: share of the run's samples by what was looked at, over the whole sensor: neighbours and
+            successive frames, shapes of the histograms, pairs of pixels in rows, columns and frames.
         places: where those stand out.
     """
 
@@ -307,6 +310,7 @@ class Examined(_Part):
     histograms: int | None = None
     share: Number = _NAN
     surveyed: Number = _NAN
+    surveyed_by: dict[str, Number] = {}
     places: tuple[Surveyed, ...] = ()
 
     @property

@@ -9,13 +9,14 @@ it is then judged by, so none may be a chance: the probabilities count all place
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.places import FEWEST_FRAMES, FEWEST_PIXELS, Part
 from pchem_pipeline.discrepancy.scan import scan_series
 from pchem_pipeline.discrepancy.scan_pairs import Limits, Shared, scan_pairs
@@ -64,7 +65,7 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
     ]
     places = _apart(regions, usable.shape)
     ranges = _told_apart(_stretches(evidence, time), time.frames)
-    crossings = [*_frames_of_places(shared, samples, time), *_places_of_frames(ranges, samples, time)]
+    crossings = [*_frames_of_places(shared, samples, time), *_places_of_frames(ranges, samples, frames, time)]
     if places and ranges and not crossings:
         crossings = [_Found(0.0, Part(places[0].region, ranges[0].when))]
     return (*places, *ranges, *(each.part for each in crossings[:1]))
@@ -110,11 +111,14 @@ def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeri
                 yield _Found(one.z, Part(each.place.region, _with_unseen(one.when, time.frames)))
 
 
-def _places_of_frames(ranges: Sequence[Part], samples: Samples, time: TimeSeries) -> Iterator[_Found]:
+def _places_of_frames(
+    ranges: Sequence[Part], samples: Samples, frames: NDArray[np.unsignedinteger[Any]], time: TimeSeries
+) -> Iterator[_Found]:
     """Yield ranges of frames in those pixels only that share noise there."""
     for part in ranges:
+        chosen = Stack(frames[part.frames(time.frames)])
         for each in scan_pairs(
-            samples.during(part.frames(time.frames)),
+            replace(samples, frames=chosen),
             significance=_SIGNIFICANCE,
             most=1,
             limits=Limits(FEWEST_PIXELS, _LARGEST),

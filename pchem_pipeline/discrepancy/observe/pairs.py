@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.sums import PixelStatistics, pixel_statistics
+from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-__all__ = ["CHANNELS", "MODES", "PERIOD", "Pairs", "Samples", "pairs_of"]
+__all__ = ["CHANNELS", "MODES", "PERIOD", "FrameBlocks", "Pairs", "Samples", "Stack", "pairs_of"]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -40,9 +40,47 @@ _CLIP = 6.0
 _CHUNK_SAMPLES = 1 << 22
 
 
+class FrameBlocks(Protocol):
+    """Frames of some rows that come by blocks.
+
+    Attributes:
+        n_frames: number of them.
+    """
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        ...
+
+    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
+        ...
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Frames in memory, or some of them.
+
+    Attributes:
+        frames: codes (n, y, x), DN.
+    """
+
+    frames: NDArray[np.unsignedinteger[Any]]
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return int(self.frames.shape[0])
+
+    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
+        for begin in range(0, self.n_frames, size):
+            yield self.frames[begin : begin + size]
+
+
 @dataclass(frozen=True)
 class Samples:
-    """Frames as standardised deviations of their pixels, channel by channel.
+    """Frames as standardised deviations of their pixels, of both channels.
 
     Attributes:
         frames: codes (n, y, x), DN.
@@ -52,7 +90,7 @@ class Samples:
         usable: pixels that count, (y, x).
     """
 
-    frames: NDArray[np.unsignedinteger[Any]]
+    frames: FrameBlocks
     first: NDArray[np.int32]
     last: NDArray[np.int32]
     start: NDArray[np.int32]
@@ -72,68 +110,64 @@ class Samples:
             np.stack([values.ravel() for values in known], axis=1),
             maps.usable.ravel(),
         )
-        shape = (maps.usable.shape[0], maps.usable.shape[1])
-        pixels = pixel_statistics(laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), shape)
-        return cls.by_laws(frames, laws, pixels)
+        return cls.by_laws(Stack(frames), laws, maps)
 
     @classmethod
-    def by_laws(
-        cls, frames: NDArray[np.unsignedinteger[Any]], laws: PixelLaws, pixels: PixelStatistics
-    ) -> Samples:
-        """Prepare frames by the laws of their pixels."""
+    def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:
+        """Prepare frames by the laws of their pixels, made of all samples of the frames or of more."""
+        shape = (maps.usable.shape[0], maps.usable.shape[1])
+        pixels = pixel_statistics(laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), shape)
         usable = pixels.usable
         first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T.astype(np.int32)
         tables = laws.tables.T.copy()
+        of = np.repeat(np.arange(length.size), np.where(laws.good, laws.support[:, 1], 0))
         for channel, variance in enumerate((pixels.charge, pixels.readout)):
-            scale = np.sqrt(np.where(usable, variance, 1.0)).ravel()
-            good = np.flatnonzero(usable.ravel())
-            rows = np.concatenate([[0], np.repeat(good, length[good])]) if good.size else np.zeros(1, int)
-            tables[channel, : rows.size] /= scale[rows]
+            tables[channel, 1 : 1 + of.size] /= np.sqrt(np.where(usable, variance, 1.0)).ravel()[of]
         np.clip(tables, -_CLIP, _CLIP, out=tables)
-        first, last, start = (values.reshape(usable.shape) for values in (first, first + length - 1, start))
+        first, last, start = (values.reshape(shape) for values in (first, first + length - 1, start))
         return cls(frames, first, last, start, tables, usable)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.frames.n_frames
 
     def without(self, pixels: BoolArray) -> Samples:
         """Return it without some pixels, (y, x)."""
         return replace(self, usable=self.usable & ~pixels)
 
-    def during(self, frames: BoolArray) -> Samples:
-        """Return it with some of its frames, (n,)."""
-        return replace(self, frames=self.frames[frames])
-
-    def chunks(self, channel: int) -> Iterator[tuple[slice, Float32Array]]:
-        """Yield some frames at a time as deviations, (frame, y, x), 0 in pixels that do not count."""
-        n, ny, nx = self.frames.shape
-        size = max(1, _CHUNK_SAMPLES // (ny * nx))
-        weight = self.usable.astype(np.float32)
-        for begin in range(0, n, size):
-            at = self.frames[begin : begin + size].astype(np.int32)
-            np.clip(at, self.first, self.last, out=at)
-            at += self.start - self.first
-            yield slice(begin, min(begin + size, n)), self.tables[channel][at] * weight
+    def chunks(
+        self, channels: tuple[int, ...] = (0, 1), rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Iterator[list[Float32Array]]:
+        """Yield some frames at a time as deviations of each channel, (frame, y, x), 0 where not usable."""
+        box = rows, columns
+        first, last, offset = self.first[box], self.last[box], (self.start - self.first)[box]
+        weight = self.usable[box].astype(np.float32)
+        for block in self.frames.blocks(max(1, _CHUNK_SAMPLES // self.usable.size)):
+            at = block[(slice(None), *box)].astype(np.int32)
+            np.clip(at, first, last, out=at)
+            at += offset
+            yield [self.tables[channel][at] * weight for channel in channels]
 
     def energies(self, channel: int, mode: str, pixels: BoolArray) -> FloatArray:
         """Return the sum of the products of pairs of some pixels that share a mode, in each frame, (n,)."""
-        found = np.zeros(self.frames.shape[0])
-        rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
-        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        small = replace(
-            self,
-            frames=self.frames[(slice(None), *box)],
-            first=self.first[box],
-            last=self.last[box],
-            start=self.start[box],
-            usable=self.usable[box] & pixels[box],
-        )
-        for part, u in small.chunks(channel):
-            own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
-            rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))
-            of_rows, of_columns = ((sums**2).sum(axis=1) for sums in (rows, columns))
-            if mode == "frame":
-                found[part] = rows.sum(axis=1) ** 2 - of_rows - of_columns + own
-            else:
-                found[part] = (of_rows if mode == "row" else of_columns) - own
-        return found / 2.0
+        rows, columns = (np.flatnonzero((self.usable & pixels).any(axis=axis)) for axis in (1, 0))
+        if rows.size == 0:
+            return np.zeros(self.n_frames)
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        inside = pixels[box].astype(np.float32)
+        found = [_energy(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
+        return np.concatenate(found)
+
+
+def _energy(u: Float32Array, mode: str) -> FloatArray:
+    """Return the sum of the products of all pairs that share a mode, of frames (t, y, x)."""
+    own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
+    rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))
+    of_rows, of_columns = ((sums**2).sum(axis=1) for sums in (rows, columns))
+    if mode == "frame":
+        return np.asarray(rows.sum(axis=1) ** 2 - of_rows - of_columns + own) / 2.0
+    return np.asarray((of_rows if mode == "row" else of_columns) - own) / 2.0
 
 
 @dataclass(frozen=True)
@@ -190,13 +224,15 @@ class Pairs:
         return self.rows if self.mode == "column" else self.columns
 
 
-def pairs_of(samples: Samples, channel: int) -> dict[str, Pairs]:
-    """Sum the products of all pairs in one pass over the frames, by what the pixels share."""
-    gathered, counted = (_Gathered(*samples.usable.shape) for _ in range(2))
+def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
+    """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share."""
+    shape = samples.usable.shape
+    counted, gathered = _Gathered(*shape), [_Gathered(*shape) for _ in CHANNELS]
     counted.add(samples.usable[None].astype(np.float32))
-    for _, u in samples.chunks(channel):
-        gathered.add(u)
-    return _told(gathered, counted, samples.frames.shape[0])
+    for chunk in samples.chunks():
+        for each, u in zip(gathered, chunk, strict=True):
+            each.add(u)
+    return [_told(each, counted, samples.n_frames) for each in gathered]
 
 
 class _Gathered:
@@ -326,5 +362,5 @@ def _summed(values: FloatArray, starts: tuple[IntArray, ...]) -> FloatArray:
 def _folded(values: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return sums over the last axis by its number modulo the period, (..., PERIOD)."""
     missing = -values.shape[-1] % PERIOD
-    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]) if missing else values
     return np.asarray(padded.reshape(*values.shape[:-1], -1, PERIOD).sum(axis=-2))

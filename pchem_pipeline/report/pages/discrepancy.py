@@ -565,6 +565,18 @@ def _defects(found: Verdict) -> Table:
     )
 
 
+def _surveyed(name: str, data: DiscrepancyData) -> str:
+    """Return in words what stands out of a map of the whole sensor."""
+    kind, _, rest = name.partition(".")
+    if kind == "pairs":
+        mode, _, channel = rest.partition(".")
+        return f"pixels of a {mode} move together ({'charge' if channel == 'charge' else 'readout'})"
+    if kind in ("score", "goodness"):
+        _, sentence = data.statistics.get(f"shape.{rest or kind}.mean", ("", name))
+        return sentence.removesuffix(", in all pixels alike")
+    return _SURVEYED.get(name, name)
+
+
 def _examined(data: DiscrepancyData) -> Table:
     found, rows = data.found, []
     for key, words in (
@@ -580,11 +592,13 @@ def _examined(data: DiscrepancyData) -> Table:
     examined = found.examined
     if math.isfinite(examined.share):
         rows.append(("share of the run's samples", percent(examined.share, 1.0)))
-        rows.append(("share by whose sums these were chosen", percent(examined.surveyed, 1.0)))
+        rows.append(("share that was looked at for places", percent(examined.surveyed, 1.0)))
+        rows += [(f"share: {kind}", percent(share, 1.0)) for kind, share in examined.surveyed_by.items()]
     for place in examined.places:
         words = Region.model_validate(place.region).words()
-        what = _SURVEYED.get(place.map, place.map)
-        rows.append((f"whole sensor: {what}", f"{words} (p {probability_text(place.p)})"))
+        rows.append(
+            (f"whole sensor: {_surveyed(place.map, data)}", f"{words} (p {probability_text(place.p)})")
+        )
     if found.replicates:
         rows.append(("simulated replicates", f"{found.replicates:,}"))
     rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]

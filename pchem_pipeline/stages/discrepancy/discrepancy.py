@@ -21,7 +21,8 @@ from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, survey
+from pchem_pipeline.stages.discrepancy.survey import survey
+from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
@@ -61,8 +62,8 @@ def run(context: StageContext) -> None:
         return
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
-    places = survey(context.store, source.shape[1:])
-    window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi, places)
+    seen = survey(context, source, settings.max_samples)
+    window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi, seen.places)
     found = find_discrepancies(
         read_window(source, window),
         window.numbers,
@@ -75,7 +76,7 @@ def run(context: StageContext) -> None:
         window=SensorWindow(window.rows, window.columns, (source.shape[1], source.shape[2])),
     )
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
-    found = replace(found, verdict=window.told(verdict, source.shape, places))
+    found = replace(found, verdict=seen.told(verdict, window.share(source.shape)))
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 

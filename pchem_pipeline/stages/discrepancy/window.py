@@ -9,19 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.quick.places import SensorPlace, sensor_maps, sensor_place
+from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.discrepancy.splits import block_length
-from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-from pchem_pipeline.stages.quick_look import read_sums
-from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Window", "choose_window", "read_window", "survey"]
+__all__ = ["Window", "choose_window", "read_window"]
 
 # frames tell more than pixels about what happens in time; pixels more about what is rare
 _FRAMES_WANTED = 6000
-#: Probability of a chance, in any of the maps, below which a place decides where the window lies.
-_SIGNIFICANCE = 1e-3
 #: Windows tried along each edge of the sensor.
 _TRIED = 64
 
@@ -43,40 +38,10 @@ class Window:
         """Return the place on the sensor of a pixel of the window."""
         return y + self.rows[0], x + self.columns[0]
 
-    def told(
-        self, verdict: Verdict, shape: tuple[int, int, int], places: Mapping[str, SensorPlace] | None
-    ) -> Verdict:
-        """Return a verdict that says how much of a stack of some shape it rests on, and on what else."""
+    def share(self, shape: tuple[int, int, int]) -> float:
+        """Return its share of the samples of a stack of some shape."""
         pixels = (self.rows[1] - self.rows[0]) * (self.columns[1] - self.columns[0])
-        share = self.numbers.size * pixels / math.prod(shape)
-        surveyed = share if places is None else 1.0
-        spots = tuple(
-            Surveyed(map=name, region=place.region.numbers(), p=place.p)
-            for name, place in sorted((places or {}).items(), key=lambda item: item[1].p)
-        )
-        examined = verdict.examined.model_copy(update={"share": share, "surveyed": surveyed, "places": spots})
-        return verdict.model_copy(update={"examined": examined})
-
-
-def survey(store: RunStore, shape: tuple[int, int]) -> dict[str, SensorPlace] | None:
-    """Return where the whole sensor stands out, in all frames, from the summaries of the stage histogram.
-
-    Args:
-        store: the run.
-        shape: rows and columns of the sensor.
-
-    Returns:
-        The most significant place of each map of :func:`sensor_maps` that has one; None without summaries.
-
-    Raises:
-        StoreError: an array is corrupt.
-    """
-    sums = read_sums(store)
-    if sums is None or sums.shape != shape or sums.freedom <= 0:
-        return None
-    maps = sensor_maps(sums)
-    found = {name: sensor_place(name, values, _SIGNIFICANCE / len(maps)) for name, values in maps.items()}
-    return {name: place for name, place in found.items() if place is not None}
+        return self.numbers.size * pixels / math.prod(shape)
 
 
 def choose_window(
@@ -96,7 +61,7 @@ def choose_window(
         max_samples: frames x pixels to look at.
         block_frames: frames in a block, or None to choose.
         roi: rows and columns that the user asked for: y0, y1, x0, x1.
-        places: what :func:`survey` found.
+        places: where the survey found that the sensor stands out.
     """
     n_frames, ny, nx = shape
     y0, y1, x0, x1 = roi or (0, ny, 0, nx)

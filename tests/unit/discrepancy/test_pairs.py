@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.observe.pairs import PERIOD, Samples, pairs_of
+from pchem_pipeline.discrepancy.observe.pairs import PERIOD, Samples, Stack, pairs_of
 from pchem_pipeline.discrepancy.scan import scan_series
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.effects.framework.region import Region
@@ -23,7 +23,7 @@ def samples_of(values: Floats, usable: np.ndarray[Any, np.dtype[np.bool_]] | Non
     table = np.tile(((np.arange(1201) - 600) / 100.0).astype(np.float32), (2, 1))
     codes = np.rint(100.0 * values + 600.0).astype(np.uint16)
     every = np.ones(shape, np.bool_) if usable is None else usable
-    return Samples(codes, zero, zero + 1200, zero, table, every)
+    return Samples(Stack(codes), zero, zero + 1200, zero, table, every)
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (70, 40), (40, 33)])
@@ -31,7 +31,7 @@ def test_sums_of_cells_are_those_of_all_pairs(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(sum(shape))
     usable = rng.random(shape) < 0.8
     samples = samples_of(np.clip(rng.standard_normal((5, *shape)), -6, 6), usable)
-    [(_, u)] = samples.chunks(0)
+    [[u, _]] = samples.chunks()
     flat = u.reshape(5, -1).astype(np.float64)
     y, x = (each.ravel() for each in np.mgrid[: shape[0], : shape[1]])
     products, counts = flat.T @ flat, 5.0 * np.outer(usable.ravel(), usable.ravel())
@@ -41,7 +41,7 @@ def test_sums_of_cells_are_those_of_all_pairs(shape: tuple[int, int]) -> None:
         "column": same_column & ~same_row,
         "frame": ~same_row & ~same_column,
     }
-    for mode, pairs in pairs_of(samples, 0).items():
+    for mode, pairs in pairs_of(samples)[0].items():
         first, last = 1, pairs.lines.size - 2
         begin, end = 2, pairs.across.size - 1
         line, across = (x, y) if mode == "column" else (y, x)

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers.quick_stacks import stack, sums_of
 
 from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.stages.discrepancy import window as module
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, survey
+from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
 
 
 class Frames:
@@ -75,21 +73,3 @@ def test_without_a_place_or_outside_of_the_region_asked_for_the_middle_is_looked
     elsewhere = {"lag": place(rows=[500, 512])}
     asked = choose_window((17750, 512, 512), 1 << 25, None, (0, 256, 0, 256), elsewhere)
     assert asked.rows == choose_window((17750, 512, 512), 1 << 25, None, (0, 256, 0, 256)).rows
-
-
-def test_the_survey_finds_the_place_in_the_sums_of_all_frames(monkeypatch):
-    rng = np.random.default_rng(1)
-
-    def tap(dn):
-        dn[:, :, 40:] += 2.5 * rng.standard_normal(dn.shape[:2])[:, :, None]
-        return dn
-
-    monkeypatch.setattr(module, "read_sums", lambda store: sums_of(stack(rng, (600, 32, 48), tap)))
-    found = survey(None, (32, 48))
-    assert found["next_x"].region.numbers() == {"columns": [[40, 48]]}
-    assert found["next_x"].p < 1e-20
-    assert survey(None, (16, 48)) is None  # of another region of the sensor
-    monkeypatch.setattr(module, "read_sums", lambda store: sums_of(stack(rng, (600, 32, 48))))
-    assert survey(None, (32, 48)) == {}
-    monkeypatch.setattr(module, "read_sums", lambda store: None)
-    assert survey(None, (32, 48)) is None

@@ -1,0 +1,243 @@
+"""Where a run stands out, over the whole sensor and all frames, before a part of it is compared closely.
+
+Three kinds of sums are looked at. Those of the stage ``histogram`` say whether neighbours and successive
+samples resemble each other and whether levels wander; the histograms of all pixels, against the law of their
+fit, say whether shapes and tails differ by place; and one more pass over the frames says whether the pixels
+of a row, a column or a frame move together in some place. Rows are done in bands, so that the tables of their
+pixels and a block of frames take no more memory than a gigabyte, whatever the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
+from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
+from pchem_pipeline.discrepancy.observe.vector import goodness_of
+from pchem_pipeline.discrepancy.quick.places import SensorPlace, sensor_maps, sensor_place
+from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
+from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
+from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
+from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
+from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.stages.quick_look import read_sums
+
+if TYPE_CHECKING:
+    from pchem_pipeline.discrepancy.quick.sums import StackSums
+    from pchem_pipeline.run.stage import StageContext
+    from pchem_pipeline.store.run_store import RunStore
+
+__all__ = ["Survey", "places_of_bands", "places_of_sums", "survey"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Probability of a chance, in any map of a kind, below which a place decides where the window lies.
+_SIGNIFICANCE = 1e-3
+#: The same of shapes: they rest on fits, whose errors are not quite normal.
+_SIGNIFICANCE_OF_SHAPES = 1e-6
+#: Codes of the tables of a band at most (two numbers of four bytes each), and rows at least.
+_MOST_CODES, _FEWEST_ROWS = 1 << 26, 16
+#: Samples whose pairs are summed at most: some five minutes.
+_MOST_SAMPLES = 1 << 31
+_BLOCK = 64  # frames that are read at a time where not all are
+_FEWEST_SAMPLES = 50  # of a histogram that is compared with its law
+
+SUMS, SHAPES, PAIRS = (
+    "neighbours, successive frames, levels",
+    "shapes and tails of the histograms",
+    "pairs of pixels in rows, columns and frames",
+)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What stands out, and how much was looked at.
+
+    Attributes:
+        places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
+        shares: of the run's samples, by what was looked at; what is absent was not.
+    """
+
+    places: Mapping[str, SensorPlace] = field(default_factory=dict)
+    shares: Mapping[str, float] = field(default_factory=dict)
+
+    def told(self, verdict: Verdict, share: float) -> Verdict:
+        """Return a verdict that says on what share of the samples it rests, and on what else."""
+        spots = tuple(
+            Surveyed(map=name, region=place.region.numbers(), p=place.p)
+            for name, place in sorted(self.places.items(), key=lambda item: item[1].p)
+        )
+        least = min(self.shares.get(kind, 0.0) for kind in (SUMS, SHAPES, PAIRS))
+        examined = verdict.examined.model_copy(
+            update={
+                "share": share,
+                "surveyed": max(share, least),
+                "surveyed_by": dict(self.shares),
+                "places": spots,
+            }
+        )
+        return verdict.model_copy(update={"examined": examined})
+
+
+def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
+    """Look at every pixel and every frame of a run.
+
+    Args:
+        context: of the stage.
+        source: its frames.
+        compared: samples that can be compared closely: of a run with no more the frames are not read here.
+
+    Raises:
+        StoreError: an array is corrupt.
+    """
+    store, shape = context.store, source.shape
+    found = Survey()
+    places = places_of_sums(read_sums(store), shape[1:])
+    if places is not None:
+        found = Survey(places, {SUMS: 1.0})
+    model = model_of(store, "fit")
+    done = all(_complete(context, stage) for stage in ("histogram", "fit"))
+    if math.prod(shape) <= compared or not done or model is None:
+        return found
+    here, shares = places_of_bands(store, source, plain=not model.effects)
+    return Survey({**found.places, **here}, {**found.shares, **shares})
+
+
+def _complete(context: StageContext, stage: str) -> bool:
+    record = context.store.records.read(stage)
+    return record is not None and len(context.tiles_done(stage)) >= record.keys
+
+
+def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, SensorPlace] | None:
+    """Return where the sums of the stage histogram stand out; None where there are none of this sensor.
+
+    Args:
+        sums: of all frames.
+        shape: rows and columns of the sensor.
+    """
+    if sums is None or sums.shape != shape or sums.freedom <= 0:
+        return None
+    maps = sensor_maps(sums)
+    return _places(maps, _SIGNIFICANCE)
+
+
+def _places(maps: Mapping[str, FloatArray], significance: float) -> dict[str, SensorPlace]:
+    found = {name: sensor_place(name, values, significance / len(maps)) for name, values in maps.items()}
+    return {name: place for name, place in found.items() if place is not None}
+
+
+def places_of_bands(
+    store: RunStore, source: FrameSource, *, plain: bool = True
+) -> tuple[dict[str, SensorPlace], dict[str, float]]:
+    """Return where histograms and pairs of pixels stand out, and the share of the samples looked at.
+
+    Args:
+        store: the run, with histograms and fit.
+        source: its frames.
+        plain: the pixels were fitted without effects, so that their histograms follow the plain law.
+    """
+    n, ny, nx = source.shape
+    rows = max(_FEWEST_ROWS, _MOST_CODES // (nx * store.array("histogram/counts").shape[2]))
+    bands = [(first, min(first + rows, ny)) for first in range(0, ny, rows)]
+    numbers = _spread_frames(n, _MOST_SAMPLES // (ny * nx))
+    maps = {name: np.full((ny, nx), np.nan) for name in (*(f"score.{s}" for s in SCORES), "goodness")}
+    places: dict[str, SensorPlace] = {}
+    for first, last in bands:
+        fitted, laws = _laws(store, (first, last))
+        for name, values in _shapes(laws, fitted.usable.shape).items():
+            maps[name][first:last] = values
+        if not laws.good.any():
+            continue
+        samples = Samples.by_laws(_Band(source, (first, last), numbers), laws, fitted)
+        for each in scan_pairs(samples, significance=_SIGNIFICANCE / len(bands), most=1):
+            name = f"pairs.{each.mode}.{CHANNELS[each.channel]}"
+            mask = np.zeros((ny, nx), np.bool_)
+            mask[first:last] = each.place.region.mask((last - first, nx))
+            root = math.sqrt(numbers.size)
+            place = SensorPlace(
+                Region.of_mask(mask),
+                min(1.0, each.place.p * len(bands)),
+                each.place.inside * root,
+                each.place.outside * root,
+            )
+            if name not in places or place.p < places[name].p:
+                places[name] = place
+    shares = {PAIRS: numbers.size / n}
+    if plain:
+        places |= _places(maps, _SIGNIFICANCE_OF_SHAPES)
+        shares[SHAPES] = 1.0
+    return places, shares
+
+
+def _spread_frames(n: int, most: int) -> IntArray:
+    """Return the numbers of all frames, or of blocks spread over the run."""
+    if most >= n:
+        return np.arange(n, dtype=np.int64)
+    starts = np.unique(np.linspace(0, n - _BLOCK, max(most // _BLOCK, 1)).astype(np.int64))
+    return np.unique((starts[:, None] + np.arange(min(_BLOCK, n))).ravel())
+
+
+def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]:
+    """Return the fit of the pixels of some rows, and their laws with their histograms."""
+    part = slice(*rows), slice(None)
+    values = [store.read(f"fit/{name}", part).astype(np.float64) for name in PARAMETERS]
+    counts = store.read("histogram/counts", (*part, slice(None)))
+    outside = [store.read(f"histogram/{side}", part) for side in ("under", "over")]
+    usable = (store.read("fit/fit_status", part) & int(UNTRUSTWORTHY)) == 0
+    usable &= np.isfinite(values).all(axis=0)
+    usable &= counts.sum(axis=2) >= np.maximum(_FEWEST_SAMPLES, 100.0 * sum(outside))
+    maps = PixelMaps(values[0], values[1], values[2], values[3], usable)
+    laws = pixel_laws(
+        counts.reshape(-1, counts.shape[2]),
+        store.read("histogram/origin", part).ravel().astype(np.int64),
+        np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
+        np.stack([each.ravel() for each in values], axis=1),
+        usable.ravel(),
+    )
+    return replace(maps, usable=laws.good.reshape(usable.shape)), laws
+
+
+def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
+    """Return the scores and the goodness of fit of each pixel, NaN without a law."""
+    found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
+    found["goodness"] = goodness_of(laws.moments)
+    return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Frames of a band of rows, read by blocks.
+
+    Attributes:
+        source: frames of the sensor.
+        rows: first, and end.
+        numbers: of the frames, increasing.
+    """
+
+    source: FrameSource
+    rows: tuple[int, int]
+    numbers: IntArray
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return int(self.numbers.size)
+
+    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
+        breaks = np.flatnonzero(np.diff(self.numbers) != 1) + 1
+        for part in np.split(self.numbers, breaks):
+            frames = int(part[0]), int(part[-1]) + 1
+            with FrameStream(self.source, [self.rows], size, frames=frames) as stream:
+                for _, (block,) in stream:
+                    yield block
