@@ -13,13 +13,15 @@ from pchem_pipeline.model.fit.climb_numba import CONVERGED, same_place, sensible
 from pchem_pipeline.model.fit.satellites_numba import fill_core, search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
-    CHI2,
     CLEAR_GAP,
+    DEGREES,
     FIT_NOT_CONVERGED,
     GAP,
     LOG_LIKELIHOOD,
     SATELLITE_WEIGHT,
     SUSPICIOUS,
+    Found,
+    Task,
     Tools,
     climb_neighbours,
     climb_on,
@@ -27,7 +29,7 @@ from pchem_pipeline.model.fit.search_numba import (
     from_start,
     judge,
     loglik_without_gain,
-    normal_score,
+    score_of,
 )
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
@@ -38,7 +40,6 @@ from pchem_pipeline.model.fit.starts_numba import (
     start_peak,
     start_regression,
 )
-from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     ADDED_WEIGHT,
@@ -133,9 +134,7 @@ def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray)
 
 
 @kernel(borrows=True)
-def _better(
-    pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, heights: tuple[float, float]
-) -> tuple[float, float, int]:
+def _better(pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, found: Found) -> Found:
     """Climb from ``trial`` and its neighbours; put it in the place of ``best`` if it is likelier.
 
     Args:
@@ -143,25 +142,22 @@ def _better(
         tools: of the search.
         trial: a start; overwritten.
         best: best maximum so far; its step is 0 where there is none.
-        heights: its log-likelihood and that of its runner-up.
-
-    Returns:
-        Both after that, evaluations.
+        found: how far the search has come.
     """
     n = pixel.facts.shape[0]
-    best_loglik, runner_up = heights
-    outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
+    outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
+    used = found.used + count
     if best[n + STEP] > 0.0 and same_place(best, trial, tools.limits.cells):
-        if outcome == CONVERGED and loglik > best_loglik:
+        if outcome == CONVERGED and loglik > found.loglik:
             copy(trial, best)
-            best_loglik = loglik
-        return best_loglik, runner_up, used
-    if outcome != CONVERGED or loglik <= best_loglik:
-        return best_loglik, max(runner_up, loglik), used
-    runner_up = max(runner_up, best_loglik)
+            return Found(loglik, found.runner_up, used, found.degenerate)
+        return Found(found.loglik, found.runner_up, used, found.degenerate)
+    if outcome != CONVERGED or loglik <= found.loglik:
+        return Found(found.loglik, max(found.runner_up, loglik), used, found.degenerate)
     copy(trial, best)
-    best_loglik, beside, count = climb_neighbours(pixel, tools, best, loglik)
-    return best_loglik, max(runner_up, beside), used + count
+    higher, beside, count = climb_neighbours(pixel, tools, best, loglik)
+    runner_up = max(found.runner_up, found.loglik, beside)
+    return Found(higher, runner_up, used + count, found.degenerate)
 
 
 @kernel(inline=True)
@@ -237,10 +233,8 @@ def _limit_start(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
     return height > -math.inf
 
 
-@kernel(inline=True)
-def _climb_few(
-    pixel: Pixel, tools: Tools, best: FloatArray, heights: tuple[float, float]
-) -> tuple[float, float, int]:
+@kernel(borrows=True)
+def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
     """Climb from starts ranked by the cells, where a DN is no small part of an electron; see `_better`."""
     scratch = tools.scratch
     trial, heights_of = scratch.small[HERE], scratch.small[HEIGHTS]
@@ -254,122 +248,131 @@ def _climb_few(
     for i in range(N_KEPT):
         if heights_of[i] > -math.inf:
             copy(scratch.small[KEPT_STARTS + i], trial)
-            first, second, count = _better(pixel, tools, trial, best, heights)
-            heights = first, second
-            used += count
-    return heights[0], heights[1], used
+            found = _better(pixel, tools, trial, best, found)
+    return Found(found.loglik, found.runner_up, found.used + used, found.degenerate)
 
 
-@kernel(inline=True)
-def _climb_scaled(
-    pixel: Pixel, tools: Tools, best: FloatArray, heights: tuple[float, float]
-) -> tuple[float, float, int]:
+@kernel(borrows=True)
+def _climb_scaled(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
     """Climb from the best of a single sample with other gains, mean and variance kept; see `_better`.
 
     Where a bias is ambiguous, the density's likelihood and this one rank the maxima differently, and those at
     other gains are as near as the neighbours.
     """
-    trial, start, used = tools.scratch.small[HERE], tools.scratch.small[KEPT_STARTS], 0
+    trial, start = tools.scratch.small[HERE], tools.scratch.small[KEPT_STARTS]
     histogram = histogram_of(pixel, np.int64(0))
     for scale in _SCALES:
         start[1 + SATELLITE] = 0.0
         if scaled_start(histogram, best, scale, _SHARP_NOISE2, start):
             _from_density(pixel, np.bool_(False), start, trial)
-            first, second, count = _better(pixel, tools, trial, best, heights)
-            heights = first, second
-            used += count
-    return heights[0], heights[1], used
+            found = _better(pixel, tools, trial, best, found)
+    return found
+
+
+@kernel(borrows=True)
+def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray) -> Found:
+    """Climb from a fit with the density, what the law adds taken off, or else from the fit as it is."""
+    trial, used = tools.scratch.small[HERE], 0
+    for as_it_is in (tools.limits.warm, np.bool_(True)):
+        _from_density(pixel, as_it_is, near, trial)
+        outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
+        used += count
+        if outcome == CONVERGED:
+            copy(trial, best)
+            return Found(loglik, -math.inf, used, np.bool_(False))
+    return Found(-math.inf, -math.inf, used, np.bool_(False))
+
+
+@kernel(inline=True)
+def _start_anew(
+    pixel: Pixel, tools: Tools, known: bool, score: float, best: FloatArray, found: Found
+) -> Found:
+    """Climb from other starts in pixels that the density may have led astray.
+
+    These are pixels at the limits of the codes, those of few DN per electron, several samples, and those
+    whose climb did not arrive.
+    """
+    n, limits, trial = pixel.facts.shape[0], tools.limits, tools.scratch.small[HERE]
+    place = n + STEP
+    if not limits.warm and (not best[place] > 0.0 or score > _POOR) and _limit_start(pixel, tools, trial):
+        found = _better(pixel, tools, trial, best, found)
+    # several samples, some of them cut, may have led the density astray
+    astray = n > 1 and score > SUSPICIOUS
+    lost = known and not best[place] > 0.0
+    if lost or (limits.scan and (astray or not best[place] > _FEW_STEP)):
+        found = _climb_few(pixel, tools, best, found)
+    return found
+
+
+@kernel(inline=True)
+def _try_satellites(
+    pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: FloatArray, found: Found
+) -> Found:
+    """Try free satellites of each amplitude; ``out`` is that of the fit with those that are kept."""
+    n = pixel.facts.shape[0]
+    noise = math.exp(0.5 * best[n + LOG_VARIANCE]) / best[n + STEP]
+    poor = score_of(out) > _SUSPICIOUS or noise > _UNRESOLVED
+    amplitude, count = search_satellites(
+        best, found.loglik, pixel, task.law, task.row, task.amplitudes, unsure, poor, tools
+    )
+    loglik = examine(pixel, tools, best, out)
+    if amplitude > 0.0:
+        out[DEGREES] = max(out[DEGREES] - 2.0, 0.0)
+    out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + SATELLITE]
+    return Found(loglik, found.runner_up, found.used + count + 1, found.degenerate)
 
 
 def search_cells(
-    pixel: Pixel,
-    tools: Tools,
-    law: Law,
-    index: int,
-    amplitudes: FloatArray,
-    near: FloatArray,
-    gap: float,
-    best: FloatArray,
-    out: FloatArray,
+    pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
 ) -> tuple[int, int, int]:
     """Find the most likely parameters of one pixel with its cells integrated, under any law.
 
     From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
-    exclude them, or where its law was too different to do so. Pixels that the limits of the codes led
-    astray, those of few DN per electron, and those whose climb does not arrive are also started anew. Where
-    the law has free satellites, each amplitude is tried.
+    exclude them, or where its law was too different to do so. Pixels that the density may have led astray
+    are also started anew. Where the law has free satellites, each amplitude is tried.
 
     Args:
         pixel: its samples and its law.
         tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
-        law: of all pixels.
-        index: the pixel's place in it.
-        amplitudes: of free satellites, e-.
-        near: theta of the fit to start from, v with the rounding; its step is 0 where there is none.
-        gap: nats of that fit above its runner-up.
+        task: the law, and the fit to start from.
         best: out, theta at the maximum; its step is 0 where there is none.
         out: out, a row of results.
 
     Returns:
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
-    n, limits, trial = pixel.facts.shape[0], tools.limits, tools.scratch.small[HERE]
-    place, used, freedom, score, known = n + STEP, 0, 0, math.inf, near[n + STEP] > 0.0
-    if not known:
-        gap = math.inf
-    loglik, runner_up = -math.inf, -math.inf
-    null = loglik_without_gain(pixel)
-    best[place] = 0.0
+    n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
+    known = task.near[n + STEP] > 0.0
+    gap, score = task.gap if known else math.inf, math.inf
+    best[n + STEP] = 0.0
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
+    found = Found(-math.inf, -math.inf, 0, np.bool_(False))
     if known:
-        for as_it_is in (limits.warm, np.bool_(True)):
-            _from_density(pixel, as_it_is, near, trial)
-            outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
-            used += count
-            if outcome == CONVERGED:
-                copy(trial, best)
-                break
-            loglik = -math.inf
-    if best[place] > 0.0:
+        found = _climb_known(pixel, tools, task.near, best)
+    if best[n + STEP] > 0.0:
+        loglik, runner_up, used = found.loglik, found.runner_up, found.used
         if gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
             loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
             used += count
             if runner_up > -math.inf and not limits.scan:
                 gap = math.inf  # that of another law
-        _, freedom, score = examine(pixel, tools, best, out)
-        used += 1
-    before = loglik
-    if not limits.warm and (not best[place] > 0.0 or score > _POOR) and _limit_start(pixel, tools, trial):
-        loglik, runner_up, count = _better(pixel, tools, trial, best, (loglik, runner_up))
-        used += count
-    # several samples, some of them cut, may have led the density astray
-    astray = n > 1 and score > SUSPICIOUS
-    lost = known and not best[place] > 0.0
-    if lost or (limits.scan and (astray or not best[place] > _FEW_STEP)):
-        loglik, runner_up, count = _climb_few(pixel, tools, best, (loglik, runner_up))
-        used += count
-    if not best[place] > 0.0:
-        return FIT_NOT_CONVERGED, used, 0
-    if n == 1 and not limits.warm and min(gap, loglik - runner_up) < limits.gap:
-        loglik, runner_up, count = _climb_scaled(pixel, tools, best, (loglik, runner_up))
-        used += count
-    if loglik > before:
-        _, freedom, score = examine(pixel, tools, best, out)
-        used += 1
-    bias_gap = min(gap, loglik - runner_up)
-    gap = min(bias_gap, loglik - null)
-    if amplitudes.size > 0:
-        noise = math.exp(0.5 * best[n + LOG_VARIANCE]) / best[place]
-        poor = normal_score(out[CHI2], freedom) > _SUSPICIOUS or noise > _UNRESOLVED
-        amplitude, count = search_satellites(
-            best, loglik, pixel, law, index, amplitudes, gap < CLEAR_GAP, poor, tools
-        )
-        loglik, freedom, _ = examine(pixel, tools, best, out)
-        used += count + 1
-        freedom = max(freedom - 2, 0) if amplitude > 0.0 else freedom
-        out[AMPLITUDE], out[SATELLITE_WEIGHT] = amplitude, best[n + SATELLITE]
-    out[LOG_LIKELIHOOD], out[GAP] = loglik, gap
+        examine(pixel, tools, best, out)
+        score = score_of(out)
+        found = Found(loglik, runner_up, used + 1, found.degenerate)
+    before = found.loglik
+    found = _start_anew(pixel, tools, known, score, best, found)
+    if not best[n + STEP] > 0.0:
+        return FIT_NOT_CONVERGED, found.used, 0
+    if n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap:
+        found = _climb_scaled(pixel, tools, best, found)
+    if found.loglik > before:
+        examine(pixel, tools, best, out)
+    bias_gap = min(gap, found.loglik - found.runner_up)
+    gap = min(bias_gap, found.loglik - null)
+    if task.amplitudes.size > 0:
+        found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
+    out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
     # the density has told whether there is a gain: it knows no other law than one Gaussian does
-    above_null = math.inf if known else loglik - null
-    return judge(pixel, limits, best, above_null, bias_gap), used, freedom
+    above_null = math.inf if known else found.loglik - null
+    return judge(pixel, limits, best, above_null, bias_gap), found.used, int(out[DEGREES])

@@ -45,7 +45,8 @@ def _search_arguments() -> tuple[Any, ...]:
     tools = numba.types.NamedTuple(
         types_of((_LIMITS, evaluate, climb_on, np.zeros((1, 1)), scratch)), search_numba.Tools
     )
-    return pixel, tools, pack([SampleLaw()], 1), 0, _VECTOR, _VECTOR, 0.0, _VECTOR, _VECTOR
+    task = search_numba.Task(pack([SampleLaw()], 1), 0, _VECTOR, _VECTOR, 0.0)
+    return pixel, tools, task, _VECTOR, _VECTOR
 
 
 @functools.cache

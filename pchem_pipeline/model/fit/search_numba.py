@@ -50,8 +50,8 @@ EXPOSURE_AT_BOUND, BIAS_AMBIGUOUS = int(FitStatus.EXPOSURE_AT_BOUND), int(FitSta
 NOT_INFORMATIVE, COARSE_STEPS = int(FitStatus.NOT_INFORMATIVE), int(FitStatus.COARSE_STEPS)
 
 # columns of a row of results
-LOG_LIKELIHOOD, GAP, CHI2, OUTLYING, AMPLITUDE, SATELLITE_WEIGHT = range(6)
-N_OUT = 6
+LOG_LIKELIHOOD, GAP, CHI2, DEGREES, OUTLYING, AMPLITUDE, SATELLITE_WEIGHT = range(7)
+N_OUT = 7
 
 CLEAR_GAP = 30.0  # nats: a neighbour this far below is not climbed to the end
 SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
@@ -65,6 +65,7 @@ _MOST_MOVES = 40
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
+_SAME_COMB = 1e-3  # nats: two maxima of one comb, farther apart in height than climbs to one of them
 
 SMALLEST_EXPECTATION = 5.0
 FITTED_PARAMETERS = 4  # of one sample
@@ -85,6 +86,40 @@ class Tools(NamedTuple):
     climb: Any
     basis: FloatArray
     scratch: Scratch
+
+
+class Task(NamedTuple):
+    """What is asked of a search, and what is known before.
+
+    Attributes:
+        law: of all pixels.
+        row: of the pixel in it.
+        amplitudes: of free satellites to try, e-.
+        near: theta near the maximum, v with the rounding; its step is 0 where nothing is known.
+        gap: nats of that answer above its runner-up.
+    """
+
+    law: Law
+    row: int
+    amplitudes: FloatArray
+    near: FloatArray
+    gap: float
+
+
+class Found(NamedTuple):
+    """How far a search has come.
+
+    Attributes:
+        loglik: log-likelihood of the best maximum, -inf without one.
+        runner_up: that of the next one.
+        used: evaluations.
+        degenerate: a climb ran towards one Gaussian.
+    """
+
+    loglik: float
+    runner_up: float
+    used: int
+    degenerate: bool | np.bool_
 
 
 @kernel(borrows=True)
@@ -205,9 +240,7 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
 
 
 @kernel(inline=True)
-def _settled(
-    pixel: Pixel, theta: FloatArray, clear: bool, chi2: float, freedom: int, score: float
-) -> tuple[bool, bool]:
+def _settled(pixel: Pixel, theta: FloatArray, clear: bool, out: FloatArray) -> tuple[bool, bool]:
     """Tell whether a maximum fits well, its gain settled, and whether other starts have a chance at all.
 
     They have none where the fit is good, nor where it is poor and the side lobe all the same far out of the
@@ -217,13 +250,12 @@ def _settled(
         pixel: its samples.
         theta: the maximum.
         clear: a side lobe of one of several samples stands clear of the noise.
-        chi2: of the goodness of fit.
-        freedom: its degrees of freedom.
-        score: as a standard normal deviate.
+        out: with the goodness of fit.
     """
     n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
-    good = score < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
-    of_the_model = n == 1 and freedom > 0 and lobe > _SURE_LOBE * math.sqrt(chi2 / max(freedom, 1))
+    good = score_of(out) < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
+    misfit = math.sqrt(out[CHI2] / max(out[DEGREES], 1.0))
+    of_the_model = n == 1 and out[DEGREES] > 0.0 and lobe > _SURE_LOBE * misfit
     return good, not (good or of_the_model)
 
 
@@ -316,16 +348,25 @@ def outlying(pixel: Pixel, floor: float) -> float:
 
 
 @kernel(borrows=True)
-def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> tuple[float, int, float]:
-    """Evaluate at a maximum; return log-likelihood, degrees of freedom and score of the goodness of fit.
+def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> float:
+    """Evaluate at a maximum; return the log-likelihood.
 
-    Its chi-square and the number of samples that are not expected go to ``out``; the evaluation to `AT_BEST`.
+    The goodness of fit and the number of samples that are not expected go to ``out``; the evaluation to
+    `AT_BEST`.
     """
     scratch = tools.scratch
     loglik: float = tools.evaluate(pixel, theta, True, scratch, scratch.evaluations[AT_BEST])
     out[OUTLYING] = outlying(pixel, tools.limits.floor)
     out[CHI2], freedom = goodness(pixel)
-    return loglik, freedom, normal_score(out[CHI2], freedom)
+    out[DEGREES] = float(freedom)
+    return loglik
+
+
+@kernel(inline=True)
+def score_of(out: FloatArray) -> float:
+    """Return the goodness of fit in a row of results as a standard normal deviate."""
+    score: float = normal_score(out[CHI2], int(out[DEGREES]))
+    return score
 
 
 @kernel(borrows=True)
@@ -360,34 +401,99 @@ def judge(pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, gap
     return status
 
 
-def search_density(
+@kernel(inline=True)
+def _next_start(scratch: Scratch, theta: FloatArray) -> bool:
+    """Take the highest of the starts; False where none is left."""
+    heights, which = scratch.small[HEIGHTS], 0
+    for i in range(1, N_KEPT):
+        if heights[i] > heights[which]:
+            which = i
+    if heights[which] == -math.inf:
+        return False
+    heights[which] = -math.inf
+    copy(scratch.small[KEPT_STARTS + which], theta)
+    return True
+
+
+@kernel(borrows=True)
+def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray) -> Found:
+    """Examine a new best maximum and its neighbours; the likeliest of them is kept.
+
+    No neighbour is climbed to where the fit is good and much better than any neighbour of such a pixel: were
+    a neighbour the right one, the fit could not be good.
+    """
+    n, loglik, runner_up, used = pixel.facts.shape[0], found.loglik, found.runner_up, found.used + 1
+    at_best = examine(pixel, tools, best, out)
+    if n == 1:
+        good, _ = _settled(pixel, best, clear, out)
+        expected = expected_gap(pixel.facts[0, N_FRAMES], best)
+        sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
+        if good and out[DEGREES] > 0.0 and expected > sure and best[n + STEP] > _FINE_STEP:
+            return Found(at_best, max(runner_up, at_best - expected), used, found.degenerate)
+    higher, beside, count = climb_neighbours(pixel, tools, best, loglik)
+    used += count
+    if higher > loglik:
+        at_best = examine(pixel, tools, best, out)
+        used += 1
+    return Found(at_best, max(beside, runner_up), used, found.degenerate)
+
+
+@kernel(borrows=True)
+def _climb_start(
     pixel: Pixel,
     tools: Tools,
-    law: Law,
-    index: int,
-    amplitudes: FloatArray,
-    near: FloatArray,
-    gap: float,
+    clear: bool,
+    found: Found,
+    trial: FloatArray,
     best: FloatArray,
     out: FloatArray,
+) -> Found:
+    """Climb from ``trial``; a higher maximum takes the place of ``best``."""
+    n, cells = pixel.facts.shape[0], tools.limits.cells
+    known, goal = best[n + STEP] > 0.0, from_start()
+    if known and n == 1:  # of several samples, one comb may have two maxima
+        goal = Goal(np.bool_(True), found.loglik - CLEAR_GAP, found.loglik, np.bool_(False))
+    outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
+    used = found.used + count
+    if outcome == DEGENERATE:
+        return Found(found.loglik, found.runner_up, used, np.bool_(True))
+    same = known and same_place(best, trial, cells)
+    least = found.loglik + _SAME_COMB if same else found.loglik
+    if outcome != CONVERGED or loglik <= least:
+        runner_up = found.runner_up if same else max(found.runner_up, loglik)
+        return Found(found.loglik, runner_up, used, found.degenerate)
+    runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
+    copy(trial, best)
+    weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, used, found.degenerate), best, out)
+    return weighed
+
+
+@kernel(inline=True)
+def _stay_near(
+    pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
+) -> tuple[bool, float, int]:
+    """Climb from what is known; tell whether that fits well, with the log-likelihood and evaluations."""
+    copy(task.near, trial)
+    outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
+    if outcome != CONVERGED:
+        return False, loglik, used
+    examine(pixel, tools, trial, out)
+    return score_of(out) < SUSPICIOUS, loglik, used
+
+
+def search_density(
+    pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
 ) -> tuple[int, int, int]:
     """Find the most likely parameters of one pixel with the density.
 
-    Where an answer is known to be near, the maximum next to it is taken as long as it fits well.
-
-    The first start is climbed from, and its neighbours, unless the fit is good and much better than
-    any neighbour of such a pixel: were a neighbour the right one, the fit could not be good. Where the
-    goodness of fit or a side lobe in the noise raises suspicion, the other starts follow; the likeliest
-    maximum is kept.
+    Where an answer is known to be near, the maximum next to it is taken as long as it fits well. Otherwise
+    the first start is climbed from; where the goodness of fit or a side lobe in the noise raises suspicion,
+    the other starts follow; the likeliest maximum is kept.
 
     Args:
         pixel: its samples.
         tools: of the search, with the density; out: score and information at the maximum in `AT_BEST`.
-        law: of a search with the cells.
-        index: of a search with the cells.
-        amplitudes: of a search with the cells.
-        near: theta near the maximum; its step is 0 where nothing is known.
-        gap: nats of that answer above its runner-up.
+        task: what is known.
         best: out, theta at the maximum; its step is 0 where there is none.
         out: out, a row of results; the columns are named at the top of this module.
 
@@ -395,70 +501,28 @@ def search_density(
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
     n, trial, limits = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits
-    heights, kept = tools.scratch.small[HEIGHTS], tools.scratch.small[KEPT_STARTS:HEIGHTS]
-    place = n + STEP
-    best_loglik, runner_up = -math.inf, -math.inf
-    goal = from_start()
-    null = loglik_without_gain(pixel)
-    sure = max(_SURE_GAP, _SURE_THRESHOLDS * limits.gap)
-    used = freedom = 0
-    degenerate = False
-    best[place] = 0.0
-    if near[place] > 0.0:
-        copy(near, trial)
-        outcome, loglik, used = climb_on(pixel, tools, goal, trial, trial)
-        if outcome == CONVERGED:
-            _, freedom, score = examine(pixel, tools, trial, out)
-            if score < SUSPICIOUS:
-                copy(trial, best)
-                out[LOG_LIKELIHOOD], out[GAP] = loglik, min(gap, loglik - null)
-                return judge(pixel, limits, best, loglik - null, math.inf), used + 1, freedom
+    null, used = loglik_without_gain(pixel), 0
+    best[n + STEP] = 0.0
+    if task.near[n + STEP] > 0.0:
+        fits, loglik, used = _stay_near(pixel, tools, task, trial, out)
+        if fits:
+            copy(trial, best)
+            out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
+            return judge(pixel, limits, best, loglik - null, math.inf), used + 1, int(out[DEGREES])
+    found = Found(-math.inf, -math.inf, used, np.bool_(False))
     for attempt in range(n_attempts(n)):
         clear, count = fill_starts(attempt, pixel, tools.basis, tools.evaluate, best, tools.scratch)
-        used += count
-        unsure = True
+        before = found.loglik
+        found = Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
         for _ in range(1 if n == 1 or (clear and attempt == 0) else N_KEPT):
-            which = 0
-            for i in range(1, N_KEPT):
-                if heights[i] > heights[which]:
-                    which = i
-            if heights[which] == -math.inf:
+            if not _next_start(tools.scratch, trial):
                 break
-            heights[which] = -math.inf
-            copy(kept[which], trial)
-            if n > 1 and best[place] > 0.0 and same_place(best, trial, tools.limits.cells):
-                continue
-            outcome, loglik, count = climb_on(pixel, tools, goal, trial, trial)
-            used += count
-            if outcome == DEGENERATE:
-                degenerate = True
-                continue
-            if best[place] > 0.0 and same_place(best, trial, tools.limits.cells):
-                continue
-            if outcome != CONVERGED or loglik <= best_loglik:
-                runner_up = max(runner_up, loglik)
-                continue
-            runner_up = max(runner_up, best_loglik)
-            copy(trial, best)
-            best_loglik, freedom, score = examine(pixel, tools, best, out)
-            used += 1
-            good, unsure = _settled(pixel, best, clear, out[CHI2], freedom, score)
-            if n == 1:
-                expected = expected_gap(pixel.facts[0, N_FRAMES], best)
-                if good and freedom > 0 and expected > sure and best[place] > _FINE_STEP:
-                    runner_up = max(runner_up, best_loglik - expected)
-                    break
-            higher, beside, count = climb_neighbours(pixel, tools, best, loglik)
-            used += count
-            runner_up = max(beside, runner_up)
-            if higher > loglik:
-                best_loglik, freedom, score = examine(pixel, tools, best, out)
-                used += 1
-                good, unsure = _settled(pixel, best, clear, out[CHI2], freedom, score)
-        if not unsure:
+            found = _climb_start(pixel, tools, clear, found, trial, best, out)
+        if found.loglik > before and not _settled(pixel, best, clear, out)[1]:
             break
-    if not best[place] > 0.0:
-        return GAIN_NOT_IDENTIFIED if degenerate else FIT_NOT_CONVERGED, used, 0
-    out[LOG_LIKELIHOOD] = best_loglik
-    out[GAP] = best_loglik - max(runner_up, null)
-    return judge(pixel, limits, best, best_loglik - null, best_loglik - runner_up), used, freedom
+    if not best[n + STEP] > 0.0:
+        return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, found.used, 0
+    out[LOG_LIKELIHOOD] = found.loglik
+    out[GAP] = found.loglik - max(found.runner_up, null)
+    word = judge(pixel, limits, best, found.loglik - null, found.loglik - found.runner_up)
+    return word, found.used, int(out[DEGREES])

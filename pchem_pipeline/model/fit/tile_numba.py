@@ -13,7 +13,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import enclose, invert_arrow, to_natural
 from pchem_pipeline.model.errors.information_numba import fill_squared_scores
 from pchem_pipeline.model.fit.climb_numba import Limits, min_log_variance
-from pchem_pipeline.model.fit.search_numba import FIT_NOT_CONVERGED, NO_DATA, TOO_FEW_BINS, Tools
+from pchem_pipeline.model.fit.search_numba import FIT_NOT_CONVERGED, NO_DATA, TOO_FEW_BINS, Task, Tools
 from pchem_pipeline.model.law.cells_numba import Law, resolve
 from pchem_pipeline.model.law.pixel_numba import (
     AT_BEST,
@@ -248,7 +248,8 @@ def fit_tile(
             gap = starts.gaps[index]
         tried = starts.looked[index if starts.looked.size > 1 else 0]
         amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
-        status, used, words[FREEDOM] = search(pixel, tools, law, index, amplitudes, near, gap, best, out)
+        task = Task(law, index, amplitudes, near, gap)
+        status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
         words[EVALUATIONS] += used
         if best[n + STEP] > 0.0:
             parameters, covariance = answers.parameters[index], answers.covariance[index]
