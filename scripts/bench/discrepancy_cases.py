@@ -21,7 +21,7 @@ OUTSIDE = ("trap_limited_lag", "self_trigger_cut", "output_crosstalk", "checkerb
 #: left out of the library on purpose; those of ``SEALED`` are for the last look, when nothing changes
 TRIED = (
     "temporal_filter", "corner_glow", "slipped_rows", "shifted_rows", "settling_rows", "tap_gain",
-    "black_clamp", "dead_time", "gain_stitch", "missing_codes", "row_swap", "block_mean",
+    "black_clamp", "dead_time", "gain_stitch", "hysteresis", "row_swap", "block_mean",
 )  # fmt: skip
 SEALED = (
     "mains_gain", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",

@@ -126,19 +126,22 @@ class GainStitch(Hidden):
         return np.where(dn > self.code, self.code + (1 + self.strength) * (dn - self.code), dn)
 
 
-class MissingCodes(Hidden):
-    """Codes that never come, regularly; their samples read one less. Strength: share of samples moved."""
+class Hysteresis(Hidden):
+    """A sample is drawn towards the one delivered before, whatever its size; strength: DN."""
 
-    tag: ClassVar[str] = "missing_codes"
-    s95: ClassVar[float] = 2e-3
-    most: ClassVar[float] = 1.0
+    tag: ClassVar[str] = "hysteresis"
+    s95: ClassVar[float] = 0.05
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
 
     def draw(self):
-        self.period = int(self.pick("period", 11, 13, 19))
+        self.before = None
 
     def convert(self, t, dn, code):
-        moved = (code % self.period == 5) & (self.rng.random(code.shape) < self.period * self.strength)
-        return code - moved
+        found = code
+        if self.before is not None:
+            found = np.floor(dn + self.strength * np.sign(self.before - dn) + 0.5).astype(np.int64)
+        self.before = found
+        return found
 
 
 class RowSwap(Hidden):
@@ -317,7 +320,7 @@ class NegativeGhost(Hidden):
 
 TRIED = (
     "temporal_filter", "corner_glow", "slipped_rows", "shifted_rows", "settling_rows", "tap_gain",
-    "black_clamp", "dead_time", "gain_stitch", "missing_codes", "row_swap", "block_mean",
+    "black_clamp", "dead_time", "gain_stitch", "hysteresis", "row_swap", "block_mean",
 )  # fmt: skip
 SEALED = (
     "mains_gain", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",

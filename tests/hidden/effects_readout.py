@@ -130,7 +130,7 @@ class AdcDnl(Hidden):
     most: ClassVar[float] = 0.9
 
     def draw(self):
-        kind = self.pick("kind", "bit", "random", "one_code", p=(0.6, 0.25, 0.15))
+        kind = self.pick("kind", "bit", "random", "one_code", "missing", p=(0.6, 0.25, 0.075, 0.075))
         codes = np.arange(2**self.sensor.bits + 2)
         if kind == "bit":
             bit = self.pick("bit", 0, 1, 2, 3, p=(0.4, 0.25, 0.2, 0.15))
@@ -140,6 +140,9 @@ class AdcDnl(Hidden):
             edges = np.clip(
                 2.5 / np.sqrt(2) * self.strength * self.rng.standard_normal(codes.size), -0.4, 0.4
             )
+        elif kind == "missing":
+            period = int(self.pick("period", 11, 13, 19))
+            edges = min(self.strength * np.sqrt(2 * period), 1.0) * (codes % period == 5)
         else:
             low, high = self.sensor.code_range
             code = int(self.rng.uniform(low + 0.1 * (high - low), high - 0.3 * (high - low)))

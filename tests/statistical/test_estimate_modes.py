@@ -157,6 +157,20 @@ def test_edges_are_found_one_by_one():
     assert np.corrcoef(np.diff(true), np.diff(found.edges))[0, 1] > 0.8
 
 
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_missing_codes_are_edges_that_nearly_coincide(share):
+    frames = taken(TRUTH, n_frames=N_FRAMES, seed=4)
+    # every 13th code reads one less, always or in some of its samples
+    moved = (frames % 13 == 5) & (np.random.default_rng(4).random(frames.shape) < share)
+    (found,) = AdcDnl.estimate(seen((frames - moved).astype(np.uint16)))
+    shifts = dict(enumerate(np.array(found.edges) * found.dnl_lsb, found.first_code))
+    # codes with samples enough on both sides; the fits of the pixels take up some of the rest
+    inner = [shifts.get(code, 0.0) for code in range(109, 175, 13)]
+    assert np.abs(np.array(inner) / share - 1.0).max() < 0.35
+    others = [abs(shift) for code, shift in shifts.items() if code % 13 != 5 and 100 < code < 175]
+    assert np.mean(others) < 0.1 * share
+
+
 def test_limits_are_found_exactly():
     assert Clipping.estimate(evidence_of(Clipping(high=140))) == (Clipping(high=140),)
     assert Clipping.estimate(evidence_of(Clipping(low=96))) == (Clipping(low=96),)

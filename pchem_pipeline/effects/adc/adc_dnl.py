@@ -1,9 +1,10 @@
-"""Differential nonlinearity of the ADC: codes of unequal width.
+"""Differential nonlinearity of the ADC: codes of unequal width, those of no width included.
 
 The lower edge of code c lies at ``c - 1/2 + d_c`` (IEEE Std 1241): shifts of edges from the matching of
 comparators and capacitors, the same code by code for everything that goes through that ADC. An error of the
 weight of one binary bit repeats with the bit's period (period 16 in EMCCD bias frames, Harpsoe et al. 2012,
-A&A 542, A23; binary offsets in many instruments, Boone et al. 2018, PASP 130, 064504).
+A&A 542, A23; binary offsets in many instruments, Boone et al. 2018, PASP 130, 064504). A missing code, of a
+converter or of a look-up table behind it, is one whose two edges coincide: a DNL of -1 LSB.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 __all__ = ["AdcDnl"]
 
 _CHUNK = 1024
-# edges further away would change their order
-_FARTHEST = 0.499
+# random edges further away would change their order, others further than a code leave it
+_FARTHEST_RANDOM, _FARTHEST = 0.499, 1.0
 # fall of chi2 that one of 8 bits must bring
 _BIT_GAIN = 12.0
 
@@ -51,7 +52,7 @@ class AdcDnl(Effect):
 
     tag: Literal["adc_dnl"] = Field(default="adc_dnl", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
-    title: ClassVar[str] = "differential nonlinearity of the ADC (DNL), bit weight error"
+    title: ClassVar[str] = "differential nonlinearity of the ADC (DNL), bit weight error, missing codes"
     source: ClassVar[str] = (
         "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"
     )
@@ -100,16 +101,17 @@ class AdcDnl(Effect):
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal at the ADC (frame, y, x), DN, moved against the edges' shifts."""
-        below = np.floor(values).astype(np.int64)
         if not values.size:
             return values.copy()
-        # between two whole numbers lies one edge, that of the upper one
-        first, last = int(below.min()) + 1, int(below.max()) + 1
+        code = np.rint(values).astype(np.int64)
+        # no edge is further than a code away, so a sample is at most in the next one
+        first, last = int(code.min()), int(code.max()) + 1
         columns = np.arange(context.shape[1]) if self.per_column else None
         shift = self._shifts(first, last, context, columns)
-        index = below - (first - 1)
-        moved = shift[index] if columns is None else shift[index, columns]
-        result: NDArray[Any] = values - moved
+        index = code - first
+        lower, upper = (shift[i] if columns is None else shift[i, columns] for i in (index, index + 1))
+        place = values - code
+        result: NDArray[Any] = values + (place >= 0.5 + upper) - (place < -0.5 + lower)
         return result
 
     def _shifts(
@@ -133,17 +135,22 @@ class AdcDnl(Effect):
         chosen = np.concatenate(parts)[begin : begin + last - first + 1]
         # a width is the difference of two edges
         shift = chosen * (self.dnl_lsb / np.sqrt(2.0))
-        return np.asarray(np.clip(shift, -_FARTHEST, _FARTHEST), np.float64)
+        return np.asarray(np.clip(shift, -_FARTHEST_RANDOM, _FARTHEST_RANDOM), np.float64)
 
-    def _listed(self, codes: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the shifts of the edges of these codes that need no random numbers, DN."""
+    def _listed(self, wanted: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the shifts of the edges of successive codes that need no random numbers, DN.
+
+        Where a list would change the order of two edges they coincide.
+        """
+        codes = np.arange(wanted[0] - 1, wanted[-1] + 1)
         if self.pattern == "bit":
             shift = (codes >> self.bit & 1) - 0.5
         else:
             place = codes - self.first_code
             inside = (place >= 0) & (place < len(self.edges))
             shift = np.where(inside, np.array(self.edges)[place.clip(0, len(self.edges) - 1)], 0.0)
-        return np.asarray(np.clip(self.dnl_lsb * shift, -_FARTHEST, _FARTHEST), np.float64)
+        edges = codes + np.clip(self.dnl_lsb * shift, -_FARTHEST, _FARTHEST)
+        return np.asarray((np.maximum.accumulate(edges) - codes)[1:], np.float64)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

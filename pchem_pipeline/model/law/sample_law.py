@@ -64,7 +64,7 @@ class SampleLaw:
         satellite_weights, satellite_shift_e, satellite_shift_dn, satellite_shift_sigma, satellite_width:
             components of the noise, shape (n or 1, l) each; weights sum to 1 along l.
         edge_first, edge_shift: shift of the lower edge of the codes from ``edge_first`` on, DN; 0 elsewhere.
-            The shifts of neighbouring edges must differ by less than 1 DN.
+            No edge may lie before the one below it.
         clip_low, clip_high: smallest and largest code that comes out, or None.
         outlier_share, outlier_codes: share of the samples that can be anything, evenly over so many codes:
             they then count for nothing in the fit (particle hits).

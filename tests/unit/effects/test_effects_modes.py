@@ -278,6 +278,24 @@ def test_listed_edges_move_and_no_others():
     np.testing.assert_allclose(moved, [0, 0, 0.3, -0.2, 0, 0], atol=2e-3)
 
 
+def test_a_code_whose_edges_coincide_is_missing():
+    effect = AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=101, edges=(1.0, 0.0, 0.0, 0.5, -0.5, 0.0, -1.0))
+    fine = np.arange(97.5, 112.5, 1e-2) + 5e-3
+    codes = coded(effect, fine)
+    # 101 reads 100; the halves of 104 read 103 and 105; 106 reads 107
+    expected = np.rint(fine).astype(int)
+    expected[expected == 101] = 100
+    expected[(expected == 104) & (fine < 104)] = 103
+    expected[expected == 104] = 105
+    expected[expected == 106] = 107
+    np.testing.assert_array_equal(codes, expected)
+
+
+def test_edges_in_the_wrong_order_coincide():
+    effect = AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=101, edges=(1.0, -1.0))
+    assert set(coded(effect, np.arange(99.5, 103.5, 1e-2))) == {100, 102, 103}
+
+
 @pytest.mark.parametrize("bit", [0, 1, 3])
 def test_a_wrong_bit_has_its_period(bit):
     moved = edges_of(AdcDnl(dnl_lsb=0.4, pattern="bit", bit=bit), 63, 96) - (np.arange(64, 97) - 0.5)
