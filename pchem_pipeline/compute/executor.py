@@ -17,6 +17,7 @@ from pchem_pipeline.compute.environment import available_workers, prepare_enviro
 from pchem_pipeline.compute.settings import ComputeSettings
 
 __all__ = [
+    "DaskPoolExecutor",
     "Executor",
     "Notices",
     "OnResult",

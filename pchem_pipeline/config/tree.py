@@ -30,8 +30,10 @@ class RunSettings(Section):
         description="the run's store (zarr): a folder, or a URL of an object storage: s3://bucket/run.zarr",
     )
     title: str = Field(default="", description="title of the report; empty: the name of the store")
-    tile: Literal[8, 16, 32, 64, 128, 256] = Field(
-        default=64, description="side of a tile, pixels: the unit of work and of storage"
+    tile: Literal["auto", 8, 16, 32, 64, 128, 256] = Field(
+        default="auto",
+        description="side of a tile, pixels: the unit of work and of storage; auto: 64 x 64, "
+        "larger on sensors of more than 80 such tiles",
     )
     allowed_failed_pixels: float = Field(
         default=0.1,

@@ -17,6 +17,7 @@ from typing import Any
 
 from pchem_pipeline.base.kernel_cache import cache_folder, listening
 from pchem_pipeline.compute.environment import available_workers
+from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.files import write_atomic
@@ -36,12 +37,14 @@ _SECTIONS = ("histogram", "model", "fit", "maps", "ensemble")
 def compiled_ahead(config: RunConfig, stages: Sequence[str]) -> Iterator[None]:
     """Compile the kernels of stages in a second process while the first ones run; it ends with the block.
 
-    Nothing is started where the kernels are there, where the work is to be done on one processor, or for no
-    stages. Nothing is lost where the process fails: whoever needs a kernel compiles it.
+    Nothing is started where the kernels are there, where the work is to be done on one processor or in little
+    memory, or for no stages. Nothing is lost where the process fails: whoever needs a kernel compiles it.
     """
     mark = mark_path(config, stages)
     one = min(available_workers(), 2 if config.compute.workers == "auto" else config.compute.workers) < 2
-    if one or not stages or mark.exists():
+    limit = config.compute.max_memory
+    small = limit is not None and limit << 20 < BASE_BYTES + SECOND_PROGRAM_BYTES
+    if one or small or not stages or mark.exists():
         yield
         return
     process = _start({"config": config.model_dump(mode="json", by_alias=True), "stages": list(stages)})

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["StageState", "differences", "fingerprint_content", "rests_on", "setting_values", "status"]
 
+_TILE = "run.tile"
+
 
 @dataclass(frozen=True)
 class StageState:
@@ -61,8 +63,12 @@ def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
 
 
 def setting_values(stage: Stage, context: StageContext) -> dict[str, Any]:
-    """Return the settings that a stage reads, as JSON data."""
-    return {key: setting_of(context.config, key) for key in stage.settings}
+    """Return the settings that a stage reads, as JSON data; of the tiles what they are."""
+    found = {key: setting_of(context.config, key) for key in stage.settings}
+    if found.get(_TILE) == "auto":
+        rows, columns = context.tile
+        found[_TILE] = rows if rows == columns else [rows, columns]
+    return found
 
 
 def _state_of_record(store: RunStore, record: StageRecord) -> str:

@@ -15,6 +15,7 @@ parallel units has one, ``WHOLE``, which is done in this process.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
+from pchem_pipeline.compute.memory import affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
 from pchem_pipeline.run.progress import Reporter
@@ -30,7 +32,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid
+from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -200,9 +202,23 @@ class StageContext:
         depth = self.config.input.bit_depth or self.sensor.bit_depth
         return None if depth is None else (0, 2**depth - 1)
 
+    @property
+    def tile(self) -> tuple[int, int]:
+        """Rows and columns of a tile, as configured; with ``auto`` those that the run has already."""
+        size: Any = self.config.run.tile
+        record = self.store.records.read("histogram") if size == "auto" else None
+        if record is not None:
+            size = record.content.get("settings", {}).get("run.tile", size)
+        return tile_shape(tuple(size) if isinstance(size, list) else size, self.sensor.shape)
+
+    @property
+    def tile_pixels(self) -> int:
+        """Pixels of the largest tile."""
+        return math.prod(min(size, length) for size, length in zip(self.tile, self.sensor.shape, strict=True))
+
     def tiles(self) -> list[Tile]:
         """Return all tiles of the sensor."""
-        return tile_grid(self.sensor.shape, self.config.run.tile)
+        return tile_grid(self.sensor.shape, self.tile)
 
     def tiles_done(self, stage: str) -> set[str]:
         """Return the keys of the tiles that an upstream stage has finished."""
@@ -220,19 +236,21 @@ class StageContext:
         shape: tuple[int, ...],
         *,
         chunks: tuple[int, ...],
+        shards: tuple[int, ...] | None = None,
         dtype: Any = None,
         **attributes: Any,
     ) -> None:
         """Make an array of this stage, unless the stage resumes and has it."""
         if self.fresh or not self.store.has(name):
-            self.store.create_array(name, shape, chunks=chunks, dtype=dtype, attributes=attributes)
+            self.store.create_array(
+                name, shape, chunks=chunks, shards=shards, dtype=dtype, attributes=attributes
+            )
 
     def create_maps(self, names: Sequence[str], **attributes: Any) -> None:
         """Make arrays whose first dimensions are (y, x), one tile per chunk; further ones are whole."""
-        tile = self.config.run.tile
         for name in names:
             rest = tuple(LENGTHS[dim] for dim in VARIABLES[name].dims[2:])
-            self.create(name, (*self.sensor.shape, *rest), chunks=(tile, tile, *rest), **attributes)
+            self.create(name, (*self.sensor.shape, *rest), chunks=(*self.tile, *rest), **attributes)
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
         """Return the units that ``--tiles`` and ``--roi`` choose (all of them without these options)."""
@@ -265,6 +283,7 @@ class StageContext:
         needs: str | None = None,
         by_tiles: bool = True,
         total: int | None = None,
+        unit_bytes: int = 0,
     ) -> dict[str, dict[str, Any]]:
         """Run ``task`` on every unit that is chosen and not done yet, and mark each.
 
@@ -273,10 +292,12 @@ class StageContext:
         tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
         ``--tiles`` and ``--roi`` do not choose, such as blocks of frames. A stage that learns only on its way
         what its units are calls this several times and says in ``total`` how many markers that makes so far;
-        it resumes also under ``--force``, which has made it start anew. Returns the summaries of all
-        finished units by key, earlier runs included.
+        it resumes also under ``--force``, which has made it start anew. ``unit_bytes`` is the memory that a
+        worker takes for a unit: fewer work at once where ``compute.max_memory`` says so. Returns the
+        summaries of all finished units by key, earlier runs included.
 
         Raises:
+            ConfigError: the memory allowed is not enough for one unit.
             InterruptedRunError: a signal asked for a stop; running units were finished.
             InputError: the camera files are gone.
             StoreError: the store cannot be written.
@@ -290,7 +311,7 @@ class StageContext:
         shown = len(self.selected(units) if by_tiles else units)
         undivided = list(units) == [WHOLE]
         # what is not divided is done here, and tells its own steps
-        executor = SerialExecutor() if undivided else self.executor
+        executor = self._affordable(SerialExecutor() if undivided else self.executor, unit_bytes)
         with self.reporter.progress(
             self.stage, shown, unit_name, shown - len(todo), hidden=undivided
         ) as advance:
@@ -310,6 +331,12 @@ class StageContext:
                     raise fatal[0] from fatal[0].__cause__
         self.stop.check()
         return self.store.records.summaries(self.stage, self.fingerprint)
+
+    def _affordable(self, executor: Executor, unit_bytes: int) -> Executor:
+        limit = self.config.compute.max_memory
+        if limit is None or not unit_bytes:
+            return executor
+        return affordable(executor, limit << 20, unit_bytes, f"stage {self.stage}")
 
     def _pending_of(self, units: Sequence[AnyUnit], by_tiles: bool, total: int | None) -> list[AnyUnit]:
         if total is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,8 @@ __all__ = ["CopyUnit", "frames_tile", "run"]
 
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)
+#: files of frames beyond which several chunks share one
+_MANY_FILES = 1500
 #: bytes of frames that a worker holds at once
 _UNIT_BYTES = 128 << 20
 
@@ -91,7 +93,9 @@ def run(context: StageContext) -> None:
     if done is None:
         create_frames(context, reader)
         task = functools.partial(_copy, store=context.store.path, reader=reader)
-    context.run_units(units, task, unit_name="block", by_tiles=False)
+    # the frames of a row of chunks, those that the reader holds, and the compressed ones
+    held = 0 if done else 3 * chunk[0] * chunk[1] * reader.shape[2] * reader.dtype.itemsize
+    context.run_units(units, task, unit_name="block", by_tiles=False, unit_bytes=held)
 
 
 def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, Any]) -> SensorInfo:
@@ -113,7 +117,8 @@ def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, 
 def create_frames(context: StageContext, reader: FrameSequence) -> None:
     """Make the array that the frames are copied to; say so where the disk may be too small."""
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
-    context.create("frames/dn", reader.shape, chunks=chunk, dtype=reader.dtype)
+    shard = shard_shape(reader.shape, chunk)
+    context.create("frames/dn", reader.shape, chunks=chunk, shards=shard, dtype=reader.dtype)
     _warn_of_a_small_disk(context, math.prod(reader.shape) * reader.dtype.itemsize)
 
 
@@ -123,6 +128,19 @@ def chunk_shape(shape: tuple[int, int, int], itemsize: int) -> tuple[int, int, i
     while frames > 16 and frames * min(rows, shape[1]) * shape[2] * itemsize > _UNIT_BYTES:
         frames //= 2
     return min(frames, shape[0]), min(rows, shape[1]), min(columns, shape[2])
+
+
+def shard_shape(shape: tuple[int, int, int], chunk: tuple[int, int, int]) -> tuple[int, int, int] | None:
+    """Return how many of the chunks share a file, along the columns; None where each has its own.
+
+    A unit of the copy is whole rows, so wider files cost no memory, and a pixel is still read by its chunk.
+    """
+    frames, rows, columns = chunk
+    bands = math.ceil(shape[0] / frames) * math.ceil(shape[1] / rows)
+    wide = columns
+    while bands * math.ceil(shape[2] / wide) > _MANY_FILES and wide < shape[2]:
+        wide *= 2
+    return None if wide == columns else (frames, rows, wide)
 
 
 def copy_units(shape: tuple[int, int, int], itemsize: int, chunk: tuple[int, int, int]) -> Iterator[CopyUnit]:
@@ -136,9 +154,13 @@ def copy_units(shape: tuple[int, int, int], itemsize: int, chunk: tuple[int, int
 
 
 def _copy(unit: CopyUnit, *, store: Path, reader: FrameReader) -> dict[str, Any]:
-    """Read the frames of a unit and write them into the store."""
-    region = (slice(unit.t0, unit.t1), slice(unit.y0, unit.y1), slice(None))
-    open_store(store).write("frames/dn", region, frames_tile(reader, unit))
+    """Read the frames of a unit and write them into the store, a row of chunks at a time."""
+    opened = open_store(store)
+    rows = opened.array("frames/dn").chunks[1]
+    for y in range(unit.y0, unit.y1, rows):
+        part = replace(unit, y0=y, y1=min(y + rows, unit.y1))
+        region = (slice(part.t0, part.t1), slice(part.y0, part.y1), slice(None))
+        opened.write("frames/dn", region, frames_tile(reader, part))
     return {}
 
 

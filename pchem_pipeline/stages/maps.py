@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["maps_tile", "run"]
 
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
+#: of the arrays of a tile that are read and made
+_PIXEL_BYTES = 80 * 8
 _NO_TIME = "integration time is not known: no charge rate; give input.integration_time, s"
 
 
@@ -80,7 +82,7 @@ def run(context: StageContext) -> None:
     task = functools.partial(
         _do_tile, store=context.store.path, integration_time=time, rate=context.charge_rate, line=line
     )
-    context.run_units(context.tiles(), task, needs="fit")
+    context.run_units(context.tiles(), task, needs="fit", unit_bytes=context.tile_pixels * _PIXEL_BYTES)
     _summarise(context, names)
 
 
@@ -102,9 +104,9 @@ def _line(context: StageContext) -> _Line | None:
 
 def _create_residuals(context: StageContext, n_samples: int) -> None:
     """Make the arrays of what the line leaves."""
-    tile, shape = context.config.run.tile, context.sensor.shape
+    tile, shape = context.tile, context.sensor.shape
     for name in ("linearity_residual", "linearity_residual_stderr"):
-        context.create(f"samples/{name}", (n_samples, *shape), chunks=(n_samples, tile, tile))
+        context.create(f"samples/{name}", (n_samples, *shape), chunks=(n_samples, *tile))
     context.create_maps(["samples/linearity_chi2", "samples/linearity_p"])
 
 

@@ -131,6 +131,7 @@ class RunStore:
         shape: tuple[int, ...],
         *,
         chunks: tuple[int, ...],
+        shards: tuple[int, ...] | None = None,
         dtype: Any = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> None:
@@ -140,6 +141,8 @@ class RunStore:
             name: path in :data:`pchem_pipeline.base.variables.VARIABLES`.
             shape: its shape.
             chunks: chunk shape; one task must write whole chunks.
+            shards: multiples of the chunks that share a file; one task must write them whole. None: each
+                chunk is a file.
             dtype: only for variables whose type the data decide.
             attributes: further attributes (JSON).
 
@@ -156,6 +159,7 @@ class RunStore:
                 name,
                 shape=shape,
                 chunks=tuple(max(1, min(c, s)) for c, s in zip(chunks, shape, strict=True)),
+                shards=shards,
                 dtype=kind,
                 fill_value=np.nan if kind.kind == "f" else 0,
                 compressors=_compressors(name, kind),

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 from pchem_pipeline.base.errors import ConfigError
 
-__all__ = ["Tile", "parse_tiles", "roi_tiles", "tile_grid"]
+__all__ = ["Tile", "TileSize", "parse_tiles", "roi_tiles", "tile_grid", "tile_shape"]
+
+#: The setting: a side, rows and columns, or chosen by the sensor.
+TileSize = int | tuple[int, int] | Literal["auto"]
+
+#: The side of the smallest tile that is chosen, and the pixels that it has at least on a sensor of few rows.
+_SIDE, _FEW_PIXELS = 64, 2048
+#: Tiles beyond which they grow: each is some 50 files.
+_MANY = 80
+#: Columns beyond which tiles grow in rows: bands of rows over the full width are read and counted at once.
+_WIDE = 2048
 
 
 @dataclass(frozen=True, order=True)
@@ -41,14 +53,47 @@ class Tile:
         """Rows and columns of the tile."""
         return self.y1 - self.y0, self.x1 - self.x0
 
+    def within(self, part: tuple[slice, slice]) -> tuple[slice, slice]:
+        """Return where a piece of the tile lies on the sensor."""
+        y, x = part
+        return slice(self.y0 + y.start, self.y0 + y.stop), slice(self.x0 + x.start, self.x0 + x.stop)
 
-def tile_grid(shape: tuple[int, int], size: int) -> list[Tile]:
+    def parts(self) -> Iterator[tuple[slice, slice]]:
+        """Yield pieces of at most 64 x 64 pixels, as indices into an array of the tile."""
+        ny, nx = self.shape
+        for y in range(0, ny, _SIDE):
+            for x in range(0, nx, _SIDE):
+                yield slice(y, min(y + _SIDE, ny)), slice(x, min(x + _SIDE, nx))
+
+
+def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:
+    """Return rows and columns of the tiles of a sensor of some shape (y, x).
+
+    With ``auto`` they are 64 x 64, and wider, then higher, on larger sensors: a tile is an amount of work and
+    some 50 files, and neither should be small a thousand times.
+    """
+    if size != "auto":
+        return size if isinstance(size, tuple) else (size, size)
+    ny, nx = sensor
+    rows = columns = _SIDE
+    while columns < nx and min(rows, ny) * columns < _FEW_PIXELS:
+        columns *= 2
+    while -(-ny // rows) * -(-nx // columns) > _MANY:
+        if columns < min(nx, _WIDE):
+            columns *= 2
+        else:
+            rows *= 2
+    return rows, columns
+
+
+def tile_grid(shape: tuple[int, int], size: TileSize) -> list[Tile]:
     """Return the tiles of a sensor of ``shape`` (y, x), row by row; edge tiles may be smaller."""
     ny, nx = shape
+    rows, columns = tile_shape(size, shape)
     return [
-        Tile(y0 // size, x0 // size, y0, min(y0 + size, ny), x0, min(x0 + size, nx))
-        for y0 in range(0, ny, size)
-        for x0 in range(0, nx, size)
+        Tile(y0 // rows, x0 // columns, y0, min(y0 + rows, ny), x0, min(x0 + columns, nx))
+        for y0 in range(0, ny, rows)
+        for x0 in range(0, nx, columns)
     ]
 
 

@@ -75,13 +75,13 @@ def run(context: StageContext) -> None:
         )
     source = open_source(context)
     n_frames, ny, nx = source.shape
-    tile = context.config.run.tile
-    depth = max(1, min(_CHUNK_FRAMES, _BLOCK_BYTES // (tile * nx * 2)))
+    rows_of_tile, columns_of_tile = context.tile
+    depth = max(1, min(_CHUNK_FRAMES, _BLOCK_BYTES // (rows_of_tile * nx * 2)))
     if context.fresh or not context.store.has("electrons/electron_number"):
         context.create(
             "electrons/electron_number",
             (n_frames, ny, nx),
-            chunks=(depth, tile, max(_CHUNK_COLUMNS, tile)),
+            chunks=(depth, rows_of_tile, max(_CHUNK_COLUMNS, columns_of_tile)),
             # not missing_value: xarray would turn the integers into floats
             no_number=NO_NUMBER,
             largest_number=LARGEST_NUMBER,

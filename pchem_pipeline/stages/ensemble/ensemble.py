@@ -58,7 +58,10 @@ __all__ = ["ensemble_tile", "run"]
 #: Frames read at a time, and bytes of histograms of a band.
 _BLOCK_FRAMES = 64
 _BAND_BYTES = 64 << 20
+#: of the maps of a tile
+_PIXEL_BYTES = 40 * 8
 _SUMS = ("integers", "floats")
+_HISTOGRAM = ("origin", "counts", "under", "over")
 
 
 @dataclass(frozen=True)
@@ -180,8 +183,15 @@ def run(context: StageContext) -> None:
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
     job = _Job(store.path, axes, numbered, None if everything else frames, source, truth, effects)
     rows = max(1, _BAND_BYTES // (sensor.nx * fitted.bins * 4))
-    bands = tile_bands(context, "fit", rows, 1 if source is None else source.rows_per_read)
-    done = context.run_units(bands, functools.partial(_do_band, job=job), unit_name="band", needs="fit")
+    bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
+    task = functools.partial(_do_band, job=job)
+    counted = fitted.bins * store.array("histogram/counts").dtype.itemsize
+    held = context.tile_pixels * (2 * counted + _PIXEL_BYTES)
+    if source is not None:
+        highest = max(band.y1 - band.y0 for band in bands)
+        held += highest * sensor.nx * (counted + 2 * _BLOCK_FRAMES * source.dtype.itemsize)
+    unit_name = "tile" if source is None else "band"
+    done = context.run_units(bands, task, unit_name=unit_name, needs="fit", unit_bytes=held)
     finished = [tile for tile in tiles if tile.key in done]
     if finished:
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
@@ -253,36 +263,18 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     store.set_attributes("ensemble_tiles", {"axes": content})
 
 
-def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
-    """Sum over each tile of a band."""
+def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
+    """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
     store = open_store(job.store)
-    rows = (slice(band.y0, band.y1), slice(None))
-    origin = store.read("histogram/origin", rows)
-    counts = store.read("histogram/counts", (*rows, slice(None)))
-    outside = store.read("histogram/under", rows) + store.read("histogram/over", rows)
-    maps = tuple(store.read(f"fit/{name}", rows) for name in PARAMETERS)
-    covariance = None
-    if store.has("fit/correlation"):
-        stderr = np.stack([store.read(f"fit/{name}_stderr", rows) for name in PARAMETERS], axis=-1)
-        covariance = covariance_from(stderr, store.read("fit/correlation", (*rows, slice(None))))
-    chosen, chosen_outside = counts, outside
-    if job.frames is not None:
-        chosen, chosen_outside = _count(job, band, origin, counts)
-    errors = _compare(job, band) if job.truth is not None else {}
+    chosen = None if job.frames is None else _count(job, band)
+    errors = {} if job.truth is None else _compare(job, band)
     for key in band.keys:
         number, tile = job.tiles[key]
-        part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
-        n = math.prod(tile.shape)
-        integers, floats = ensemble_tile(
-            tuple(values[part].ravel() for values in maps),
-            origin[part].ravel(),
-            PixelHistograms(chosen[part].reshape(n, -1), chosen_outside[part].ravel()),
-            PixelHistograms(counts[part].reshape(n, -1), outside[part].ravel()),
-            job.axes,
-            fitted_law(store, [values[part] for values in maps], tile.region),
-            fitted_satellites(store, tile.region),
-            None if covariance is None else covariance[part].reshape(n, 4, 4),
-        )
+        own = None
+        if chosen is not None:
+            part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
+            own = chosen[0][part], chosen[1][part]
+        integers, floats = _sum_tile(store, tile, job, own)
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size
             integers[job.axes.integers["compared"]] = errors[key].n_samples
@@ -292,18 +284,66 @@ def _do_band(band: Band, *, job: _Job) -> dict[str, Any]:
     return {}
 
 
-def _stream(job: _Job, band: Band, frames: tuple[int, int]) -> FrameStream:
+def _sum_tile(
+    store: RunStore, tile: Tile, job: _Job, chosen: tuple[NDArray[Any], NDArray[Any]] | None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what a tile adds to the ensemble.
+
+    Args:
+        store: the run.
+        tile: the tile.
+        job: what is summed.
+        chosen: counts of the chosen frames, and samples outside of the bins; None: all frames.
+    """
+    *maps, origin, counts, under, over = (
+        store.read(name, tile.region)
+        for name in (*(f"fit/{each}" for each in PARAMETERS), *(f"histogram/{each}" for each in _HISTOGRAM))
+    )
+    outside = under + over
+    covariance = None
+    if store.has("fit/correlation"):
+        stderr = [store.read(f"fit/{name}_stderr", tile.region) for name in PARAMETERS]
+        covariance = np.stack(stderr, axis=-1), store.read("fit/correlation", tile.region)
+    rows = []
+    for part in tile.parts():
+        everything = _histograms(counts[part], outside[part])
+        some = everything if chosen is None else _histograms(*(values[part] for values in chosen))
+        place, of_pixels = tile.within(part), [values[part] for values in maps]
+        row = ensemble_tile(
+            tuple(values.ravel() for values in of_pixels),
+            origin[part].ravel(),
+            some,
+            everything,
+            job.axes,
+            fitted_law(store, of_pixels, place),
+            fitted_satellites(store, place),
+            None if covariance is None else _covariance(covariance[0][part], covariance[1][part]),
+        )
+        rows.append(row)
+    return np.sum([row[0] for row in rows], axis=0), np.sum([row[1] for row in rows], axis=0)
+
+
+def _histograms(counts: NDArray[Any], outside: NDArray[Any]) -> PixelHistograms:
+    return PixelHistograms(counts.reshape(outside.size, -1), outside.ravel())
+
+
+def _covariance(stderr: NDArray[np.float64], correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+    return covariance_from(stderr, correlation).reshape(-1, 4, 4)
+
+
+def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:
     """Open the stream of the frames of a band."""
     assert job.source is not None
     return FrameStream(job.source, [(band.y0, band.y1)], _BLOCK_FRAMES, frames=frames)
 
 
-def _count(
-    job: _Job, band: Band, origin: NDArray[Any], like: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+def _count(job: _Job, band: Band | Tile) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     """Histogram the chosen frames of a band on the bins of the stored histograms."""
     assert job.frames is not None
-    counts = np.zeros_like(like)
+    store = open_store(job.store)
+    like = store.array("histogram/counts")
+    origin = store.read("histogram/origin", (slice(band.y0, band.y1), slice(None)))
+    counts = np.zeros((*origin.shape, like.shape[2]), like.dtype)
     under, over = np.zeros((2, *origin.shape), dtype=np.uint32)
     with _stream(job, band, job.frames) as stream:
         for _, (block,) in stream:
@@ -311,11 +351,14 @@ def _count(
     return counts, under + over
 
 
-def _compare(job: _Job, band: Band) -> dict[str, ErrorTally]:
+def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
     store, (y0, x0, t0) = open_store(job.store), job.truth
+    rows = (slice(band.y0, band.y1), slice(None))
+    fitted = [store.read(f"fit/{name}", rows) for name in PARAMETERS]
+    maps = deciding_maps(fitted, job.effects, fitted_added_exposure(store, rows), pixel_places(store, rows))
     first, end = job.frames or (0, job.source.shape[0])
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["fit_tile", "run"]
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
+#: of all that is kept of a pixel of a tile until it is written, twice
+_PIXEL_BYTES = 2 * 40 * 8
 
 
 def fit_tile(
@@ -96,7 +98,9 @@ def run(context: StageContext) -> None:
         adc_limits=context.adc_limits,
         model=context.model,
     )
-    done = context.run_units(context.tiles(), task, needs="histogram")
+    counts = context.store.array("histogram/counts")
+    held = context.tile_pixels * (2 * counts.shape[2] * counts.dtype.itemsize + _PIXEL_BYTES)
+    done = context.run_units(context.tiles(), task, needs="histogram", unit_bytes=held)
     judge_sensor(context)
     if len(done) == context.n_keys:
         drop_fit(context.store.path)
@@ -130,8 +134,21 @@ def _do_tile(
     start = kept_fit(store, tile.region)
     effects, set_aside = model.effects, model.settings.set_aside_e
     added = read_added_exposure(run_store, model, tile.region)
-    places = pixel_places(run_store, tile.region)
-    arrays = fit_tile(histogram, settings, adc_limits, effects, set_aside, start, added, places)
+    arrays: dict[str, NDArray[Any]] = {}
+    for part in tile.parts():
+        found = fit_tile(
+            {name: values[part] for name, values in histogram.items()},
+            settings,
+            adc_limits,
+            effects,
+            set_aside,
+            None if start is None else start[part],
+            None if added is None else added.of(part),
+            pixel_places(run_store, tile.within(part)),
+        )
+        for name, values in found.items():
+            whole = arrays.setdefault(name, np.empty(tile.shape + values.shape[2:], values.dtype))
+            whole[part] = values
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]

@@ -106,12 +106,12 @@ def fit_samples(context: StageContext) -> None:
     Raises:
         StoreError: histograms of a sample are missing, or the store refuses.
     """
-    samples, tile, shape = context.sensor.samples, context.config.run.tile, context.sensor.shape
+    samples, tile, shape = context.sensor.samples, context.tile, context.sensor.shape
     create_fit_maps(context)
     for name in _OF_SAMPLES:
-        context.create(f"samples/{name}", (len(samples), *shape), chunks=(len(samples), tile, tile))
+        context.create(f"samples/{name}", (len(samples), *shape), chunks=(len(samples), *tile))
     rest = (len(samples) + 3,) * 2
-    context.create("samples/covariance", (*shape, *rest), chunks=(tile, tile, *rest))
+    context.create("samples/covariance", (*shape, *rest), chunks=(*tile, *rest))
     how = SampleFit(
         [sample.bias for sample in samples],
         context.sensor.shown,

@@ -31,7 +31,7 @@ def judge_sensor(context: StageContext) -> int:
         StoreError: the store refuses.
     """
     store, shape = context.store, context.sensor.shape
-    bands = list(_bands(shape, context.config.run.tile))
+    bands = list(_bands(shape, context.tile[0]))
     every = -(-shape[0] * shape[1] // _LARGEST_POOL)
     kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
     chosen = []
@@ -56,10 +56,10 @@ def judge_sensor(context: StageContext) -> int:
     return found
 
 
-def _bands(shape: tuple[int, int], tile: int) -> Iterator[_Region]:
+def _bands(shape: tuple[int, int], rows: int) -> Iterator[_Region]:
     """Return the rows of the sensor, as high as a tile: whole chunks."""
-    for first in range(0, shape[0], tile):
-        yield slice(first, min(first + tile, shape[0])), slice(0, shape[1])
+    for first in range(0, shape[0], rows):
+        yield slice(first, min(first + rows, shape[0])), slice(0, shape[1])
 
 
 def _judged(store: RunStore, band: _Region) -> Judged:

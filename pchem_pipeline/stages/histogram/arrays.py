@@ -36,19 +36,17 @@ def row_frames(ny: int) -> int:
 def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
     """Make the arrays of the stage for a stack of some shape (frames, rows, columns)."""
     n_frames, ny, nx = shape
-    settings, tile = context.config.histogram, context.config.run.tile
-    context.create(
-        "histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
-    )
+    settings, tile = context.config.histogram, context.tile
+    context.create("histogram/counts", (ny, nx, bins), chunks=(*tile, bins), dtype=counts_dtype(n_frames))
     context.create_maps([f"histogram/{name}" for name in MAPS])
     if not settings.summaries:
         context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
         return
     context.create_maps([f"summary/{name}" for name in COVARIANCES])
     for name, length in (("open_sums", 7), ("open_covariances", 3)):
-        context.create(f"summary/{name}", (length, ny, nx), chunks=(length, tile, tile))
+        context.create(f"summary/{name}", (length, ny, nx), chunks=(length, *tile))
     starts = block_starts(n_frames, settings.block_frames)
-    rows = max(tile, ROW_GROUP)
+    rows = max(tile[0], ROW_GROUP)
     for name in ("block_sum", "block_sum_square"):
         context.create(f"summary/{name}", (starts.size, ny, nx), chunks=(CHUNK_BLOCKS, rows, nx))
     for name in ("row_sum", "row_sum_square"):
@@ -66,13 +64,11 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
 def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
     """Make the arrays along time longer, and the counts wide enough."""
     store, n_frames = context.store, shape[0]
-    tile, length = context.config.run.tile, context.config.histogram.block_frames
+    tile, length = context.tile, context.config.histogram.block_frames
     open_store.cache_clear()
     if store.array("histogram/counts").dtype != counts_dtype(n_frames):
         counts = (*shape[1:], bins)
-        store.create_array(
-            "histogram/counts", counts, chunks=(tile, tile, bins), dtype=counts_dtype(n_frames)
-        )
+        store.create_array("histogram/counts", counts, chunks=(*tile, bins), dtype=counts_dtype(n_frames))
     if context.config.input.mode == "copy":
         store.resize("frames/dn", n_frames)
     if context.config.histogram.summaries:

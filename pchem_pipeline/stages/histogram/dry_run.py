@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
 from pchem_pipeline.stages.histogram.memory import (
-    BASE_BYTES,
     allowed_bytes,
     band_bytes,
     single_pass_bytes,
     worker_count,
 )
+from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,7 +64,7 @@ class Plan:
     shape: tuple[int, int, int]
     bins: int
     tiles: int
-    tile: int
+    tile: tuple[int, int]
     workers: int
     single_pass: bool
     input_bytes: int
@@ -78,7 +79,7 @@ class Plan:
         n, ny, nx = self.shape
         how = "once" if self.single_pass else "twice, by bands of rows (more compute.max_memory: once)"
         return [
-            f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tiles of {self.tile} x {self.tile}, "
+            f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tiles of {self.tile[0]} x {self.tile[1]}, "
             f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
             f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files {how}: "
             f"{self.read_bytes / 1e9:.3g} GB in all; writes about {self.written_bytes / 1e9:.2g} GB",
@@ -132,8 +133,8 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     return Plan(
         shape=frames.shape,
         bins=bins,
-        tiles=math.ceil(ny / config.run.tile) * math.ceil(nx / config.run.tile),
-        tile=config.run.tile,
+        tiles=len(tile_grid((ny, nx), config.run.tile)),
+        tile=tile_shape(config.run.tile, (ny, nx)),
         workers=workers,
         single_pass=single_pass,
         input_bytes=size,

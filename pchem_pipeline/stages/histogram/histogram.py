@@ -123,7 +123,9 @@ def run(context: StageContext) -> None:
     job = CountJob(context.store.path, source.shape, bins, context.config.histogram)
     threads = max(1, context.executor.workers // max(1, len(context.pending(bands))))
     task = functools.partial(_do_band, job=job, source=source, threads=threads)
-    done = context.run_units(bands, task, unit_name="band")
+    row = bytes_per_row(source.shape[2], source.shape[0], source.dtype.itemsize, bins, job.settings)
+    held = row * max(band.y1 - band.y0 for band in bands)
+    done = context.run_units(bands, task, unit_name="band", unit_bytes=held)
     if len(done) == context.n_keys:
         _end(context, bands)
 
@@ -208,8 +210,7 @@ def _copy_histograms(context: StageContext) -> None:
 
     given = read_histograms(context.config.input, context.base_dir)
     ny, nx, bins = given.counts.shape
-    tile = context.config.run.tile
-    context.create("histogram/counts", (ny, nx, bins), chunks=(tile, tile, bins), dtype=given.counts.dtype)
+    context.create("histogram/counts", (ny, nx, bins), chunks=(*context.tile, bins), dtype=given.counts.dtype)
     context.create_maps([f"histogram/{name}" for name in MAPS])
     context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
     task = functools.partial(_copy_tile, store=context.store.path, given=given)

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.compute.environment import available_memory, available_workers
+from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.stages.histogram.arrays import CHUNK_BLOCKS, COLUMN_FRAMES, ROW_FRAMES
 from pchem_pipeline.stages.ingest import chunk_shape
+from pchem_pipeline.store.tiles import tile_shape
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
 
 __all__ = [
-    "BASE_BYTES",
     "allowed_bytes",
     "band_bytes",
     "bytes_per_row",
@@ -26,9 +27,6 @@ __all__ = [
     "single_pass_rows",
     "worker_count",
 ]
-
-#: the program with its libraries and compiled kernels
-BASE_BYTES = 240 << 20
 
 
 def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:
@@ -77,7 +75,7 @@ def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int
 
 def single_pass_rows(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
     """Return the rows that must stay together in a single pass: of tiles, groups, chunks of the copy."""
-    step = max(config.run.tile, ROW_GROUP)
+    step = max(tile_shape(config.run.tile, shape[1:])[0], ROW_GROUP)
     if config.input.mode == "copy":
         step = math.lcm(step, chunk_shape(shape, dtype.itemsize)[1])
     return step

@@ -27,8 +27,8 @@ def copy_shown_sample(context: StageContext) -> None:
         StoreError: the run of the sample is gone, or the store refuses.
     """
     place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
-    counts, tile = RunStore.open(place).array("histogram/counts"), context.config.run.tile
-    chunks = (tile, tile, counts.shape[2])
+    counts, tile = RunStore.open(place).array("histogram/counts"), context.tile
+    chunks = (*tile, counts.shape[2])
     context.create("histogram/counts", counts.shape, chunks=chunks, dtype=counts.dtype)
     context.create_maps([f"histogram/{name}" for name in _MAPS])
     context.store.set_attributes("summary", {"missing": "the samples keep their own"})

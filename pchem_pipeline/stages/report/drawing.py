@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor
 from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
+from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
@@ -27,7 +28,10 @@ def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
     """Return how many processes may draw: as asked for, else as the run's section ``compute`` says."""
     if wanted is not None:
         return wanted
-    return available_workers() if settings.workers == "auto" else settings.workers
+    workers = available_workers() if settings.workers == "auto" else settings.workers
+    if settings.max_memory is not None:
+        workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))
+    return workers
 
 
 def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:

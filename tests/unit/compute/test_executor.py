@@ -8,6 +8,7 @@ import pytest
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
 from pchem_pipeline.compute.executor import Stop, make_executor
+from pchem_pipeline.compute.memory import BASE_BYTES, affordable, check_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
@@ -105,3 +106,22 @@ def test_a_lack_of_memory_is_one_line_with_its_cure(backend):
     assert isinstance(found[0].error, IncompleteRunError)
     assert str(found[0].error).startswith("out of memory; use fewer --workers, a smaller --max-memory")
     assert "take_too_much" in found[0].trace
+
+
+def test_workers_are_as_many_as_memory_is_enough_for():
+    four = make_executor(ComputeSettings(workers=4, backend="threads"))
+    here = resident_bytes()
+    assert here > 20 << 20
+    assert affordable(four, here + (900 << 20), 100 << 20, "it") is four
+    assert affordable(four, here + (250 << 20), 100 << 20, "it").workers == 2
+    with pytest.raises(ConfigError, match=r"it takes \d+ MiB at least, compute.max_memory"):
+        affordable(four, here + (50 << 20), 100 << 20, "it")
+    processes = make_executor(ComputeSettings(workers=4, backend="processes"))
+    fewer = affordable(processes, here + 2 * BASE_BYTES + (250 << 20), 100 << 20, "it")
+    assert (fewer.workers, fewer.shares_memory) == (2, False)
+
+
+def test_too_little_memory_for_the_program_is_refused():
+    check_limit(BASE_BYTES)
+    with pytest.raises(ConfigError, match="64 MiB are less than the"):
+        check_limit(64 << 20)

@@ -78,7 +78,7 @@ def test_missing_and_undecodable_files(tmp_path):
 def test_settings_are_read_by_dotted_name():
     config = parse_config("input: {files: [a], roi: [0, 8, 0, 9]}")
     assert setting_of(config, "input.roi") == [0, 8, 0, 9]
-    assert setting_of(config, "run.tile") == 64
+    assert setting_of(config, "run.tile") == "auto"
     assert yaml.safe_dump(setting_of(config, "fit"))
 
 

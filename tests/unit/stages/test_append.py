@@ -144,7 +144,7 @@ def test_what_cannot_be_appended_is_said(tmp_path, frames):
     other = target(tmp_path, "run.zarr", histogram={"block_frames": 64})
     with pytest.raises(StoreError, match="other settings"):
         append_frames(other, QUIET)
-    short = target(tmp_path, "run.zarr", compute={"max_memory": 64})
+    short = target(tmp_path, "run.zarr", compute={"max_memory": 261})
     with pytest.raises(StoreError, match="appending needs"):
         append_frames(short, QUIET)
     np.save(tmp_path / "a.npy", frames[:10])

@@ -27,6 +27,7 @@ from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
 STACK = np.random.default_rng(16).integers(0, 4096, (40, 30, 26)).astype(np.uint16)
@@ -329,3 +330,40 @@ def test_units_are_whole_chunks_within_memory(n: int, ny: int, nx: int, itemsize
         if number > 200:
             return
     assert (t, y) == (n, 0)
+
+
+def test_chunks_share_files_on_a_large_sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_stack(tmp_path / "cam")
+    monkeypatch.setattr(ingest, "_CHUNK", (16, 8, 8))
+    monkeypatch.setattr(ingest, "_MANY_FILES", 24)
+    context = make_context(tmp_path)
+    run(context)
+    array = context.store.array("frames/dn")
+    assert (array.chunks, array.shards) == ((16, 8, 8), (16, 8, 16))
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    np.testing.assert_array_equal(
+        open_store(context.store.path).read("frames/dn")[:, 3:9, 5:20], STACK[:, 3:9, 5:20]
+    )
+    files = list((context.store.path / "frames" / "dn").rglob("c/*/*/*"))
+    assert len(files) == 3 * 4 * 2
+
+
+@given(n=st.integers(2, 20_000), ny=st.integers(1, 9000), nx=st.integers(1, 9000))
+def test_no_stack_has_many_files_that_could_be_fewer(n: int, ny: int, nx: int) -> None:
+    chunk = ingest.chunk_shape((n, ny, nx), 2)
+    shard = ingest.shard_shape((n, ny, nx), chunk) or chunk
+    files = -(-n // shard[0]) * -(-ny // shard[1]) * -(-nx // shard[2])
+    assert files <= 1500 or shard[2] >= nx
+    assert shard[:2] == chunk[:2]
+    assert shard[2] % chunk[2] == 0
+
+
+def test_a_run_keeps_the_tiles_that_it_has(tmp_path: Path) -> None:
+    write_stack(tmp_path / "cam")
+    context = make_context(tmp_path)
+    run(context)
+    assert context.tile == (64, 64)
+    content = {"settings": {"run.tile": [8, 16]}}
+    context.store.records.write(StageRecord("histogram", 1, "f", content))
+    assert context.tile == (8, 16)
+    assert context.tiles()[-1].key == "3.1"

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.stages.histogram.dry_run import make_plan
 from pchem_pipeline.stages.histogram.memory import (
-    BASE_BYTES,
     allowed_bytes,
     band_bytes,
     bytes_per_row,
@@ -118,10 +118,10 @@ def test_the_limit_is_shared_by_the_workers():
     [
         (None, None, 640),
         (8192, None, 640),
-        (400, None, 160),
+        (400, None, 140),
         (200, None, 16),
-        (400, 440, 100),
-        (300, 640, 60),
+        (400, 440, 90),
+        (300, 640, 40),
     ],
 )
 def test_a_band_fits_into_the_memory_of_a_worker_and_of_the_run(limit, allowed, mebibytes):

@@ -175,6 +175,7 @@ def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
     context = make_context(tmp_path, "run.zarr", compute={"max_memory": 64})
     single_pass.count_in_one_pass(context)
     assert not context.prepared
+    context = make_context(tmp_path, "run.zarr")
     # what the first block shows can be too much, too
     room = memory.single_pass_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
     monkeypatch.setattr(single_pass, "allowed_bytes", lambda config, workers: room)

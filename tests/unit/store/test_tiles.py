@@ -1,9 +1,10 @@
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.store.tiles import parse_tiles, roi_tiles, tile_grid
+from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
 
 
 @given(ny=st.integers(1, 200), nx=st.integers(1, 200), size=st.sampled_from([8, 16, 64]))
@@ -14,6 +15,38 @@ def test_tiles_cover_every_pixel_once(ny, nx, size):
             for x in range(tile.x0, tile.x1):
                 seen[y][x] += 1
     assert all(count == 1 for row in seen for count in row)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "rows", "columns"),
+    [
+        ((16, 16), 64, 64),
+        ((512, 512), 64, 64),
+        ((1024, 1024), 64, 256),
+        ((2304, 4096), 64, 2048),
+        ((1, 14_400), 64, 2048),
+    ],
+)
+def test_tiles_grow_with_the_sensor(sensor, rows, columns):
+    assert tile_shape("auto", sensor) == (rows, columns)
+    assert tile_shape(16, sensor) == (16, 16)
+
+
+@given(ny=st.integers(1, 20_000), nx=st.integers(1, 20_000))
+def test_no_sensor_has_many_tiles(ny, nx):
+    rows, columns = tile_shape("auto", (ny, nx))
+    assert 1 <= len(tile_grid((ny, nx), "auto")) <= 80
+    assert rows % 64 == columns % 64 == 0
+
+
+@given(y0=st.integers(0, 3), x0=st.integers(0, 3), ny=st.integers(1, 150), nx=st.integers(1, 200))
+def test_parts_of_a_tile_cover_it_once(y0, x0, ny, nx):
+    tile = Tile(0, 0, y0, y0 + ny, x0, x0 + nx)
+    seen = np.zeros((y0 + ny, x0 + nx), int)
+    for part in tile.parts():
+        assert seen[tile.within(part)].shape == np.empty(tile.shape)[part].shape
+        seen[tile.within(part)] += 1
+    assert (seen[tile.region] == 1).all()
 
 
 def test_tile_is_named_like_its_chunk():

@@ -1,0 +1,103 @@
+"""How much memory the program has and may take, and how many workers that is enough for."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.compute.executor import DaskPoolExecutor, Executor
+
+__all__ = [
+    "BASE_BYTES",
+    "SECOND_PROGRAM_BYTES",
+    "affordable",
+    "check_limit",
+    "keep_memory_tight",
+    "resident_bytes",
+]
+
+#: the program with its libraries and compiled kernels
+BASE_BYTES = 260 << 20
+#: a second program beside it that compiles kernels
+SECOND_PROGRAM_BYTES = 400 << 20
+
+#: parameters of mallopt: heaps, the size from which memory comes from the system and goes back to it at once,
+#: and the free end of a heap from which it goes back
+_ARENA_MAX, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -8, -3, -1
+_HEAPS, _LARGE = 2, 1 << 20
+
+
+@functools.cache
+def _libc() -> Any:
+    return ctypes.CDLL(None) if sys.platform == "linux" else None
+
+
+def keep_memory_tight() -> None:
+    """Give freed memory back to the system at once, here and in processes started from now on.
+
+    Otherwise each thread keeps a heap of its own, and arrays that were freed stay in it: half as much again
+    as is in use. It costs a twentieth of the CPU time. Only the C library of Linux can do it.
+    """
+    names = ("MALLOC_ARENA_MAX", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+    for name, value in zip(names, (_HEAPS, _LARGE, _LARGE), strict=True):
+        os.environ.setdefault(name, str(value))
+    mallopt = getattr(_libc(), "mallopt", None)
+    if mallopt is not None:
+        for parameter, value in ((_ARENA_MAX, _HEAPS), (_MMAP_THRESHOLD, _LARGE), (_TRIM_THRESHOLD, _LARGE)):
+            mallopt(parameter, value)
+
+
+def resident_bytes() -> int:
+    """Return the memory of this process, what it does not use given back first; 0 where it is not known."""
+    trim = getattr(_libc(), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def check_limit(limit: int) -> None:
+    """Refuse less memory than the program takes before it does anything.
+
+    Raises:
+        ConfigError: with what it takes.
+    """
+    if limit < BASE_BYTES:
+        raise ConfigError(
+            f"compute.max_memory (--max-memory): {limit >> 20} MiB are less than the {BASE_BYTES >> 20} that "
+            "the program takes with its libraries; raise it"
+        )
+
+
+def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Executor:
+    """Return the executor with no more workers than the memory allowed is enough for.
+
+    Args:
+        executor: of the run; a cluster has memory of its own.
+        limit: bytes that this machine may give.
+        unit_bytes: that a worker takes for a unit of its work.
+        what: is done, for the message.
+
+    Raises:
+        ConfigError: it is not enough for one.
+    """
+    here, each = resident_bytes() or BASE_BYTES, unit_bytes
+    if isinstance(executor, DaskPoolExecutor) and not executor.shares_memory:
+        each += BASE_BYTES
+    enough = (limit - here) // max(each, 1)
+    if enough < 1:
+        raise ConfigError(
+            f"{what} takes {-(-(here + each) >> 20)} MiB at least, compute.max_memory (--max-memory) allows "
+            f"{limit >> 20}: raise it, and run the same command to go on"
+        )
+    if isinstance(executor, DaskPoolExecutor) and enough < executor.workers:
+        return DaskPoolExecutor(enough, processes=not executor.shares_memory)
+    return executor
