@@ -2,7 +2,7 @@
 
 Histograms and summaries go on where they ended, and are in the end those of all frames together, to the bit.
 What depends on them becomes stale; the next fit starts from the old answer. The pass changes the arrays in
-place: one that is stopped leaves the run without histograms, and ``pchem run`` then counts all frames.
+place: one that is stopped leaves the run without histograms, and the same command then counts all frames.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
 from pchem_pipeline.run.runner import execute
-from pchem_pipeline.run.session import Command, working_run
+from pchem_pipeline.run.session import Command, run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.start import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, prepared, stream_rows, whole_mebibytes
 from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.files import remove_file, write_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target
 
 __all__ = ["append_frames"]
+
+#: there from the moment when the arrays are neither of the old nor of all frames until they are of all
+_BEGUN = ".pchem/appending.json"
 
 
 def append_frames(target: Target, command: Command) -> list[StageState]:
@@ -53,6 +57,11 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         InputError: the old files are not those of the run, or the new frames do not fit them.
         StoreError: the run is not finished as far as its histograms, or was made with other settings.
     """
+    begun = target.store / _BEGUN
+    if begun.exists() and any(state.state != "complete" for state in run_status(target)[: len(PREPARED)]):
+        states = run_stages(target, PREPARED, command)
+        remove_file(begun)
+        return states
     with working_run(target, command) as context:
         clock = time.perf_counter(), cpu_seconds()
         _check_run(context)
@@ -68,7 +77,9 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         files = kept["files"] + _go_on(context, frames, added)["files"]
         keep_identity(context, quick, {"files": files, "digest": digest_of(files)})
         context.prepared = prepared(frames, clock)
-        return [execute(name, context) for name in PREPARED]
+        states = [execute(name, context) for name in PREPARED]
+        remove_file(begun)
+        return states
 
 
 def _check_run(context: StageContext) -> None:
@@ -170,6 +181,7 @@ def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> d
     ):
         counter = StackCounter(job, stream.bands, workers)
         counter.resume(done)
+        write_json(store.path / _BEGUN, {"frames": done})
         for name in PREPARED:
             store.records.forget(name)
         extend_arrays(context, frames.shape, bins)

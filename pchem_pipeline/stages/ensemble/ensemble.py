@@ -356,9 +356,6 @@ def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
     assert job.truth is not None
     assert job.source is not None
     store, (y0, x0, t0) = open_store(job.store), job.truth
-    rows = (slice(band.y0, band.y1), slice(None))
-    fitted = [store.read(f"fit/{name}", rows) for name in PARAMETERS]
-    maps = deciding_maps(fitted, job.effects, fitted_added_exposure(store, rows), pixel_places(store, rows))
     first, end = job.frames or (0, job.source.shape[0])
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}

@@ -168,3 +168,36 @@ def test_more_frames_than_sixteen_bits_can_count(tmp_path):
     counts = RunStore.open(tmp_path / "run.zarr").read("histogram/counts")
     assert counts.dtype == np.uint32
     np.testing.assert_array_equal(counts.sum(axis=2), np.full((2, 3), 70_000))
+
+
+@pytest.mark.parametrize(
+    "moment", ["before the arrays grow", "while frames are counted", "while tiles are marked"]
+)
+def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames, moment):
+    write(tmp_path, frames, [600])
+    (tmp_path / "f1.npy").rename(tmp_path / "later")
+    run = target(tmp_path, "run.zarr")
+    run_stages(run, ["ingest", "histogram", "fit"], QUIET)
+    (tmp_path / "later").rename(tmp_path / "f1.npy")
+
+    def killed(*arguments, **named):
+        raise KeyboardInterrupt
+
+    place = {
+        "before the arrays grow": "extend_arrays",
+        "while frames are counted": "StackCounter.count",
+        "while tiles are marked": "execute",
+    }[moment]
+    with monkeypatch.context() as patch:
+        patch.setattr(f"pchem_pipeline.commands.append.{place}", killed)
+        with pytest.raises(KeyboardInterrupt):
+            append_frames(run, QUIET)
+    assert [state.state for state in append_frames(run, QUIET)] == ["complete", "complete"]
+    assert append_frames(run, QUIET) == []
+    whole = target(tmp_path, "whole.zarr")
+    run_stages(whole, ["ingest", "histogram"], QUIET)
+    expected, found = (arrays_of(tmp_path / name, GROUPS) for name in ("whole.zarr", "run.zarr"))
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    assert kept_fit(tmp_path / "run.zarr", (slice(None), slice(None))) is not None
