@@ -329,8 +329,15 @@ def compare(
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="label of a run in the history, in their order: a temperature, a date (repeatable) "
-            "[default: dates of the frames]"
+            help="label of a run in the history, in their order, such as a setpoint (repeatable) "
+            "[default: what it is drawn against]"
+        ),
+    ] = None,
+    against: Annotated[
+        Literal["date", "temperature", "label"] | None,
+        typer.Option(
+            help="axis of the history: date and sensor temperature as the files say, or the number that a "
+            "label begins with [default: label where there are labels, else date]"
         ),
     ] = None,
     fdr: Annotated[
@@ -344,9 +351,15 @@ def compare(
     Runs on the same frames are compared value by value, others in standard errors.
     """
     from pchem_pipeline.commands.compare.compare import compare_runs
+    from pchem_pipeline.commands.compare.history import HistorySettings
 
     for path in compare_runs(
-        runs, output, tolerance=tolerance, labels=label or (), rate=fdr, workers=workers, progress=progress
+        runs,
+        output,
+        tolerance=tolerance,
+        history=HistorySettings(label or (), against, fdr),
+        workers=workers,
+        progress=progress,
     ):
         typer.echo(path)
 

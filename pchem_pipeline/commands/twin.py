@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import yaml
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
-from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.config.load import make_config
 from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.simulate.scene import with_scene
@@ -22,12 +23,16 @@ from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.twin import Twin, extrapolated, redrawn, twin_maps
 
 if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.target import Target
 
 __all__ = ["TWIN_FRAMES", "twin_of", "write_twin"]
 
 #: Bits of the ADC where the run does not say, and frames where nothing else is asked for.
 _BIT_DEPTH, TWIN_FRAMES = 16, 1000
+_HEAD = """# The camera of {run} as it was measured: pchem run makes its frames and characterises them.
+# What the model of that run had is simulated, and is in the model here too.
+"""
 
 
 def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:
@@ -119,12 +124,26 @@ def write_twin(
         "output": f"{output.stem}_frames",
         "n_frames": frames or twin.settings.n_frames,
     }
-    config = make_config({"run": {"store": f"{output.stem}.zarr"}, "simulate": given}, "the twin")
+    named = {"run": {"store": f"{output.stem}.zarr"}, "simulate": given}
+    text = _HEAD.format(run=target.store.name) + _yaml_of(make_config(named, "the twin"))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **twin.truth.arrays())
     write_atomic(maps, buffer.getvalue())
-    write_atomic(output, dump_config(config).encode())
+    write_atomic(output, text.encode())
     return [output, maps]
+
+
+def _yaml_of(config: RunConfig) -> str:
+    """Return what a twin differs in from the defaults; its effects are simulated and stand in the model."""
+    assert config.simulate is not None
+    simulated = config.simulate.model_dump(mode="json", exclude_defaults=True)
+    size = {"shape": list(config.simulate.shape), "n_frames": config.simulate.n_frames}
+    content = {
+        "run": {"store": str(config.run.store)},
+        "simulate": {**size, **simulated},
+        **({"model": {"effects": simulated["effects"]}} if "effects" in simulated else {}),
+    }
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
 def _scene_place(scene: str, twin: Twin) -> str:

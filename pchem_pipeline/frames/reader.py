@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -37,6 +38,7 @@ class FrameReader(ABC):
         bit_depth: bits of the ADC, where the file says so.
         bit_shift: bits by which the samples are left-justified, where the file says so.
         integration_time: s, where the file says so.
+        camera: its name, serial number, temperature and time, as far as the file says.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
         rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
@@ -53,6 +55,7 @@ class FrameReader(ABC):
     bit_depth: int | None = None
     bit_shift: int = 0
     integration_time: float | None = None
+    camera: CameraFacts = CameraFacts()
     timestamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
     rows_per_read: int = 1

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.inspect import InputReport
 from pchem_pipeline.frames.reader import FrameReader, check_window
 from pchem_pipeline.frames.settings import InputSettings
@@ -86,7 +87,9 @@ class FrameSequence(FrameReader):
         stamps = [reader.timestamps for reader in readers]
         if all(each is not None for each in stamps):
             self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
-        self.notes = tuple(dict.fromkeys(note for reader in readers for note in reader.notes))
+        self.camera, moved = shared_facts(reader.camera for reader in readers)
+        notes = [note for reader in readers for note in reader.notes] + ([moved] if moved else [])
+        self.notes = tuple(dict.fromkeys(notes))
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:

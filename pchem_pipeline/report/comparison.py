@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.run_differences import MapDifference, Reasons
 
-__all__ = ["ArrayRow", "Comparison", "HistoryRow", "Pair", "RunFacts", "Setting"]
+__all__ = ["Against", "ArrayRow", "Comparison", "HistoryRow", "Pair", "RunFacts", "Setting"]
 
 #: How an array of two runs compares: to the bit; within rounding; not; absent in one of them.
 State = Literal["identical", "equal", "changed", "lost", "new"]
+
+
+#: What a history is drawn against.
+Against = Literal["date", "temperature", "label"]
 
 
 @dataclass(frozen=True)
@@ -128,8 +132,10 @@ class HistoryRow:
 
     Attributes:
         label: as given, else the date.
-        date: when its frames were written, UTC, ISO 8601; empty where that is not known.
-        place: number that the label begins with, or days of the date; NaN where there is none.
+        date: when its frames were taken, else written, UTC, ISO 8601; empty where that is not known.
+        temperature: of the sensor as its frames say, degrees Celsius; None where they do not.
+        place: number that the label begins with, days of the date, or the temperature; NaN where there is
+            none.
         run: what its maps say.
         hot_pixels: pixels far above the others in dark current, or in exposure.
         flags: number of pixels that bear each word of ``fit_status``.
@@ -141,6 +147,7 @@ class HistoryRow:
 
     label: str
     date: str
+    temperature: float | None
     place: float
     run: RunFacts
     hot_pixels: int = 0
@@ -160,6 +167,7 @@ class Comparison:
         pairs: the first with each of the others.
         tolerance: relative difference that counts as rounding.
         history: a row for each run.
+        against: what the history is drawn against.
         rate: false-discovery rate at which pixels count as moved.
     """
 
@@ -167,6 +175,7 @@ class Comparison:
     pairs: Sequence[Pair]
     tolerance: float
     history: Sequence[HistoryRow] = ()
+    against: Against = "date"
     rate: float = 0.01
 
     @property

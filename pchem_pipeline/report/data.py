@@ -159,6 +159,7 @@ class ReportData:
         shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
         n_frames: frames per pixel, or None if pixels differ or it is unknown.
         integration_time: seconds, or None.
+        camera: name, serial number and temperature of the sensor as the files say; empty where they do not.
         maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
         status_words: bit of ``fit_status`` to its short sentence, gravest first.
@@ -200,6 +201,7 @@ class ReportData:
     kind: str = "unknown"
     n_frames: int | None = None
     integration_time: float | None = None
+    camera: str = ""
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
     fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})

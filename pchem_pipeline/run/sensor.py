@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from pchem_pipeline.base.errors import StoreError, quoted
+from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.store.run_store import RunStore
 
 __all__ = ["Sample", "SensorInfo"]
@@ -48,6 +49,7 @@ class SensorInfo:
         identity: names, sizes and content hashes of the files.
         names: names of the channels of ready-made histograms.
         samples: the exposures, where there are several.
+        camera: its name, serial number, temperature and date, as far as the files say.
         shown: place of the one whose histograms, H and ensemble are shown.
     """
 
@@ -63,6 +65,7 @@ class SensorInfo:
     names: tuple[str, ...] = ()
     samples: tuple[Sample, ...] = ()
     shown: int = 0
+    camera: CameraFacts = field(default_factory=CameraFacts)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -85,4 +88,5 @@ class SensorInfo:
         if content is None:
             raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
         samples = tuple(Sample(**each) for each in content.get("samples", ()))
-        return cls(**{**content, "names": tuple(content["names"]), "samples": samples})
+        camera = CameraFacts(**content.get("camera", {}))
+        return cls(**{**content, "names": tuple(content["names"]), "samples": samples, "camera": camera})

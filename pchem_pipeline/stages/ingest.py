@@ -111,6 +111,7 @@ def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, 
         integration_time=reader.stated_integration_time,
         mode=context.config.input.mode,
         identity=identity,
+        camera=reader.camera,
     )
 
 

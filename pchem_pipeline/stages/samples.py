@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.run.sensor import Sample, SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.run_store import RunStore
@@ -245,6 +246,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
         names=first.names,
         samples=tuple(_sample(config.input, i, each) for i, each in enumerate(samples)),
         shown=shown_sample(config.input),
+        camera=shared_facts(each.sensor.camera for each in samples)[0],
     )
 
 

@@ -2,18 +2,23 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+import yaml
 from helpers.commands import Result, Shell
 from helpers.known_camera import KnownCamera
 
 from pchem_pipeline.cli.app import main
+from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.store.run_store import RunStore
 
 SHAPE, N_NIGHT = (16, 24), 500
 N = SHAPE[0] * SHAPE[1]
@@ -222,6 +227,37 @@ def test_a_moved_offset_is_told(lab):
     assert "the offset has moved" in result.stderr
 
 
+def night_file(lab, name, **record):
+    path = lab.folder / name
+    tifffile.imwrite(
+        path,
+        tifffile.imread(lab.folder / "night.tif")[:20],
+        description=json.dumps({"shape": (20, *SHAPE), **record}),
+        metadata=None,
+    )
+    return path
+
+
+def test_frames_of_another_camera_or_temperature(lab, night):
+    """The camera files name serial number and temperature: another camera is refused, another warmth told."""
+    shutil.copytree(night / "run.zarr", lab.folder / "own.zarr")
+    store = RunStore.open(lab.folder / "own.zarr", writable=True)
+    camera = CameraFacts("Camera X", "42", -20.0)
+    replace(SensorInfo.read(store), camera=camera).write(store)
+    night_file(lab, "other.tif", camera="Camera X", serial_number="43")
+    refused = lab("apply", "own.zarr", "other.tif", "--output", "out.zarr")
+    assert (refused.code, refused.stderr.count("\n")) == (4, 1)
+    assert "serial number 43, the run was made with 42" in refused.stderr
+    night_file(lab, "warm.tif", camera="camera x", serial_number="42", sensor_temperature=-10)
+    warm = lab.ok("apply", "own.zarr", "warm.tif", "--output", "out.zarr", "--what", "electrons")
+    assert "at -10 °C, in the characterisation at -20 °C" in warm.stderr
+    assert "name the camera" not in warm.stderr
+    night_file(lab, "cold.tif", camera="Camera Y", sensor_temperature=-21)
+    cold = lab.ok("apply", "own.zarr", "cold.tif", "--output", "cold.zarr", "--what", "electrons")
+    assert "the frames name the camera Camera Y, those of the run Camera X" in cold.stderr
+    assert "°C" not in cold.stderr
+
+
 ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
 
 
@@ -289,6 +325,27 @@ def test_a_twin_is_the_camera_that_was_measured(lab, night):
         # the run's own errors are as large: other frames of the first camera would differ by more
     with np.load(lab.folder / "camera_maps.npz") as maps:
         assert maps["defect"][3, 5] == 3
+
+
+def test_a_twin_has_the_effects_of_the_run_in_its_model(striped, tmp_path, monkeypatch, capsys):
+    """The run knew of row noise: the twin has it, and a search of its frames finds nothing more."""
+    monkeypatch.chdir(tmp_path)
+    lab = Lab(tmp_path, {}, capsys)
+    lab.ok("twin", striped / "run.zarr", "--output", "twin.yaml", "--seed", "4", "--frames", "600")
+    content = yaml.safe_load((tmp_path / "twin.yaml").read_text())
+    assert content["model"]["effects"] == content["simulate"]["effects"]
+    assert "parameters" not in content["simulate"]
+    lab.ok("run", "twin.yaml", "--until", "fit", "--quiet")
+    lab.ok("discrepancy", "twin.yaml", "--quiet")
+    found = json.loads((tmp_path / "twin.zarr" / "discrepancy.json").read_text())
+    assert found["verdict"] in ("consistent", "cannot_tell")
+    # taken out of the model it is found again: the search can tell
+    content["model"] = {"effects": []}
+    (tmp_path / "plain.yaml").write_text(yaml.safe_dump({**content, "run": {"store": "plain.zarr"}}))
+    lab.ok("run", "plain.yaml", "--until", "fit", "--quiet")
+    lab.ok("discrepancy", "plain.yaml", "--quiet", "--no-refit")
+    found = json.loads((tmp_path / "plain.zarr" / "discrepancy.json").read_text())
+    assert found["verdict"] not in ("consistent", "cannot_tell")
 
 
 def test_a_twin_looks_at_a_scene_and_is_calibrated_again(lab, night):

@@ -7,13 +7,18 @@ import hashlib
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
+from pchem_pipeline.commands.compare.history import HistorySettings, history_csv
+from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.report.figures.history import history_figures
 from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -158,8 +163,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
         compare_runs(
             [shell.folder / f"{name}.zarr" for name in "abc"],
             shell.folder / "history",
-            labels=labels,
-            rate=0.05,
+            history=HistorySettings(labels, rate=0.05),
             workers=1,
             progress="off",
         )
@@ -182,9 +186,34 @@ def test_the_history_of_a_camera(shell, copies, finished):
     page = (shell.folder / "history" / "compare.html").read_text(encoding="utf-8")
     assert "The camera over time" in page
     assert "-20 C" in page
-    for wrong in ({"labels": ["one"]}, {"rate": 0.0}):
+    wrong = {"labels": ["one"]}, {"rate": 0.0}, {"against": "label"}, {"against": "temperature"}
+    for each in wrong:
         with pytest.raises(ConfigError, match="--"):
-            comparison_of([shell.folder / "a.zarr", shell.folder / "b.zarr"], 1e-12, Reporter("off"), **wrong)
+            comparison_of(
+                [shell.folder / "a.zarr", shell.folder / "b.zarr"],
+                1e-12,
+                Reporter("off"),
+                HistorySettings(**each),
+            )
+
+
+def test_the_history_against_the_temperature_that_the_files_state(shell, copies, finished):
+    """The sensor's temperature and the date of the frames come from the camera files."""
+    other_capture(copies)
+    for name, temperature, taken in (("a", -20.0, 1.75e9), ("b", -5.5, 1.76e9)):
+        store = RunStore.open(shell.folder / f"{name}.zarr", writable=True)
+        sensor = SensorInfo.read(store)
+        replace(sensor, camera=CameraFacts("Camera <X>", "7", temperature, taken)).write(store)
+    paths = [shell.folder / "a.zarr", shell.folder / "b.zarr"]
+    found = comparison_of(paths, 1e-12, Reporter("off"), HistorySettings(against="temperature"))
+    assert [row.label for row in found.history] == ["-20 °C", "-5.5 °C"]
+    assert [row.place for row in found.history] == [-20.0, -5.5]
+    assert found.history[0].date.startswith("2025-06-15T")
+    text = history_csv(found.history).splitlines()
+    assert text[0].startswith("label,date,temperature,run,")
+    assert text[2].split(",")[2] == "-5.5"
+    (figure,) = history_figures(found.history, found.against)
+    assert figure.tables[0]["sensor temperature, °C"].tolist() == [-20.0, -5.5]
 
 
 def test_bad_input_gets_one_line(shell, finished):

@@ -19,7 +19,7 @@ from pchem_pipeline.commands.apply.characterisation import check_run, read_calib
 from pchem_pipeline.commands.apply.files import write_files
 from pchem_pipeline.commands.apply.finish import finish_maps
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
-from pchem_pipeline.commands.apply.source import check_level, open_like_run, top_code
+from pchem_pipeline.commands.apply.source import check_camera, check_level, open_like_run, top_code
 from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece, offsets_piece
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.effects.framework.compose import model_words
@@ -136,7 +136,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     top = top_code(frames, sensor)
     modes = _modes(run, wanted)
     calibration = read_calibration(run, top=top, removed=modes.removed)
-    remarks = check_level(frames, calibration)
+    remarks = check_camera(frames, sensor) + check_level(frames, calibration)
     if modes.left and wanted.remove:
         remarks.append(
             f"{', '.join(modes.left)}: no offset of frames, rows or columns, so it stays in the frames"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.settings import InputSettings
     from pchem_pipeline.run.target import Target
 
-__all__ = ["check_level", "open_like_run", "top_code"]
+__all__ = ["check_camera", "check_level", "open_like_run", "top_code"]
 
 #: Frames that are looked at before anything is done.
 _SEEN = 16
@@ -27,6 +27,8 @@ _SEEN = 16
 _FAR_BELOW = 3.0
 #: Times the exposure of the characterisation beyond which a gain is extrapolated.
 _FAR_ABOVE = 30.0
+#: Kelvin between frames and characterisation beyond which offset and dark current are others.
+_OTHER_TEMPERATURE = 2.0
 
 
 def open_like_run(target: Target, sensor: SensorInfo, files: Sequence[str | Path]) -> FrameSequence:
@@ -92,6 +94,37 @@ def top_code(frames: FrameSequence, sensor: SensorInfo) -> int | None:
     """Return the largest code of the ADC, DN; None where it is not known."""
     depth = frames.bit_depth or sensor.bit_depth
     return None if depth is None else 2**depth - 1
+
+
+def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
+    """Return remarks on frames of another camera or temperature, as far as the files say; none where alike.
+
+    Args:
+        frames: to be calibrated.
+        sensor: of the run.
+
+    Raises:
+        InputError: both state a serial number, and these differ.
+    """
+    here, there = frames.camera, sensor.camera
+    name = frames.paths[0]
+    if here.serial and there.serial and here.serial != there.serial:
+        raise InputError(
+            f"{name}: camera of serial number {here.serial}, the run was made with {there.serial}; give "
+            "frames of the same camera, or a run of this one"
+        )
+    remarks = []
+    if here.name and there.name and here.name.casefold() != there.name.casefold():
+        remarks.append(f"the frames name the camera {here.name}, those of the run {there.name}")
+    if here.temperature is not None and there.temperature is not None:
+        warmer = here.temperature - there.temperature
+        if abs(warmer) > _OTHER_TEMPERATURE:
+            remarks.append(
+                f"the sensor was at {here.temperature:.4g} °C, in the characterisation at "
+                f"{there.temperature:.4g} °C: offset, gain and hot pixels may differ, take one at the same "
+                "temperature"
+            )
+    return remarks
 
 
 def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.commands.compare.arrays import compare_arrays
-from pchem_pipeline.commands.compare.history import HISTORY_CSV, history_csv, history_rows
+from pchem_pipeline.commands.compare.history import HISTORY_CSV, HistorySettings, history_csv, history_rows
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import LIMIT, compare_maps, reasons_of_change
@@ -49,13 +49,15 @@ _ENSEMBLE = (
 )
 
 
+_BY_DATE = HistorySettings()
+
+
 def compare_runs(
     paths: Sequence[Path],
     folder: Path,
     *,
     tolerance: float = 1e-12,
-    labels: Sequence[str] = (),
-    rate: float = 0.01,
+    history: HistorySettings = _BY_DATE,
     workers: int | None = None,
     progress: ProgressMode = "auto",
 ) -> list[Path]:
@@ -65,8 +67,7 @@ def compare_runs(
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
-        labels: of the runs, for their history: temperatures, dates; none: the dates of their frames.
-        rate: false-discovery rate at which a pixel counts as moved since the first run.
+        history: labels of the runs, what they are drawn against, and when a pixel counts as moved.
         workers: processes that draw; None: as the first run's section ``compute`` says.
         progress: auto | on | off.
 
@@ -79,7 +80,7 @@ def compare_runs(
         StoreError: a run has no maps, or the folder cannot be written.
     """
     reporter = Reporter(progress)
-    found = comparison_of(paths, tolerance, reporter, labels, rate)
+    found = comparison_of(paths, tolerance, reporter, history)
     draw = draw_by_workers(drawing_workers(workers, find_run(paths[0]).config.compute), reporter, "figures")
     page, numbers = render_comparison(found, draw)
     files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, HISTORY_CSV: history_csv(found.history)}
@@ -99,8 +100,7 @@ def comparison_of(
     paths: Sequence[Path],
     tolerance: float,
     reporter: Reporter,
-    labels: Sequence[str] = (),
-    rate: float = 0.01,
+    history: HistorySettings = _BY_DATE,
 ) -> Comparison:
     """Return how the runs differ from the first of them; see :func:`compare_runs`."""
     if len(paths) < 2:
@@ -122,7 +122,8 @@ def comparison_of(
         _pair((runs[0], targets[0], stores[0]), (run, target, store), tolerance, reporter)
         for run, target, store in zip(runs[1:], targets[1:], stores[1:], strict=True)
     ]
-    return Comparison(runs, pairs, tolerance, history_rows(runs, stores, pairs, labels, rate), rate)
+    rows = history_rows(runs, stores, pairs, history)
+    return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
 
 
 def _letters(n: int) -> list[str]:

@@ -6,6 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,16 +15,18 @@ from numpy.typing import NDArray
 from scipy.special import erfc
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.run_differences import MapDifference
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import GOOD
-from pchem_pipeline.report.comparison import HistoryRow, Pair, RunFacts
+from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
 from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["HISTORY_CSV", "history_csv", "history_rows"]
+__all__ = ["HISTORY_CSV", "HistorySettings", "history_csv", "history_rows"]
 
 #: Name of the file.
 HISTORY_CSV = "history.csv"
@@ -32,12 +35,32 @@ _HOT = ("charge_rate", "dark_current", "quanta_exposure")  # the first that a ru
 _NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
 
 
+@dataclass(frozen=True)
+class HistorySettings:
+    """What a history shows.
+
+    Attributes:
+        labels: of the runs, in their order, such as setpoints; none: what they are drawn against.
+        against: date, temperature, or the number that a label begins with; None: label where there
+            are labels, else date.
+        rate: false-discovery rate at which a pixel counts as moved since the first run.
+    """
+
+    labels: Sequence[str] = ()
+    against: Against | None = None
+    rate: float = 0.01
+
+    @property
+    def axis(self) -> Against:
+        """What the runs are drawn against."""
+        return self.against or ("label" if self.labels else "date")
+
+
 def history_rows(
     runs: Sequence[RunFacts],
     stores: Sequence[RunStore],
     pairs: Sequence[Pair],
-    labels: Sequence[str],
-    rate: float,
+    wanted: HistorySettings,
 ) -> list[HistoryRow]:
     """Return a row for each run, in the order given.
 
@@ -45,29 +68,40 @@ def history_rows(
         runs: the runs.
         stores: of them.
         pairs: the first with each of the others.
-        labels: of the runs, such as temperatures; none: the dates of their frames.
-        rate: false-discovery rate at which a pixel counts as moved.
+        wanted: labels, what they are drawn against, and the false-discovery rate.
 
     Raises:
-        ConfigError: there are labels, but not one for each run.
+        ConfigError: there are labels, but not one for each run; or the frames of a run state no
+            temperature, which is asked for.
     """
+    labels, against, rate = wanted.labels, wanted.axis, wanted.rate
     if labels and len(labels) != len(runs):
         raise ConfigError(
             f"--label: {len(labels)} given for {len(runs)} runs; give one for each, in their order"
         )
+    if not labels and against == "label":
+        raise ConfigError("--against label: there are none; give --label once for each run")
     if not 0.0 < rate < 1.0:
         raise ConfigError(f"--fdr {rate:g}: a rate between 0 and 1 is meant, such as 0.01")
-    dates = [_date(store) for store in stores]
+    cameras = [SensorInfo.read(store).camera for store in stores]
+    silent = [run.name for run, camera in zip(runs, cameras, strict=True) if camera.temperature is None]
+    if against == "temperature" and silent:
+        raise ConfigError(
+            f"--against temperature: the frames of {', '.join(silent)} state none; give --label with the "
+            "temperatures"
+        )
     rows = []
     for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
         moved, any_moved, compared = _moved(pairs[i - 1], stores[0], store, rate) if i else ({}, 0, 0)
-        label = labels[i] if labels else dates[i]
-        place = _place(label) if labels else _days(dates[i])
+        date, temperature = _date(store, cameras[i]), cameras[i].temperature
+        warmth = "" if temperature is None else f"{temperature:.4g} °C"
+        label = labels[i] if labels else warmth if against == "temperature" else date
         rows.append(
             HistoryRow(
                 label,
-                dates[i],
-                place,
+                date,
+                temperature,
+                {"date": _days(date), "temperature": _number(warmth), "label": _number(label)}[against],
                 run,
                 _hot(store),
                 _flags(store),
@@ -80,8 +114,10 @@ def history_rows(
     return rows
 
 
-def _date(store: RunStore) -> str:
-    """Return when the camera files of a run were written, else read, UTC, ISO 8601; or empty."""
+def _date(store: RunStore, camera: CameraFacts) -> str:
+    """Return when the frames of a run were taken, else written, else read, UTC, ISO 8601; or empty."""
+    if camera.taken is not None:
+        return datetime.fromtimestamp(camera.taken, UTC).isoformat(timespec="seconds")
     kept: Any = read_json(store.path / ".pchem" / "ingested.json") or {}
     times = [each.get("mtime_ns") for each in (kept.get("quick") or {}).get("files", [])]
     known = [time for time in times if time]
@@ -95,7 +131,7 @@ def _days(date: str) -> float:
     return datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
 
 
-def _place(label: str) -> float:
+def _number(label: str) -> float:
     """Return the number that a label begins with; NaN where it begins with none."""
     match = _NUMBER.match(label)
     return float(match[1]) if match else float("nan")
@@ -149,7 +185,17 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(
-        ["label", "date", "run", "frames", "pixels_good", "pixels_caution", "pixels_no_value", "hot_pixels"]
+        [
+            "label",
+            "date",
+            "temperature",
+            "run",
+            "frames",
+            "pixels_good",
+            "pixels_caution",
+            "pixels_no_value",
+            "hot_pixels",
+        ]
         + [f"{name}_{part}" for name in maps for part in ("median", "median_stderr", "scatter")]
         + [f"{name}_moved" for name in moved]
         + ["moved_pixels", "compared_pixels", "effects", *(f"flag_{name}" for name in flags)]
@@ -157,7 +203,8 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
     for row in rows:
         of_maps = [row.run.summary.get(name, (float("nan"),) * 3) for name in maps]
         writer.writerow(
-            [row.label, row.date, row.run.name, row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
+            [row.label, row.date, "" if row.temperature is None else f"{row.temperature:.6g}"]
+            + [row.run.name, row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
             + ["" if value != value else f"{value:.9g}" for each in of_maps for value in each]
             + [row.moved.get(name, "") for name in moved]
             + [row.any_moved, row.compared, " ".join(row.effects), *(row.flags[name] for name in flags)]

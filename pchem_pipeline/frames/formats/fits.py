@@ -8,9 +8,10 @@ than half as fast (0.9 against 2.4 GB/s) into arrays of their own.
 
 from __future__ import annotations
 
+import re
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, MissingDependencyError
+from pchem_pipeline.frames.camera import CameraFacts, celsius, seconds_of, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
@@ -28,6 +30,9 @@ from pchem_pipeline.store.files import whole_file
 __all__ = ["FitsReader", "write_frames"]
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "TELAPSE", "INTTIME", "ITIME", "XPOSURE")
+_CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
+_SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
+_TEMPERATURE_KEYWORDS = ("CCD-TEMP", "DET-TEMP", "DETTEMP", "CCDTEMP", "SENSTEMP", "SET-TEMP")
 #: BITPIX -> BZERO of unsigned integers of that size
 _UNSIGNED_ZERO = {16: 1 << 15, 32: 1 << 31}
 #: astropy's compressed images share a file handle and are not made for threads
@@ -102,6 +107,7 @@ class FitsReader(ContiguousReader):
             value = header.get("BITDEPTH", header.get("ADCBITS"))
             if self.bit_depth is None and isinstance(value, int) and 1 <= value <= 32:
                 self.bit_depth = value
+        self.camera = _camera([*reversed(headers)])
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -161,6 +167,31 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
             "choose one by its number in input.dataset"
         )
     return *images[0], hdus[0].header
+
+
+def _camera(headers: Sequence[Any]) -> CameraFacts:
+    """Return what headers say of the camera; the first that has a keyword counts."""
+    hot, unit = _keyword(headers, _TEMPERATURE_KEYWORDS)
+    taken, _ = _keyword(headers, ("DATE-OBS", "DATE-BEG"))
+    clock, _ = _keyword(headers, ("TIME-OBS",))
+    if isinstance(taken, str) and "T" not in taken and isinstance(clock, str):
+        taken = f"{taken}T{clock}"
+    kelvin = re.search(r"\[K\]|kelvin", unit, re.IGNORECASE)
+    return CameraFacts(
+        text_of(_keyword(headers, _CAMERA_KEYWORDS)[0]),
+        text_of(_keyword(headers, _SERIAL_KEYWORDS)[0]),
+        celsius(hot, "K" if kelvin else "C"),
+        seconds_of(taken),
+    )
+
+
+def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:
+    """Return the value of the first keyword that is there, and its comment."""
+    for header in headers:
+        for name in names:
+            if name in header and header[name] not in ("", None):
+                return header[name], str(header.comments[name])
+    return None, ""
 
 
 def _samples(path: Path, header: Any) -> tuple[np.dtype[Any], bool]:

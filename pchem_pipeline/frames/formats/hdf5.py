@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.camera import camera_from_names
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
@@ -88,6 +89,7 @@ class Hdf5Reader(ContiguousReader):
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         self._read_facts(dataset)
+        self._read_camera(dataset)
 
     def _read_facts(self, dataset: Any) -> None:
         """Take integration time (count_time in NeXus) and bit depth from attributes or the group."""
@@ -106,6 +108,15 @@ class Hdf5Reader(ContiguousReader):
                 value = np.ravel(dataset.parent[name][()])[0]
             if self.bit_depth is None and isinstance(value, int | np.integer) and 1 <= value <= 32:
                 self.bit_depth = int(value)
+
+    def _read_camera(self, dataset: Any) -> None:
+        """Take what the attributes of the dataset and the values beside it say of the camera."""
+        values, units = {}, {}
+        for name, beside in dataset.parent.items():
+            if getattr(beside, "size", 0) == 1 and name != dataset.name:
+                values[name] = np.ravel(beside[()])[0]
+                units[name] = beside.attrs.get("units")
+        self.camera = camera_from_names({**values, **dataset.attrs}, units)
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""

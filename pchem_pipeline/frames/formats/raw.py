@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.camera import camera_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
@@ -39,6 +40,10 @@ class _Sidecar(BaseModel):
     bit_shift: int | None = None
     bit_depth: int | None = None
     integration_time: float | None = None
+    camera: str | None = None
+    serial_number: str | None = None
+    sensor_temperature: float | None = None
+    start_time: str | None = None
 
 
 def find_sidecar(path: Path) -> Path | None:
@@ -99,6 +104,7 @@ class RawReader(ContiguousReader):
         reader.bit_shift = facts["bit_shift"] or 0
         reader.bit_depth = facts["bit_depth"]
         reader.integration_time = facts["integration_time"]
+        reader.camera = camera_from_names(side.model_dump())
         reader._lay_out(path, facts)
         return reader
 

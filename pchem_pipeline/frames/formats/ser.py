@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.camera import CameraFacts, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
@@ -46,7 +47,7 @@ class SerReader(ContiguousReader):
             raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise InputError(f"{path}: truncated, or not SER video; copy the file again")
-        _, _, colour, flag, columns, rows, depth, n = _HEADER.unpack(head)[:8]
+        _, _, colour, flag, columns, rows, depth, n, _, instrument, _, _, ticks = _HEADER.unpack(head)
         if colour != 0:
             name = _COLOUR_NAMES.get(colour, "RGB")
             raise InputError(
@@ -63,6 +64,8 @@ class SerReader(ContiguousReader):
         reader._set_layout(path, Layout(offsets, rows, columns, stored), size)
         reader.bit_depth = depth
         reader._read_times()
+        taken = _seconds(ticks) if reader.timestamps is None else float(reader.timestamps[0])
+        reader.camera = CameraFacts(text_of(instrument), taken=taken)
         return reader
 
     def _read_times(self) -> None:
@@ -74,6 +77,11 @@ class SerReader(ContiguousReader):
         ticks = np.fromfile(self.paths[0], "<i8", n, offset=end)
         if (ticks > 0).all():
             self.timestamps = (ticks - _EPOCH) * 1e-7
+
+
+def _seconds(ticks: int) -> float | None:
+    """Return the header's time as s since 1970; None where it is empty."""
+    return (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
 
 
 def write_frames(

@@ -33,6 +33,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
     check_chain,
     images_behind_one_page,
     stated_bit_depth,
+    stated_camera,
     stated_channels,
     stated_time,
 )
@@ -124,6 +125,7 @@ class TiffReader(ContiguousReader):
             self._set_segments(path, pages, size, signed)
         self.bit_depth = stated_bit_depth(file, first)
         self.integration_time = stated_time(file, first)
+        self.camera = stated_camera(file, first)
 
     def _set_segments(self, path: Path, pages: Sequence[Any], size: int, signed: bool) -> None:
         """Remember where the coded strips or tiles of each page are."""

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import re
+from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.camera import CameraFacts, camera_from_names, celsius, seconds_of, text_of
 
-__all__ = ["check_chain", "images_behind_one_page", "stated_bit_depth", "stated_channels", "stated_time"]
+__all__ = [
+    "check_chain",
+    "images_behind_one_page",
+    "stated_bit_depth",
+    "stated_camera",
+    "stated_channels",
+    "stated_time",
+]
 
 
 class _Kind(NamedTuple):
@@ -27,6 +38,7 @@ _CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
 _MOST_TAGS = 4096
 _EXPOSURE_TAG = 33434
 _MICRO_MANAGER_TAG = 51123
+_MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "\u00b5s": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
@@ -137,6 +149,55 @@ def stated_time(file: Any, page: Any) -> float | None:
         exposure = record.get("Exposure-ms") if isinstance(record, dict) else None
         return _positive(1e-3 * float(exposure)) if exposure is not None else None
     return None
+
+
+def stated_camera(file: Any, page: Any) -> CameraFacts:
+    """Return what JSON, OME-XML, Micro-Manager, or the tags Make, Model and DateTime say of the camera."""
+    record = page.tags[_MICRO_MANAGER_TAG].value if _MICRO_MANAGER_TAG in page.tags else None
+    record = record if isinstance(record, dict) else {}
+    hot = next((value for name, value in record.items() if name.endswith("Temperature")), None)
+    found = (
+        camera_from_names(_shaped(file)),
+        _ome_camera(_ome(file)),
+        CameraFacts(
+            text_of(record.get("Camera")), temperature=celsius(hot), taken=seconds_of(record.get("Time"))
+        ),
+        CameraFacts(_make_and_model(page), taken=seconds_of(_tag(page, _DATE_TAG))),
+    )
+    return CameraFacts(*(_first(found, each.name) for each in fields(CameraFacts)))
+
+
+def _ome_camera(text: str) -> CameraFacts:
+    detector = re.search(r"<Detector [^<>]*>", text)
+    surroundings = re.search(r"<ImagingEnvironment [^<>]*>", text)
+    date = re.search(r"<AcquisitionDate>([^<>]*)<", text)
+    hot = _attribute(surroundings, "Temperature")
+    return CameraFacts(
+        text_of(_attribute(detector, "Model")),
+        text_of(_attribute(detector, "SerialNumber")),
+        celsius(hot, _attribute(surroundings, "TemperatureUnit") or "C"),
+        seconds_of(date[1].strip()) if date else None,
+    )
+
+
+def _attribute(element: re.Match[str] | None, name: str) -> str | None:
+    found = re.search(rf'\s{name}="([^"]*)"', element[0]) if element else None
+    return html.unescape(found[1]) if found else None
+
+
+def _make_and_model(page: Any) -> str | None:
+    make, model = text_of(_tag(page, _MAKE_TAG)), text_of(_tag(page, _MODEL_TAG))
+    if make and model and model.lower().startswith(make.lower()):
+        return model
+    return " ".join(part for part in (make, model) if part) or None
+
+
+def _tag(page: Any, number: int) -> Any:
+    return page.tags[number].value if number in page.tags else None
+
+
+def _first(found: Iterable[CameraFacts], name: str) -> Any:
+    return next((getattr(each, name) for each in found if getattr(each, name) is not None), None)
 
 
 def _positive(value: float) -> float | None:

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from pchem_pipeline.report.comparison import HistoryRow
+from pchem_pipeline.report.comparison import Against, HistoryRow
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, styled
 from pchem_pipeline.report.style.wording import short, symbol
@@ -17,16 +17,19 @@ __all__ = ["history_figures"]
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
 
 
-def history_figures(rows: Sequence[HistoryRow]) -> list[Figure]:
+_AXES = {"date": "days since the first", "temperature": "sensor temperature, °C", "label": "label"}
+
+
+def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure]:
     """Return the medians of the maps of each run; none for fewer than two runs."""
     shown = [name for name in _SHOWN if all(name in row.run.summary for row in rows)]
     if len(rows) < 2 or not shown:
         return []
     places = np.array([row.place for row in rows])
     ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
-    by_date = ordered and all(row.label == row.date for row in rows)
+    by_date = ordered and against == "date"
     at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
-    axis = "days since the first" if by_date else "label" if ordered else "run"
+    axis = _AXES[against] if ordered else "run"
     columns: dict[str, object] = {
         "run": [row.run.name for row in rows],
         "label": [row.label for row in rows],

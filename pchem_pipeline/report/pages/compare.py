@@ -95,7 +95,7 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     many = len(found.pairs) > _MOST_DRAWN
     maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
     whole = ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]])
-    times = history_figures(found.history)
+    times = history_figures(found.history, found.against)
     drawn = (draw or draw_here)(
         [*whole, *times, *(each for figures in maps.values() for each in figures)], _SETTINGS
     )
@@ -202,6 +202,8 @@ def history_table(found: Comparison) -> Table:
         rows.append(
             (
                 row.label,
+                row.date[:10],
+                "" if row.temperature is None else f"{row.temperature:.4g}",
                 row.run.title,
                 f"{row.run.pixels[0]:,}",
                 f"{row.hot_pixels:,}",
@@ -217,7 +219,7 @@ def history_table(found: Comparison) -> Table:
         "Moved: pixels with a good fit in both whose value differs from the first run's beyond its errors, "
         f"at a false-discovery rate of {found.rate:g}. This and all medians are in history.csv, a line "
         "for each run.",
-        ("label", "run", "good pixels", "hot", "flags", "effects", "moved", "in"),
+        ("label", "date", "°C", "run", "good pixels", "hot", "flags", "effects", "moved", "in"),
         tuple(rows),
     )
 

@@ -53,6 +53,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
                 "nx": data.shape[1],
                 "n_frames": data.n_frames,
                 "integration_time": data.integration_time,
+                "camera": data.camera or None,
             },
             "summary": _summary(data),
             "fit_status": _fit_status(data),

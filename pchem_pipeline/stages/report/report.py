@@ -213,6 +213,7 @@ def report_data(
         kind=config.input.kind,
         n_frames=n_frames,
         integration_time=integration_time,
+        camera=sensor.camera.words(),
         maps=maps,
         fit=run.fit,
         status_words={int(bit): text for bit, text in MEANINGS.items()},

@@ -1,0 +1,139 @@
+"""The camera's name, serial number, temperature and date, in every format that has a place for them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import zarr
+from astropy.io import fits
+
+from pchem_pipeline.frames.camera import CameraFacts, celsius, seconds_of, shared_facts, text_of
+from pchem_pipeline.frames.formats import ser
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+
+STACK = np.random.default_rng(5).integers(0, 4096, (5, 6, 7)).astype(np.uint16)
+TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
+
+
+def facts(path: Path, **settings: object) -> CameraFacts:
+    with open_frames(InputSettings(files=(path.name,), **settings), path.parent) as frames:
+        np.testing.assert_array_equal(frames.read(), STACK)
+        return frames.camera
+
+
+def test_fits(tmp_path: Path) -> None:
+    image = fits.PrimaryHDU(STACK)
+    image.header["INSTRUME"], image.header["SERIALNO"] = "qCMOS X", 1234
+    image.header["CCD-TEMP"], image.header["DATE-OBS"] = -19.5, "2026-01-31T12:00:00"
+    image.writeto(tmp_path / "a.fits")
+    assert facts(tmp_path / "a.fits") == CameraFacts("qCMOS X", "1234", -19.5, TAKEN)
+    image.header["CCD-TEMP"] = (253.15, "[K] of the detector")
+    image.header["DATE-OBS"], image.header["TIME-OBS"] = "2026-01-31", "12:00:00"
+    image.writeto(tmp_path / "b.fits")
+    found = facts(tmp_path / "b.fits")
+    assert (found.temperature, found.taken) == (pytest.approx(-20.0), TAKEN)
+
+
+def test_tiff_tags_and_records(tmp_path: Path) -> None:
+    tags = [
+        (271, "s", 0, "Maker", True),
+        (272, "s", 0, "Model 7", True),
+        (306, "s", 0, "2026:01:31 12:00:00", True),
+    ]
+    tifffile.imwrite(tmp_path / "tags.tif", STACK, photometric="minisblack", extratags=tags, metadata=None)
+    assert facts(tmp_path / "tags.tif") == CameraFacts("Maker Model 7", None, None, TAKEN)
+    record = json.dumps(
+        {"shape": STACK.shape, "camera": "Own", "serial_number": "S-1", "sensor_temperature": 4}
+    )
+    tifffile.imwrite(tmp_path / "json.tif", STACK, description=record, metadata=None)
+    assert facts(tmp_path / "json.tif") == CameraFacts("Own", "S-1", 4.0, None)
+    manager = json.dumps({"Camera": "Andor", "Andor-CCDTemperature": "-60"}).encode()
+    tifffile.imwrite(tmp_path / "m.tif", STACK, extratags=[(51123, "s", 0, manager, True)], metadata=None)
+    assert facts(tmp_path / "m.tif") == CameraFacts("Andor", None, -60.0, None)
+
+
+def test_ome_tiff(tmp_path: Path) -> None:
+    path = tmp_path / "a.ome.tif"
+    tifffile.imwrite(path, STACK, metadata={"axes": "TYX", "AcquisitionDate": "2026-01-31T12:00:00"})
+    text = tifffile.tiffcomment(path)
+    detector = '<Detector ID="Detector:0" Model="A &amp; B" SerialNumber="9"/>'
+    extra = f'<Instrument ID="Instrument:0">{detector}</Instrument>'
+    text = text.replace("<Image ", extra + "<Image ", 1)
+    text = text.replace("<Pixels ", '<ImagingEnvironment Temperature="-10" TemperatureUnit="°C"/><Pixels ', 1)
+    tifffile.tiffcomment(path, text.encode())
+    found = facts(path)
+    assert (found.name, found.serial, found.temperature, found.taken) == ("A & B", "9", -10.0, TAKEN)
+
+
+def test_hdf5_and_zarr(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.create_group("entry/detector")
+        group["frames"] = STACK
+        group["description"], group["serial_number"] = "Detector Y", "77"
+        group["sensor_temperature"] = 250.0
+        group["sensor_temperature"].attrs["units"] = "K"
+    assert facts(tmp_path / "a.h5") == CameraFacts("Detector Y", "77", pytest.approx(-23.15), None)
+    attributes = {"camera": "Z", "sensor_temperature": 12.5, "start_time": "2026-01-31T13:00:00+01:00"}
+    zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
+    assert facts(tmp_path / "a.zarr") == CameraFacts("Z", None, 12.5, TAKEN)
+
+
+def test_ser_and_raw(tmp_path: Path) -> None:
+    ser.write_frames(tmp_path / "a.ser", iter([STACK]), STACK.shape, STACK.dtype, bit_depth=12)
+    head = bytearray((tmp_path / "a.ser").read_bytes())
+    head[82:122] = b"Planetary cam".ljust(40, b"\0")
+    head[170:178] = struct.pack("<q", 621_355_968_000_000_000 + int(TAKEN * 1e7))
+    (tmp_path / "a.ser").write_bytes(head)
+    assert facts(tmp_path / "a.ser") == CameraFacts("Planetary cam", None, None, pytest.approx(TAKEN))
+    STACK.astype("<u2").tofile(tmp_path / "a.raw")
+    side = {"shape": STACK.shape, "dtype": "uint16", "camera": "R", "sensor_temperature": -5}
+    (tmp_path / "a.raw.json").write_text(json.dumps(side))
+    assert facts(tmp_path / "a.raw", format="raw") == CameraFacts("R", None, -5.0, None)
+
+
+def test_files_without_facts_have_none(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", STACK)
+    assert facts(tmp_path / "a.npy") == CameraFacts()
+
+
+def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
+    for i, temperature in enumerate((-20.0, -20.4, -17.0)):
+        image = fits.PrimaryHDU(STACK[i])
+        image.header["INSTRUME"], image.header["CCD-TEMP"] = "C", temperature
+        image.header["SERIALNO"] = f"{i // 2}"
+        image.header["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
+        image.writeto(tmp_path / f"{i}.fits")
+    with open_frames(InputSettings(files=("*.fits",)), tmp_path) as frames:
+        assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
+        assert [note for note in frames.notes if "from -20.4 to -17 °C" in note]
+    steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
+    assert (steady.temperature, remark) == (1.45, "")
+    assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "found"),
+    [
+        ("-10", "°C", -10.0),
+        (300, "K", 26.85),
+        (300, "C", None),
+        (float("nan"), "C", None),
+        ("warm", "C", None),
+    ],
+)
+def test_a_temperature_is_one_of_a_sensor_or_none(value: object, unit: str, found: float | None) -> None:
+    assert celsius(value, unit) == (None if found is None else pytest.approx(found))
+
+
+def test_hostile_texts_become_one_short_line() -> None:
+    assert text_of(b"a\x1b[31m\n<b>\0rest") == "a [31m <b>"
+    assert text_of("x" * 1_000_000) == "x" * 80
+    assert (text_of(b"\0\0"), text_of(None), text_of(True)) == (None, None, None)
+    assert (seconds_of("yesterday"), seconds_of("1800-01-01"), seconds_of(5)) == (None, None, None)
