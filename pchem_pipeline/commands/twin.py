@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -136,12 +137,12 @@ def write_twin(
 def _yaml_of(config: RunConfig) -> str:
     """Return what a twin differs in from the defaults; its effects are simulated and stand in the model."""
     assert config.simulate is not None
-    simulated = config.simulate.model_dump(mode="json", exclude_defaults=True)
-    size = {"shape": list(config.simulate.shape), "n_frames": config.simulate.n_frames}
+    whole = config.simulate.model_dump(mode="json")
+    kept = config.simulate.model_dump(mode="json", exclude_defaults=True).keys() | {"shape", "n_frames"}
     content = {
         "run": {"store": str(config.run.store)},
-        "simulate": {**size, **simulated},
-        **({"model": {"effects": simulated["effects"]}} if "effects" in simulated else {}),
+        "simulate": {name: value for name, value in whole.items() if name in kept},
+        **({"model": {"effects": copy.deepcopy(whole["effects"])}} if whole["effects"] else {}),
     }
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
