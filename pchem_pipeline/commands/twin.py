@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import yaml
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
-from pchem_pipeline.config.load import make_config
+from pchem_pipeline.config.load import make_config, yaml_text
 from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.simulate.scene import with_scene
@@ -144,7 +143,7 @@ def _yaml_of(config: RunConfig) -> str:
         "simulate": {name: value for name, value in whole.items() if name in kept},
         **({"model": {"effects": copy.deepcopy(whole["effects"])}} if whole["effects"] else {}),
     }
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return yaml_text(content)
 
 
 def _scene_place(scene: str, twin: Twin) -> str:

@@ -24,6 +24,7 @@ __all__ = [
     "present_keys",
     "setting_of",
     "yaml_content",
+    "yaml_text",
 ]
 
 
@@ -181,7 +182,12 @@ def dump_config(config: RunConfig) -> str:
     content = config.model_dump(mode="json", by_alias=True)
     if content["simulate"] is None:
         del content["simulate"]
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return yaml_text(content)
+
+
+def yaml_text(content: Mapping[str, Any]) -> str:
+    """Return plain data as YAML, in their order."""
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
 def setting_of(config: RunConfig, dotted: str) -> Any:
