@@ -29,9 +29,7 @@ class PchEm(Method):
         """Return the fit of the first sample."""
         sample = pixels.samples[0]
         result = fit_histograms(sample.counts, sample.origin)
-        parameters = np.stack(
-            [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
-        )
+        parameters = result.columns
         failed = result.fit_status[(result.fit_status & int(FAILED)) != 0]
         reasons = {
             text: int(np.count_nonzero(failed & int(bit))) for bit, text in MEANINGS.items() if bit & FAILED

@@ -76,7 +76,7 @@ def verify(targets: Sequence[Target], point: Point, n_frames: int, n_pixels: int
         rng, point.quanta_exposure, point.conversion_gain, bias, point.read_noise_e, n_frames
     )
     fit = fit_histograms(drawn.counts, drawn.origin)
-    found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+    found = fit.columns
     return _outcome(targets, point, _errors(found, drawn.truth), fit.fit_status, n_frames)
 
 

@@ -63,7 +63,7 @@ def _maps(run: StoredRun) -> PixelMaps | None:
         return None
     values = [np.asarray(run.maps[name], np.float64) for name in PARAMETERS]
     usable = ((status & int(UNTRUSTWORTHY)) == 0) & np.isfinite(values).all(axis=0)
-    return PixelMaps(values[0], values[1], values[2], values[3], usable) if usable.any() else None
+    return PixelMaps.known(values, usable) if usable.any() else None
 
 
 def read_sums(store: RunStore) -> StackSums | None:
@@ -164,7 +164,7 @@ def _codes(store: RunStore, maps: PixelMaps) -> CodeSample | None:
         block = store.read("histogram/counts", (*part, slice(None)))
         counts.append(block.reshape(-1, block.shape[2])[inside])
         origins.append(origin[part].ravel()[inside].astype(np.int64))
-        values = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+        values = maps.maps
         parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
     if sum(part.size for part in origins) < _FEWEST:
         return None

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.model.law.parameters import FloatArray, PixelParameters, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import FloatArray, usable_pixels
 
 __all__ = ["PEAKS_OVERLAP_E", "Calibration", "covariance_of"]
 
@@ -21,7 +21,7 @@ PEAKS_OVERLAP_E = 0.4
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(PixelParameters):
     """Parameters of pixels with the covariance of their estimates, and the law of their samples.
 
     Attributes:
@@ -35,10 +35,6 @@ class Calibration:
         satellites: amplitude (e-) and weight of what free satellites the fit found, shape (y * x, 2).
     """
 
-    quanta_exposure: FloatArray
-    conversion_gain: FloatArray
-    bias: FloatArray
-    read_noise_dn: FloatArray
     covariance: FloatArray
     fit_status: NDArray[np.uint16]
     law: SampleLaw = field(default_factory=SampleLaw)
@@ -61,8 +57,7 @@ class Calibration:
     @property
     def columns(self) -> FloatArray:
         """(H, g, mu, sigma) of the usable pixels, NaN elsewhere, shape (n, 4)."""
-        maps = (self.quanta_exposure, self.conversion_gain, self.bias, self.read_noise_dn)
-        table = np.stack([np.asarray(values, np.float64).ravel() for values in maps], axis=1)
+        table = super().columns
         table[:, 0] = np.where(table[:, 0] > 0.0, table[:, 0], 1.0)  # held fixed nowhere: any will do
         table[~self.usable.ravel()] = np.nan
         return table

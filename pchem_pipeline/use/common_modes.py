@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.maps.pixels import FloatArray
+from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use import common_modes_numba
 from pchem_pipeline.use.calibration import Calibration
 

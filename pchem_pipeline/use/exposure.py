@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
-from pchem_pipeline.model.maps.pixels import FloatArray
+from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
 

@@ -30,9 +30,9 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 
@@ -114,7 +114,7 @@ def simulate_and_fit(size: int, n_frames: int, n_chosen: int, seed: int, clock: 
         began = time.process_time()
         fit = fit_histograms(all_frames, origin)
         clock.lap("fit", began)
-        fitted = (fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn)
+        fitted = fit.maps
         chunks.append(Chunk(origin, chosen.astype(np.uint16), all_frames, fitted))
     return chunks
 
@@ -122,7 +122,7 @@ def simulate_and_fit(size: int, n_frames: int, n_chosen: int, seed: int, clock: 
 def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock: Clock) -> None:
     """Print every RMSE with its floor."""
     columns = zip(*(chunk.fitted for chunk in chunks), strict=True)
-    pixels, mask = PixelParameters.from_maps([np.concatenate(each) for each in columns])
+    pixels, mask = UsablePixels.from_maps([np.concatenate(each) for each in columns])
     low = min(int(chunk.origin.min()) for chunk in chunks)
     high = max(int(_last(chunk)) for chunk in chunks)
     dn = DnAxis(low, high - low + 1)
@@ -136,7 +136,7 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
     raw, raw_all, nuced = (np.zeros(m, dtype=np.int64) for m in (dn.size, dn.size, axis.size))
     numbers = np.zeros(60, dtype=np.int64)
     for chunk in chunks:
-        part, use = PixelParameters.from_maps(chunk.fitted)
+        part, use = UsablePixels.from_maps(chunk.fitted)
         began = time.process_time()
         data = tally(chunk.chosen[use], chunk.origin[use], part, dn, axis)
         known = KnownPixels(part, SampleLaw())
@@ -183,7 +183,7 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
     electrons(pixels, numbers, total, clock)
 
 
-def electrons(pixels: PixelParameters, numbers: NDArray[np.int64], total: int, clock: Clock) -> None:
+def electrons(pixels: UsablePixels, numbers: NDArray[np.int64], total: int, clock: Clock) -> None:
     """Print how well the histogram of electron numbers is predicted."""
     began = time.process_time()
     known = KnownPixels(pixels, SampleLaw())

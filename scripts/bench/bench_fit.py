@@ -72,9 +72,7 @@ def draw_range(
 
 def estimates(result: FitResult) -> Array:
     """Return (H, g, mu, sigma) by pixel."""
-    return np.stack(
-        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
-    )
+    return result.columns
 
 
 def is_wrong(answer: Array, truth: Array) -> NDArray[np.bool_]:

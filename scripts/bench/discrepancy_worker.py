@@ -114,7 +114,7 @@ def _extended(
     from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.status import FAILED
 
-    parameters = [plain.quanta_exposure, plain.conversion_gain, plain.bias, plain.read_noise_dn]
+    parameters = plain.maps
     model = sample_law(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)
     return fit_histograms(counts, origin, law=model, start=plain)
 

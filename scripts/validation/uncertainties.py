@@ -101,7 +101,7 @@ def draw(
 
 def estimates(fit: FitResult) -> Array:
     """Return (H, g, mu, sigma) by pixel."""
-    return np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+    return fit.columns
 
 
 def with_noise_e(values: Array, covariance: Array) -> tuple[Array, Array]:

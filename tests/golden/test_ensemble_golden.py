@@ -11,8 +11,8 @@ from scipy.stats import nbinom
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, ensemble_sums
 from pchem_pipeline.model.ensemble.ensemble_binned import HistogramChoice, epcd_independent
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import PixelParameters
 
 
 @pytest.mark.parametrize("k", [0, 1, 4, 9])
@@ -35,7 +35,7 @@ def test_electron_mass_of_a_gamma_exposure_is_negative_binomial() -> None:
 
 def test_density_of_one_pixel_to_forty_digits() -> None:
     h, g, mu, sigma = 2.3, 0.11, 98.7, 2.9
-    pixels = PixelParameters(*(np.array([v]) for v in (h, g, mu, sigma)))
+    pixels = UsablePixels(*(np.array([v]) for v in (h, g, mu, sigma)))
     found = ensemble_sums(pixels, DnAxis(80, 120)).raw / len(pixels)
     independent = epcd_independent(pixels, DnAxis(80, 120), HistogramChoice())
     with mpmath.workdps(40):
@@ -52,7 +52,7 @@ def test_density_of_one_pixel_to_forty_digits() -> None:
 def test_error_rate_without_rounding_is_the_bit_error_rate() -> None:
     # a fine ADC (1000 DN per electron) and s_e = 0.3: the error is that of the continuous thresholds
     h, s_e = 1.5, 0.3
-    pixels = PixelParameters(*(np.array([v]) for v in (h, 1e-3, 50.0, s_e * 1e3)))
+    pixels = UsablePixels(*(np.array([v]) for v in (h, 1e-3, 50.0, s_e * 1e3)))
     with mpmath.workdps(30):
         correct = mpmath.mpf(0)
         for k in range(40):

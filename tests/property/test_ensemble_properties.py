@@ -12,9 +12,9 @@ from scipy.stats import norm, poisson
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, nuced_axis
 from pchem_pipeline.model.ensemble.totals import EnsembleAxes
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.maps import display_transform
-from pchem_pipeline.model.maps.pixels import PixelParameters
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
 
 RNG = np.random.default_rng(21)
@@ -26,7 +26,7 @@ MAPS = (
     RNG.normal(3.2, 0.2, N),
 )
 DN = DnAxis(60, 240)
-AXES = EnsembleAxes(DN, nuced_axis(PixelParameters(*MAPS), DN), 12)
+AXES = EnsembleAxes(DN, nuced_axis(UsablePixels(*MAPS), DN), 12)
 COUNTS = RNG.poisson(2.0, size=(N, 60)).astype(np.uint16)
 OUTSIDE = RNG.poisson(0.3, size=N)
 ORIGIN = RNG.integers(80, 100, N)

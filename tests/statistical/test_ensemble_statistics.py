@@ -11,25 +11,25 @@ from pchem_pipeline.model.checks.residuals import noise_floor, rmse
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.components import moment_errors, predicted_moments, sample_moments
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, ensemble_sums, nuced_axis, tally
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import PixelParameters
 
 N_PIXELS, N_FRAMES = 600, 40
 DN = DnAxis(40, 360)
 
 
-def make_pixels() -> PixelParameters:
+def make_pixels() -> UsablePixels:
     rng = np.random.default_rng(11)
     z = rng.standard_normal(N_PIXELS)
     g = 0.1 * np.exp(0.05 * z)
     s_e = 0.305 * np.exp(0.08 * z + 0.08 * rng.standard_normal(N_PIXELS))
     h = 2.0 * np.exp(0.4 * rng.standard_normal(N_PIXELS))
-    return PixelParameters(h, g, 100.0 + 4.0 * rng.standard_normal(N_PIXELS), s_e / g)
+    return UsablePixels(h, g, 100.0 + 4.0 * rng.standard_normal(N_PIXELS), s_e / g)
 
 
-def draw(pixels: PixelParameters, n_frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def draw(pixels: UsablePixels, n_frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Frames by eq. PCD_RV_definition, rounding included, and the electrons behind them."""
-    h, g, mu, sigma = pixels.columns()
+    h, g, mu, sigma = pixels.maps
     electrons = rng.poisson(h, size=(n_frames, len(pixels)))
     noise = np.sqrt(sigma**2 - 1 / 12) * rng.standard_normal(electrons.shape)
     return np.rint(mu + electrons / g + noise).astype(np.int64), electrons
@@ -41,12 +41,12 @@ def counts_of(frames: np.ndarray) -> np.ndarray:
     return counts
 
 
-def probabilities(pixels: PixelParameters, axis: NucedAxis) -> tuple[np.ndarray, np.ndarray]:
+def probabilities(pixels: UsablePixels, axis: NucedAxis) -> tuple[np.ndarray, np.ndarray]:
     """Exact probability of each DN, and of each NUCed bin, of each pixel; shapes (n, bins)."""
     k = np.arange(80)
     raw = np.empty((len(pixels), DN.size))
     nuced = np.empty((len(pixels), axis.size))
-    for p, (h, g, mu, sigma) in enumerate(zip(*pixels.columns(), strict=True)):
+    for p, (h, g, mu, sigma) in enumerate(zip(*pixels.maps, strict=True)):
         centres, analog = mu + k[:, None] / g, np.sqrt(sigma**2 - 1 / 12)
         cells = norm.cdf(DN.dn + 0.5, centres, analog) - norm.cdf(DN.dn - 0.5, centres, analog)
         raw[p] = poisson.pmf(k, h) @ cells
@@ -69,7 +69,7 @@ def repeats() -> dict[str, np.ndarray]:
     """Mean square residuals of 40 captures: true model, and one with an exposure 10 % off."""
     pixels = make_pixels()
     axis = nuced_axis(pixels, DN)
-    wrong = PixelParameters(
+    wrong = UsablePixels(
         pixels.quanta_exposure * 1.1, pixels.conversion_gain, pixels.bias, pixels.read_noise_dn
     )
     sums, off = ensemble_sums(pixels, DN, axis), ensemble_sums(wrong, DN, axis)
@@ -121,7 +121,7 @@ def test_moments_agree_with_the_sample_and_a_wrong_gain_would_not() -> None:
     assert abs(variance - expected.variance) < 5 * error.variance
     assert abs(nuced_mean - expected.nuced_mean) < 5 * error.nuced_mean
     assert abs(nuced_variance - expected.nuced_variance) < 5 * error.nuced_variance
-    wrong = PixelParameters(
+    wrong = UsablePixels(
         pixels.quanta_exposure, pixels.conversion_gain * 1.02, pixels.bias, pixels.read_noise_dn
     )
     off = predicted_moments(wrong)
@@ -168,7 +168,7 @@ def test_error_rate_and_electron_histogram_are_as_predicted() -> None:
     limit = 5 * np.sqrt(mass * (1 - mass) / n) + 5 / n
     np.testing.assert_array_less(np.abs(observed / n - mass), limit)
     # an exposure wrong by 10 % would be seen
-    h, *others = pixels.columns()
-    brighter = KnownPixels(PixelParameters(1.1 * h, *others), SampleLaw())
+    h, *others = pixels.maps
+    brighter = KnownPixels(UsablePixels(1.1 * h, *others), SampleLaw())
     off = number_tables(*brighter.codes(), brighter.exposure, brighter, detailed=True).outcomes(40)
     assert np.max(np.abs(observed / n - off.estimated / N_PIXELS) / limit) > 4

@@ -20,9 +20,7 @@ FIVE = 5.0
 
 
 def estimates(result: FitResult) -> NDArray[np.float64]:
-    return np.stack(
-        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
-    )
+    return result.columns
 
 
 def wrong(result: FitResult, truth: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -18,9 +18,9 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.model.maps.pixels import PixelParameters
 
 Array = NDArray[np.float64]
 GUARD_OFF = FitSettings(tail_guard=0)
@@ -40,7 +40,7 @@ def judge_together(fit: FitResult) -> FitResult:
 
 
 def estimates(fit: FitResult) -> Array:
-    return np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+    return fit.columns
 
 
 def errors(fit: FitResult) -> Array:
@@ -204,7 +204,7 @@ def test_the_error_of_the_ensemble_is_its_scatter() -> None:
     for _ in range(n):
         pixels = draw(rng, exposure, 11.0, 0.3, bias, n_frames=2000)
         fit = fit_histograms(pixels.counts, pixels.origin)
-        some = PixelParameters(*np.ascontiguousarray(estimates(fit).T))
+        some = UsablePixels(*np.ascontiguousarray(estimates(fit).T))
         curves.append(ensemble_sums(some, dn).raw / len(some))
         raw, corrected = curve_errors(some, fit.covariance, dn, nuced)
         predicted += np.sqrt(raw) / len(some) / n

@@ -244,8 +244,8 @@ class HistogramExplainer:
         columns = np.full((4, self.n_pixels * self.layout.n), np.nan)
         columns[:, self.chosen] = self.final_fit.fit.parameters.T
         shape = (self.n_pixels, self.layout.n) if self.joint else (1, self.n_pixels)
-        exposure, gain, bias, noise = columns.reshape(4, *shape)
-        return Fitted(PixelMaps(exposure, gain, bias, noise, np.isfinite(exposure)), self.code)
+        maps = columns.reshape(4, *shape)
+        return Fitted(PixelMaps.known(maps, np.isfinite(maps[0])), self.code)
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -344,7 +344,7 @@ def _widened(
 
 def _parameters(maps: PixelMaps) -> FloatArray:
     """Return (H, g, mu, sigma), (n, 4), NaN where not usable."""
-    columns = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    columns = maps.maps
     return np.stack([values.ravel() for values in columns], axis=1)
 
 

@@ -232,15 +232,7 @@ def _distinct(effects: Sequence[Effect]) -> list[Effect]:
 def _changes(effect: Effect, evidence: Evidence) -> bool:
     """Tell whether an effect changes the law of the pixels in more than the width of its read noise."""
     usable = np.flatnonzero(evidence.maps.usable.ravel())[:4]
-    columns = [
-        np.asarray(values, np.float64).ravel()[usable]
-        for values in (
-            evidence.maps.quanta_exposure,
-            evidence.maps.conversion_gain,
-            evidence.maps.bias,
-            evidence.maps.read_noise_dn,
-        )
-    ]
+    columns = [np.asarray(values, np.float64).ravel()[usable] for values in evidence.maps.maps]
     maps = pixel_maps(columns, np.ones(usable.size, np.bool_))
     law = sample_law([effect], maps)
     low = int((maps.bias - 8.0 * maps.read_noise_dn).min())

@@ -137,7 +137,7 @@ def _mixture(
     """Return the histograms and masses of pixels that stand for all; None where the effects give no law."""
     usable = np.flatnonzero(maps.usable.ravel())
     chosen = usable[:: max(usable.size // _MOST_PIXELS, 1)]
-    every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    every = maps.maps
     flat = tuple(values.ravel()[chosen] for values in every)
     try:
         law = sample_law(effects, pixel_maps(flat, np.ones(chosen.size, bool)))

@@ -74,8 +74,7 @@ def refit_maps(
         New maps; the old ones where the effects cannot be fitted with.
     """
     shape = maps.usable.shape
-    old = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
-    flat = tuple(values.ravel() for values in old)
+    flat = maps.flat.maps
     try:
         numbers = np.arange(frames.shape[0]) if numbers is None else numbers
         places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers)
@@ -86,15 +85,14 @@ def refit_maps(
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
     near = np.stack(flat, axis=1)
     fit = fit_histograms(counts, histograms.origin.ravel(), law=law, start=near)
-    new = (fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn)
-    good = maps.usable.ravel() & np.isfinite(np.stack(new)).all(axis=0)
-    exposure, gain, bias, noise = (np.where(good, values, np.nan).reshape(shape) for values in new)
+    new = fit.maps
+    good = maps.usable.ravel() & np.isfinite(fit.columns).all(axis=1)
     stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
     moved = {
         name: _change(after[good] - before[good], error[good], unit)
         for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
     }
-    new_maps = PixelMaps(exposure, gain, bias, noise, good.reshape(shape))
+    new_maps = PixelMaps.known(new, good.reshape(shape))
     return Refit(new_maps, moved, fit.covariance[:, :4, :4].reshape(*shape, 4, 4))
 
 
@@ -113,7 +111,7 @@ def expected_codes(
         Shape (c,); None where the effects give no law.
     """
     usable = maps.usable.ravel()
-    every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    every = maps.maps
     flat = tuple(values.ravel()[usable] for values in every)
     try:
         shape = maps.usable.shape
@@ -155,8 +153,7 @@ class Sensor:
         """Return maps that may be the true ones; ``usable`` are those that can be simulated."""
         values = np.full((*self.drawn.shape, 4), np.nan)
         values[self.drawn] = self.posterior.draw(np.random.default_rng(seed))
-        exposure, gain, bias, noise = (np.ascontiguousarray(values[..., i]) for i in range(4))
-        return PixelMaps(exposure, gain, bias, noise, self.drawn)
+        return PixelMaps.known(np.moveaxis(values, -1, 0), self.drawn)
 
     def usual(self, seed: int) -> PixelMaps:
         """Return the same of the pixels whose fit can be relied upon."""
@@ -184,7 +181,7 @@ def learn_sensor(
     """
     maps = fit.maps
     usable = maps.usable.ravel()
-    every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+    every = maps.maps
     parameters = np.where(usable[:, None], np.stack([values.ravel() for values in every], axis=1), np.nan)
     covariance = fit.covariance.reshape(-1, 4, 4)
     shape = maps.usable.shape

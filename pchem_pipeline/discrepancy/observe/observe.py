@@ -238,16 +238,11 @@ def _fitted(
     near: PixelMaps | None,
 ) -> tuple[FitResult, FloatArray, NDArray[np.bool_]]:
     """Return the fit, its parameters (n, 4), and which pixels can be used."""
-    start = None
-    if near is not None:
-        known = (near.quanta_exposure, near.conversion_gain, near.bias, near.read_noise_dn)
-        start = np.stack([values.ravel() for values in known], axis=1)
+    start = None if near is None else near.columns
     # every sample counts here: what the tail guard would leave out is what is looked for
     settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
     result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
-    parameters = np.stack(
-        [result.quanta_exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1
-    )
+    parameters = result.columns
     usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
     usable &= outside.sum(axis=1) <= _MOST_OUTSIDE * counts.sum(axis=1)
     return result, parameters, usable
@@ -269,8 +264,7 @@ def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bo
 
 
 def _maps(parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelMaps:
-    exposure, gain, bias, noise = (np.ascontiguousarray(m).reshape(usable.shape) for m in parameters.T)
-    return PixelMaps(exposure, gain, bias, noise, usable)
+    return PixelMaps.known(parameters.T, usable)
 
 
 def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:

@@ -102,7 +102,7 @@ class Samples:
         """Prepare frames by the fit of their pixels."""
         histograms = histogram_frames(frames)
         outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
-        known = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+        known = maps.maps
         laws = pixel_laws(
             histograms.counts.reshape(-1, histograms.counts.shape[2]),
             histograms.origin.ravel().astype(np.int64),

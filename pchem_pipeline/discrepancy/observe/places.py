@@ -8,7 +8,7 @@ those of the whole, which tells the two apart.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -159,14 +159,8 @@ def part_statistics(
     for part in parts:
         mask = window.mask(part.region)
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-        own = PixelMaps(*(getattr(maps, each.name)[np.ix_(rows, columns)] for each in fields(PixelMaps)))
-        own = PixelMaps(
-            own.quanta_exposure,
-            own.conversion_gain,
-            own.bias,
-            own.read_noise_dn,
-            own.usable & mask[np.ix_(rows, columns)],
-        )
+        own = maps.of(np.ix_(rows, columns))
+        own = replace(own, usable=own.usable & mask[np.ix_(rows, columns)])
         small = frames if mask.all() else frames[:, rows[:, None], columns]
         try:
             evidence = part_evidence(

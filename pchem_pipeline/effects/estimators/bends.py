@@ -96,8 +96,7 @@ def _in_use(expected: NDArray[np.float64]) -> float:
 
 def _sample(maps: PixelMaps) -> tuple[NDArray[np.float64], ...] | None:
     """Return H, g, mu, sigma of pixels spread over the sensor, each (n, 1), without the widest histograms."""
-    every = [maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn]
-    parts = np.stack([part[maps.usable] for part in every]).astype(np.float64)
+    parts = np.stack([part[maps.usable] for part in maps.maps]).astype(np.float64)
     parts = parts[:, np.isfinite(parts).all(axis=0)]
     if not parts.shape[1]:
         return None

@@ -42,8 +42,7 @@ _SAMPLES = 1e9
 
 def select_pixels(maps: PixelMaps, where: NDArray[np.intp]) -> PixelMaps:
     """Return the parameters of some pixels, by their flat indices, each of that shape."""
-    names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "usable")
-    return PixelMaps(**{name: np.asarray(getattr(maps, name)).reshape(-1)[where] for name in names})
+    return maps.flat.of(where)
 
 
 def typical_pixels(maps: PixelMaps, n: int = 8) -> tuple[NDArray[np.intp], list[NDArray[np.intp]]]:
@@ -178,7 +177,7 @@ def refitted(
         row[: mass.size] = np.rint(mass * _SAMPLES)
     fit = fit_histograms(counts, origin, settings=FitSettings(tail_guard=0))
     good = np.isfinite(fit.quanta_exposure)
-    maps = PixelMaps(fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn, good)
+    maps = PixelMaps.known(fit.maps, good)
     return [PixelLaw(maps, i, n_frames) if good[i] else laws[i] for i in range(len(laws))]
 
 

@@ -123,7 +123,7 @@ class DarkCurrentRts(Effect):
             return None
         found: dict[tuple[int, int], Telegraph] = {}
         good = maps.usable
-        columns = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
+        columns = maps.maps
         for y in np.flatnonzero(good.any(axis=1)):
             row = np.ascontiguousarray(frames[:, y].T)
             for x in np.flatnonzero(good[y]):

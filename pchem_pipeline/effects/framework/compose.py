@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,8 +38,7 @@ def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.boo
     """
     columns = [np.asarray(values, np.float64).ravel() for values in parameters]
     known = np.asarray(usable, bool).ravel() & np.isfinite(np.stack(columns)).all(axis=0)
-    exposure, gain, bias, sigma = (np.where(known, values, np.nan) for values in columns)
-    return PixelMaps(exposure, gain, bias, sigma, known)
+    return PixelMaps.known(columns, known)
 
 
 @dataclass(frozen=True)
@@ -154,7 +153,7 @@ def _some(maps: PixelMaps, pixels: NDArray[np.intp]) -> PixelMaps:
     """Return the parameters of some pixels."""
     if pixels.size == maps.bias.size:
         return maps
-    return PixelMaps(*(getattr(maps, each.name)[pixels] for each in fields(PixelMaps)))
+    return maps.of(pixels)
 
 
 def place_words(effect: Effect) -> str:

@@ -10,13 +10,14 @@ no samples.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.model.law.parameters import PixelParameters
 
 __all__ = [
     "SCORES",
@@ -34,7 +35,7 @@ SCORES = ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1")
 
 
 @dataclass(frozen=True)
-class PixelMaps:
+class PixelMaps(PixelParameters):
     """Fitted parameters of the pixels, each (y, x); NaN where ``usable`` is False.
 
     Attributes:
@@ -45,11 +46,25 @@ class PixelMaps:
         usable: pixels with a fit that can be relied upon.
     """
 
-    quanta_exposure: NDArray[np.float64]
-    conversion_gain: NDArray[np.float64]
-    bias: NDArray[np.float64]
-    read_noise_dn: NDArray[np.float64]
     usable: NDArray[np.bool_]
+
+    @classmethod
+    def known(cls, parameters: Iterable[ArrayLike], usable: NDArray[np.bool_]) -> PixelMaps:
+        """Return maps of (H, g, mu, sigma) in the shape of ``usable``, NaN where that is False."""
+        exposure, gain, bias, sigma = (
+            np.where(usable, np.asarray(each, np.float64).reshape(usable.shape), np.nan)
+            for each in parameters
+        )
+        return cls(exposure, gain, bias, sigma, usable)
+
+    def of(self, pixels: Any) -> PixelMaps:
+        """Return some pixels, by any index of the maps."""
+        return PixelMaps.known([each[pixels] for each in self.maps], self.usable[pixels])
+
+    @property
+    def flat(self) -> PixelMaps:
+        """The pixels in one axis."""
+        return PixelMaps.known(self.maps, self.usable.reshape(-1))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.maps.pixels import FloatArray
+from pchem_pipeline.model.law.parameters import FloatArray
 
 __all__ = [
     "ChiSquare",

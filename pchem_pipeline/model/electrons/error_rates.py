@@ -9,17 +9,15 @@ import numpy as np
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
 __all__ = ["error_rates"]
 
 _CHUNK = 1 << 16  # pixels whose tables are held at a time
 
 
-def error_rates(
-    totals: EnsembleTotals, pixels: PixelParameters, true: PixelParameters | None
-) -> dict[str, Any]:
+def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels | None) -> dict[str, Any]:
     """Return how often the electron numbers are wrong, where the true ones are known.
 
     What one should expect follows from the fitted parameters alone (``expected_error_rate``) or, better, from
@@ -56,13 +54,13 @@ def error_rates(
     return facts
 
 
-def _error(true: PixelParameters, deciding: PixelParameters) -> FloatArray:
+def _error(true: UsablePixels, deciding: UsablePixels) -> FloatArray:
     """Return how often numbers that some parameters decide are wrong in data of others, shape (n,)."""
     out = np.empty(len(true))
     for first in range(0, out.size, _CHUNK):
         part = slice(first, first + _CHUNK)
         data, decided = (
-            KnownPixels([column[part] for column in each.columns()], SampleLaw()) for each in (true, deciding)
+            KnownPixels([column[part] for column in each.maps], SampleLaw()) for each in (true, deciding)
         )
         out[part] = number_tables(*data.codes(), decided.exposure, decided).outcomes(1, data).error
     return out

@@ -6,8 +6,8 @@ import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.inputs import Parameters, columns_of
+from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import FloatArray
 
 __all__ = ["nearest_pcd"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 __all__ = [
     "COMPONENT_CASES",
@@ -94,7 +94,7 @@ class Components:
     nuced_variance: FloatArray
 
 
-def predicted_moments(pixels: PixelParameters) -> EnsembleMoments:
+def predicted_moments(pixels: UsablePixels) -> EnsembleMoments:
     """Mean and variance of the EPCD and the NUCed EPCD from the parameters.
 
     Hendrickson et al. 2023, Appendix A: ``E(E) = E(mu) + E(H/g)`` and ``Var(E) = Var(mu) + Var(H/g) +
@@ -107,7 +107,7 @@ def predicted_moments(pixels: PixelParameters) -> EnsembleMoments:
     Returns:
         The moments and their terms.
     """
-    exposure, gain, bias, sigma = pixels.columns()
+    exposure, gain, bias, sigma = pixels.maps
     signal = exposure / gain
     covariance = float(np.mean((bias - bias.mean()) * (signal - signal.mean())))
     terms = (float(bias.var()), float(signal.var()), float(np.mean(sigma**2)), float(np.mean(signal / gain)))
@@ -124,7 +124,7 @@ def predicted_moments(pixels: PixelParameters) -> EnsembleMoments:
     )
 
 
-def moment_errors(pixels: PixelParameters, n_frames: int | NDArray[np.integer[Any]]) -> MomentErrors:
+def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]) -> MomentErrors:
     """Standard errors of the sample moments of the ensemble, the pixels given.
 
     A pixel's samples have variance v = sigma^2 + H/g^2, third central moment H/g^3 and fourth 3 v^2 + H/g^4.
@@ -138,7 +138,7 @@ def moment_errors(pixels: PixelParameters, n_frames: int | NDArray[np.integer[An
     Returns:
         Standard errors of mean and variance, raw and NUCed.
     """
-    exposure, gain, bias, sigma = pixels.columns()
+    exposure, gain, bias, sigma = pixels.maps
     errors = []
     for step, offset, noise in ((1.0 / gain, bias, sigma), (1.0, 0.0, pixels.read_noise_e)):
         v = noise**2 + exposure * step**2
@@ -164,7 +164,7 @@ def sample_moments(counts: NDArray[np.integer[Any]], dn: NDArray[np.integer[Any]
     return mean, float(np.dot(counts, (dn - mean) ** 2)) / total
 
 
-def component_widths(pixels: PixelParameters, n_k: int) -> Components:
+def component_widths(pixels: UsablePixels, n_k: int) -> Components:
     """Mean and variance of the components of the EPCD, in the sixteen cases of Appendix B.
 
     Under the weights ``e^{-H} H^k`` (eq. EPCD_alt_form), ``Var(E|K_e=k) = E(sigma^2) + Var(mu) + 2 k
@@ -179,7 +179,7 @@ def component_widths(pixels: PixelParameters, n_k: int) -> Components:
     Returns:
         Means, variances and NUCed variances.
     """
-    exposure, gain, bias, sigma = pixels.columns()
+    exposure, gain, bias, sigma = pixels.maps
     step = 1.0 / gain
     centres = (float(bias.mean()), float(step.mean()))
     mu, a = bias - centres[0], step - centres[1]

@@ -29,7 +29,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 __all__ = ["components", "curves", "electron_numbers"]
 
@@ -45,7 +45,7 @@ def _choice(settings: EnsembleSettings) -> HistogramChoice:
 
 
 def curves(
-    totals: EnsembleTotals, pixels: PixelParameters, settings: EnsembleSettings
+    totals: EnsembleTotals, pixels: UsablePixels, settings: EnsembleSettings
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the densities, raw and NUCed, and how well they agree with the data.
 
@@ -128,7 +128,7 @@ def _agreement(
 
 
 def electron_numbers(
-    totals: EnsembleTotals, pixels: PixelParameters, settings: EnsembleSettings
+    totals: EnsembleTotals, pixels: UsablePixels, settings: EnsembleSettings
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the electron numbers, observed and predicted, and how often they should be wrong.
 
@@ -162,7 +162,7 @@ def electron_numbers(
     }
 
 
-def components(pixels: PixelParameters, mass: FloatArray) -> Arrays:
+def components(pixels: UsablePixels, mass: FloatArray) -> Arrays:
     """Return means and widths of the components that matter (Appendix B).
 
     Args:

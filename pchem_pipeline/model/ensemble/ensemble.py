@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.law.inputs import kernel_counts
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 __all__ = [
     "DnAxis",
@@ -111,9 +111,7 @@ class Tally:
     nuced_sum_square: float
 
 
-def nuced_axis(
-    pixels: PixelParameters, dn: DnAxis, *, width: float | None = None, steps: int = 1
-) -> NucedAxis:
+def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None, steps: int = 1) -> NucedAxis:
     """Choose the bins of the NUCed histogram.
 
     A pixel's NUCed values lie on a lattice of pitch g. A bin of width w holds ``floor(w/g)`` or one more
@@ -141,7 +139,7 @@ def nuced_axis(
     return NucedAxis(bin_width, start, max(math.ceil(highest / bin_width) - start, 1))
 
 
-def ensemble_sums(pixels: PixelParameters, dn: DnAxis, nuced: NucedAxis | None = None) -> EnsembleSums:
+def ensemble_sums(pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis | None = None) -> EnsembleSums:
     """Sum the pixels' PCDs at the integer DN, and the same masses sorted into NUCed bins.
 
     The sorted masses are what the NUCed data must show, lattice and all: each DN of a pixel lies at ``(x
@@ -159,7 +157,7 @@ def ensemble_sums(pixels: PixelParameters, dn: DnAxis, nuced: NucedAxis | None =
     raw, raw_square = np.zeros((2, dn.size))
     bins, bins_square = np.zeros((2, nuced.size if nuced else 0))
     ensemble_numba.sum_pcd_pixels(
-        *pixels.columns(),
+        *pixels.maps,
         dn.start,
         raw,
         raw_square,
@@ -172,7 +170,7 @@ def ensemble_sums(pixels: PixelParameters, dn: DnAxis, nuced: NucedAxis | None =
 
 
 def curve_errors(
-    pixels: PixelParameters, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
+    pixels: UsablePixels, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
 ) -> tuple[FloatArray, FloatArray]:
     """Sum the pixels' variances of the two predicted densities that the errors of their parameters cause.
 
@@ -190,7 +188,7 @@ def curve_errors(
         (n_bins,).
     """
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
-    plain = np.stack(pixels.columns(), axis=1)
+    plain = pixels.columns
     ensemble_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
     ones, zeros = np.ones(len(pixels)), np.zeros(len(pixels))
     corrected = np.stack([pixels.quanta_exposure, ones, zeros, pixels.read_noise_e], axis=1)
@@ -206,7 +204,7 @@ def curve_errors(
 def tally(
     counts: NDArray[np.integer[Any]],
     origin: NDArray[np.integer[Any]],
-    pixels: PixelParameters,
+    pixels: UsablePixels,
     dn: DnAxis,
     nuced: NucedAxis,
 ) -> Tally:

@@ -21,7 +21,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_pmf
 from pchem_pipeline.model.law.normal_numba import NARROW, REACH
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 __all__ = [
     "Cells",
@@ -113,7 +113,7 @@ def _edges(column: FloatArray, choice: HistogramChoice) -> FloatArray:
     return np.linspace(low, high, choice.bins + 1)
 
 
-def epcd_dependent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
+def epcd_dependent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
     """Ensemble PCD with the joint density of (H, g, mu, sigma^2) from a 4-D histogram.
 
     Hendrickson et al. 2023, eq. full_ensemble_dist with integrals replaced by sums, dependent parameters.
@@ -126,7 +126,7 @@ def epcd_dependent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoice)
     Returns:
         f_E, 1/DN, shape (n_dn,).
     """
-    exposure, gain, bias, sigma = pixels.columns()
+    exposure, gain, bias, sigma = pixels.maps
     cells = joint_cells((exposure, gain, bias, sigma**2), choice)
     out = np.zeros(dn.size)
     values = cells.values
@@ -136,7 +136,7 @@ def epcd_dependent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoice)
     return out
 
 
-def epcd_independent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
+def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
     """Ensemble PCD with the joint density as the product of four histograms.
 
     The product of B bins each has B^4 cells, too many to visit. Its characteristic function factors
@@ -152,7 +152,7 @@ def epcd_independent(pixels: PixelParameters, dn: DnAxis, choice: HistogramChoic
     Returns:
         f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute.
     """
-    exposure, gain, bias, sigma = pixels.columns()
+    exposure, gain, bias, sigma = pixels.maps
     exposures, gains, biases, variances = (
         joint_cells((column,), choice) for column in (exposure, gain, bias, sigma**2)
     )
@@ -192,7 +192,7 @@ def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn:
     return high - low, low
 
 
-def nuced_dependent(pixels: PixelParameters, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
+def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
     """NUCed ensemble PCD with the joint density of (H, sigma_e-^2) from a 2-D histogram.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, dependent parameters; each value is the mean of the
@@ -213,7 +213,7 @@ def nuced_dependent(pixels: PixelParameters, axis: NucedAxis, choice: HistogramC
     return out / axis.width
 
 
-def nuced_independent(pixels: PixelParameters, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
+def nuced_independent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
     """NUCed ensemble PCD with the joint density as the product of two histograms.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, independent parameters, averaged over each bin.

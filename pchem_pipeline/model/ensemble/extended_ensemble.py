@@ -11,8 +11,8 @@ from pchem_pipeline.model.ensemble import extended_ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, EnsembleSums, NucedAxis
 from pchem_pipeline.model.law.inputs import satellites_of
 from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
 __all__ = ["ExtendedSums", "extended_sums"]
 
@@ -35,7 +35,7 @@ class ExtendedSums:
 
 
 def extended_sums(
-    pixels: PixelParameters,
+    pixels: UsablePixels,
     satellites: tuple[ArrayLike, ArrayLike] | None,
     model: SampleLaw,
     dn: DnAxis,
@@ -59,7 +59,7 @@ def extended_sums(
     bins, bins_square = np.zeros((2, nuced.size))
     moments = np.zeros(2)
     n = len(pixels)
-    columns = pixels.columns()
+    columns = pixels.maps
     own = satellites_of(pixels, satellites, n)
     step = max(1, _CHUNK // dn.size)
     for first in range(0, n, step):

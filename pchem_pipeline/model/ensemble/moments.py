@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble.components import EnsembleMoments, moment_errors, predicted_moments
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 __all__ = ["moment_rows"]
 
 
 def moment_rows(
-    totals: EnsembleTotals, pixels: PixelParameters, per_pixel: int | NDArray[Any]
+    totals: EnsembleTotals, pixels: UsablePixels, per_pixel: int | NDArray[Any]
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis
-from pchem_pipeline.model.maps.pixels import FloatArray
+from pchem_pipeline.model.law.parameters import FloatArray
 
 __all__ = ["ERROR_SIZES", "MODEL_ERRORS", "EnsembleAxes", "EnsembleTotals"]
 

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pchem_pipeline.model.fit.status import describe
+from pchem_pipeline.model.law.parameters import FloatArray, PixelParameters
 
 __all__ = ["FitResult", "html_table"]
-
-FloatArray = NDArray[np.float64]
 
 #: What has an interval, in the order of the axis ``quantity``.
 INTERVAL_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
@@ -33,7 +32,7 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 @dataclass(frozen=True)
-class FitResult:
+class FitResult(PixelParameters):
     """Estimates of a batch of ``n`` pixels; failed pixels hold NaN and a reason in ``fit_status``.
 
     With several exposures of the same pixels, arrays of shape (n, J) have a column for each; with one
@@ -79,10 +78,6 @@ class FitResult:
             (n, J + 4, 2); None unless asked for.
     """
 
-    quanta_exposure: FloatArray
-    conversion_gain: FloatArray
-    bias: FloatArray
-    read_noise_dn: FloatArray
     covariance: FloatArray
     mean: FloatArray
     variance: FloatArray
@@ -97,13 +92,6 @@ class FitResult:
     satellite_amplitude_e: FloatArray
     satellite_weight: FloatArray
     intervals: FloatArray | None = None
-
-    @property
-    def columns(self) -> FloatArray:
-        """(H_1 ... H_J, g, mu, sigma), shape (n, J + 3)."""
-        n = self.bias.size
-        shared = [each.reshape(n, 1) for each in (self.conversion_gain, self.bias, self.read_noise_dn)]
-        return np.concatenate([self.quanta_exposure.reshape(n, -1), *shared], axis=1)
 
     def _repr_html_(self) -> str:
         """Return the first fits as a table, for a notebook."""

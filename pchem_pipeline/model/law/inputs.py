@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import electron_laws_numba, normal_numba
 from pchem_pipeline.model.law.cells_numba import Law
+from pchem_pipeline.model.law.parameters import PixelParameters
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
 __all__ = [
-    "HasParameters",
     "HasSatellites",
     "Parameters",
     "columns_of",
@@ -34,26 +34,6 @@ _NO_LIMIT = 2**40  # DN
 _PEAK_FIELDS = ("weights", "shift_e", "shift_dn", "shift_sigma", "width")
 
 
-class HasParameters(Protocol):
-    """Maps of the four parameters: ``PixelMaps``, ``PixelParameters``, a :class:`FitResult`."""
-
-    @property
-    def quanta_exposure(self) -> FloatArray:
-        """H, e-."""
-
-    @property
-    def conversion_gain(self) -> FloatArray:
-        """g, e-/DN."""
-
-    @property
-    def bias(self) -> FloatArray:
-        """mu, DN."""
-
-    @property
-    def read_noise_dn(self) -> FloatArray:
-        """sigma, quantisation included, DN."""
-
-
 @runtime_checkable
 class HasSatellites(Protocol):
     """Free satellites of the pixels."""
@@ -67,7 +47,7 @@ class HasSatellites(Protocol):
         """Weight; 0 without any."""
 
 
-Parameters = HasParameters | Sequence[ArrayLike]
+Parameters = PixelParameters | Sequence[ArrayLike]
 
 
 @functools.cache
@@ -162,11 +142,8 @@ def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
 
 def columns_of(parameters: Parameters) -> FloatArray:
     """Return (H, g, mu, sigma) as an array of shape (n, 4)."""
-    if isinstance(parameters, Sequence):
-        columns = [np.asarray(values, np.float64).ravel() for values in parameters]
-    else:
-        names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
-        columns = [np.asarray(getattr(parameters, name), np.float64).ravel() for name in names]
+    each = parameters.maps if isinstance(parameters, PixelParameters) else parameters
+    columns = [np.asarray(values, np.float64).ravel() for values in each]
     return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 

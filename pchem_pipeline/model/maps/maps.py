@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.model.maps.pixels import FloatArray
+from pchem_pipeline.model.law.parameters import FloatArray
 
 __all__ = [
     "CAUTION",

@@ -30,7 +30,7 @@ from pchem_pipeline.model.ensemble.moments import moment_rows
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.histogram.count_numba import count_frames
-from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
@@ -100,7 +100,7 @@ class _Fitted:
         bins: bins of a histogram.
     """
 
-    pixels: PixelParameters
+    pixels: UsablePixels
     mask: NDArray[np.bool_]
     origin: NDArray[np.int32]
     low: NDArray[np.int32]
@@ -116,7 +116,7 @@ class _Fitted:
             *(f"histogram/{n}" for n in ("origin", "minimum", "maximum")),
         ]
         *maps, origin, low, high = (_pixels_of(store, path, tiles) for path in paths)
-        pixels, mask = PixelParameters.from_maps(maps)
+        pixels, mask = UsablePixels.from_maps(maps)
         return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
 
     def axes(self, settings: EnsembleSettings, *, extended: bool) -> EnsembleAxes | None:
@@ -449,7 +449,7 @@ def _write_result(
 
 def _true_pixels(
     store: RunStore, asked: _Asked, tiles: list[Tile], mask: NDArray[np.bool_]
-) -> PixelParameters | None:
+) -> UsablePixels | None:
     """Return the true parameters of the pixels with a value, if they are all that made the frames."""
     simulated = asked.config.simulate
     if asked.truth is None or simulated is None or simulated.effects:
@@ -458,7 +458,7 @@ def _true_pixels(
     ny, nx = asked.sensor.shape
     region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
     maps = [_pixels_of(store, f"truth/{name}", tiles, region)[mask] for name in PARAMETERS]
-    true, known = PixelParameters.from_maps(maps)
+    true, known = UsablePixels.from_maps(maps)
     return true if known.all() else None
 
 

@@ -16,8 +16,8 @@ from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, tally
 from pchem_pipeline.model.ensemble.extended_ensemble import extended_sums
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.pixels import FloatArray, PixelParameters
 
 __all__ = ["PixelHistograms", "ensemble_tile"]
 
@@ -71,7 +71,7 @@ def ensemble_tile(
     """
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)
-    pixels, mask = PixelParameters.from_maps(maps)
+    pixels, mask = UsablePixels.from_maps(maps)
     law = (law or SampleLaw()).of(mask)
     satellites = None if satellites is None else (satellites[0][mask], satellites[1][mask])
     integers[axes.integers["pixels"]] = len(pixels)
@@ -87,7 +87,7 @@ def ensemble_tile(
         if n == 0:
             continue
         group = (samples == n) & (samples_all == n_all)
-        part = PixelParameters(*(column[group] for column in pixels.columns()))
+        part = pixels.of(group)
         own = None if satellites is None else (satellites[0][group], satellites[1][group])
         sets = (chosen.of(group), int(n)), (everything.of(group), int(n_all))
         tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, origin[group], *sets, axes)
@@ -98,7 +98,7 @@ def ensemble_tile(
     return integers, floats
 
 
-def _predicted(known: KnownPixels, pixels: PixelParameters, n: int, axes: EnsembleAxes) -> dict[str, Any]:
+def _predicted(known: KnownPixels, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
     """Return what the law predicts of pixels that have n samples each."""
     parts: dict[str, Any] = {}
     if axes.extended:
@@ -118,7 +118,7 @@ def _predicted(known: KnownPixels, pixels: PixelParameters, n: int, axes: Ensemb
 
 def _group_sums(
     known: KnownPixels,
-    pixels: PixelParameters,
+    pixels: UsablePixels,
     origin: NDArray[np.integer[Any]],
     chosen: tuple[PixelHistograms, int],
     everything: tuple[PixelHistograms, int],

@@ -18,17 +18,17 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     nuced_dependent,
     nuced_independent,
 )
-from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 K = np.arange(150)
 
 
-def make_pixels(n: int, seed: int = 1) -> PixelParameters:
+def make_pixels(n: int, seed: int = 1) -> UsablePixels:
     rng = np.random.default_rng(seed)
     z = rng.standard_normal(n)
     g = 0.1 * np.exp(0.05 * z)
     s_e = 0.3 * np.exp(0.08 * z + 0.08 * rng.standard_normal(n))
-    return PixelParameters(
+    return UsablePixels(
         2.0 * np.exp(0.4 * rng.standard_normal(n)), g, 100.0 + 3.0 * rng.standard_normal(n), s_e / g
     )
 
@@ -89,7 +89,7 @@ def test_a_constant_map_is_one_cell() -> None:
 def test_dependent_is_the_sum_over_cells(representative: str) -> None:
     pixels, dn = make_pixels(60), DnAxis(50, 250)
     choice = HistogramChoice(3, "central", representative)  # type: ignore[arg-type]
-    h, g, mu, sigma = pixels.columns()
+    h, g, mu, sigma = pixels.maps
     cells = joint_cells((h, g, mu, sigma**2), choice)
     expected = sum(w * pcd(dn.dn, *v) for w, v in zip(cells.share, cells.values.T, strict=True))
     np.testing.assert_allclose(epcd_dependent(pixels, dn, choice), expected, rtol=1e-10, atol=1e-15)
@@ -99,7 +99,7 @@ def test_dependent_is_the_sum_over_cells(representative: str) -> None:
 def test_independent_is_the_sum_over_all_products(representative: str) -> None:
     pixels, dn = make_pixels(60), DnAxis(50, 250)
     choice = HistogramChoice(3, "central", representative)  # type: ignore[arg-type]
-    h, g, mu, sigma = pixels.columns()
+    h, g, mu, sigma = pixels.maps
     marginals = [joint_cells((column,), choice) for column in (h, g, mu, sigma**2)]
     expected = np.zeros(dn.size)
     for places in itertools.product(*(range(m.share.size) for m in marginals)):
@@ -109,7 +109,7 @@ def test_independent_is_the_sum_over_all_products(representative: str) -> None:
 
 
 def test_independent_integrates_narrow_noise_over_the_cell() -> None:
-    pixels = PixelParameters(np.array([2.0]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
+    pixels = UsablePixels(np.array([2.0]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
     dn = DnAxis(0, 60)
     density = epcd_independent(pixels, dn, HistogramChoice(2))
     np.testing.assert_allclose(density, ensemble_sums(pixels, dn).raw / len(pixels), atol=1e-14)
@@ -127,7 +127,7 @@ def test_independent_on_a_short_axis_is_a_cut_of_the_long_one() -> None:
 
 def test_a_map_of_equal_pixels_gives_the_pcd_in_every_way() -> None:
     ones = np.ones(16)
-    pixels, dn = PixelParameters(3.0 * ones, 0.1 * ones, 90.0 * ones, 3.0 * ones), DnAxis(40, 300)
+    pixels, dn = UsablePixels(3.0 * ones, 0.1 * ones, 90.0 * ones, 3.0 * ones), DnAxis(40, 300)
     expected = pcd(dn.dn, 3.0, 0.1, 90.0, 9.0)
     for result in (
         ensemble_sums(pixels, dn).raw / len(pixels),

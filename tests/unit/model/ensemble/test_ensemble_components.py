@@ -13,15 +13,15 @@ from pchem_pipeline.model.ensemble.components import (
     predicted_moments,
     sample_moments,
 )
-from pchem_pipeline.model.maps.pixels import PixelParameters
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 
-def make_pixels(n: int, seed: int = 2) -> PixelParameters:
+def make_pixels(n: int, seed: int = 2) -> UsablePixels:
     """All four parameters vary and depend on one another."""
     rng = np.random.default_rng(seed)
     z = rng.standard_normal((4, n))
     g = 0.1 * np.exp(0.1 * z[0])
-    return PixelParameters(
+    return UsablePixels(
         2.0 * np.exp(0.4 * z[1] + 0.2 * z[0]),
         g,
         100.0 + 4.0 * z[2] + 2.0 * z[0],
@@ -46,7 +46,7 @@ def test_there_are_sixteen_cases() -> None:
 def test_every_case_is_that_of_maps_held_constant() -> None:
     pixels = make_pixels(500)
     result = component_widths(pixels, 12)
-    h, g, mu, sigma = pixels.columns()
+    h, g, mu, sigma = pixels.maps
     for row, case in enumerate(COMPONENT_CASES):
         maps = {"H": h, "g": g, "mu": mu, "sigma2": sigma**2}
         held = {name: np.full(500, v.mean()) if name in case else v for name, v in maps.items()}
@@ -75,7 +75,7 @@ def test_only_the_paper_s_five_cases_do_not_depend_on_k() -> None:
 
 
 def test_widths_survive_hot_pixels_and_many_electrons() -> None:
-    pixels = PixelParameters(
+    pixels = UsablePixels(
         np.array([0.0, 2.0, 900.0]), np.array([0.1, 0.2, 0.1]), np.array([90.0, 100.0, 110.0]), np.ones(3)
     )
     result = component_widths(pixels, 1500)
@@ -86,14 +86,14 @@ def test_widths_survive_hot_pixels_and_many_electrons() -> None:
 
 def test_no_electrons_means_one_component() -> None:
     ones = np.ones(3)
-    result = component_widths(PixelParameters(0 * ones, 0.1 * ones, 100 * ones, 3 * ones), 2)
+    result = component_widths(UsablePixels(0 * ones, 0.1 * ones, 100 * ones, 3 * ones), 2)
     assert result.variance[0, 0] == pytest.approx(9.0)
     assert np.isnan(result.mean[1])
 
 
 def test_moments_are_those_of_the_mixture() -> None:
     pixels = make_pixels(300)
-    h, g, mu, sigma = pixels.columns()
+    h, g, mu, sigma = pixels.maps
     k = np.arange(120)
     weight = poisson.pmf(k, h[:, None]) / 300
     centre = mu[:, None] + k / g[:, None]
@@ -121,7 +121,7 @@ def test_sample_moments_at_a_large_bias() -> None:
 def test_moment_errors_of_equal_poisson_pixels() -> None:
     # g = 1 and hardly any noise: mean and variance of n Poisson(H) counts, known in closed form
     ones = np.ones(50)
-    errors = moment_errors(PixelParameters(4.0 * ones, ones, 0.0 * ones, 1e-6 * ones), 200)
+    errors = moment_errors(UsablePixels(4.0 * ones, ones, 0.0 * ones, 1e-6 * ones), 200)
     n = 50 * 200
     assert errors.mean == pytest.approx(np.sqrt(4.0 / n))
     assert errors.variance == pytest.approx(np.sqrt((4.0 + 2 * 16.0) / n))

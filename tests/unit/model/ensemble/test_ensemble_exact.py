@@ -16,13 +16,13 @@ from pchem_pipeline.model.ensemble.ensemble import (
     tally,
 )
 from pchem_pipeline.model.law import normal_numba
-from pchem_pipeline.model.maps.pixels import PixelParameters, usable_pixels
+from pchem_pipeline.model.law.parameters import UsablePixels, usable_pixels
 
 
-def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> PixelParameters:
+def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> UsablePixels:
     rng = np.random.default_rng(seed)
     g = gain * np.exp(0.05 * rng.standard_normal(n))
-    return PixelParameters(
+    return UsablePixels(
         2.0 * np.exp(0.5 * rng.standard_normal(n)),
         g,
         100.0 + 4.0 * rng.standard_normal(n),
@@ -30,11 +30,11 @@ def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> PixelParameters:
     )
 
 
-def plain_pcd(pixels: PixelParameters, dn: np.ndarray) -> np.ndarray:
+def plain_pcd(pixels: UsablePixels, dn: np.ndarray) -> np.ndarray:
     """PCD of every pixel at every DN, eq. X_density term by term."""
     k = np.arange(200)
     rows = []
-    for h, g, mu, sigma in zip(*pixels.columns(), strict=True):
+    for h, g, mu, sigma in zip(*pixels.maps, strict=True):
         rows.append(poisson.pmf(k, h) @ norm.pdf(dn[None, :], mu + k[:, None] / g, sigma))
     return np.array(rows)
 
@@ -69,7 +69,7 @@ def test_nuced_sums_sort_whole_dn_into_bins() -> None:
 
 def test_narrow_pixels_give_the_mass_of_the_cell() -> None:
     # sigma = 0.6 DN at an integer + 0.3: the density at the integers does not add up to 1, the masses do
-    pixels = PixelParameters(np.array([1.5]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
+    pixels = UsablePixels(np.array([1.5]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
     dn = DnAxis(0, 60)
     k = np.arange(60)
     analog = np.sqrt(0.36 - 1 / 12)
@@ -81,7 +81,7 @@ def test_narrow_pixels_give_the_mass_of_the_cell() -> None:
 
 
 def test_a_hot_pixel_keeps_its_mass() -> None:
-    pixels = PixelParameters(np.array([3000.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]))
+    pixels = UsablePixels(np.array([3000.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]))
     density = ensemble_sums(pixels, DnAxis(0, 60_000)).raw / len(pixels)
     assert density.sum() == pytest.approx(1.0, abs=1e-10)
     assert density @ np.arange(60_000) == pytest.approx(100.0 + 30_000.0, rel=1e-10)
@@ -103,7 +103,7 @@ def test_compiled_and_plain_kernels_agree() -> None:
     for kernel in (ensemble_numba.sum_pcd_pixels, ensemble_numba.sum_pcd_pixels.py_func):
         raw, square = np.zeros((2, 300))
         bins, bins_square = np.zeros((2, axis.size))
-        kernel(*pixels.columns(), 50, raw, square, axis.width, axis.start, bins, bins_square)
+        kernel(*pixels.maps, 50, raw, square, axis.width, axis.start, bins, bins_square)
         results.append(np.concatenate([raw, square, bins, bins_square]))
     np.testing.assert_allclose(*results, rtol=1e-13)
     for kernel in (normal_numba.add_density, normal_numba.add_mass):
@@ -134,7 +134,7 @@ def test_tally_is_that_of_the_samples() -> None:
 
 def test_axis_is_not_stretched_by_one_strange_gain() -> None:
     pixels = make_pixels(1000)
-    strange = PixelParameters(
+    strange = UsablePixels(
         pixels.quanta_exposure,
         np.where(np.arange(1000) == 7, 50.0, pixels.conversion_gain),
         pixels.bias,
@@ -161,13 +161,13 @@ def test_electron_mass_is_the_mean_of_poisson_masses() -> None:
 def test_parameters_must_be_usable() -> None:
     good = np.ones(3)
     with pytest.raises(ValueError, match="usable"):
-        PixelParameters(good, good, good, np.array([1.0, np.nan, 1.0]))
+        UsablePixels(good, good, good, np.array([1.0, np.nan, 1.0]))
     with pytest.raises(ValueError, match="equally long"):
-        PixelParameters(good, good, good, np.ones(2))
+        UsablePixels(good, good, good, np.ones(2))
     maps = np.ones((4, 2, 2))
     maps[0, 0, 1] = -1.0
     maps[1, 1, 0] = np.inf
-    pixels, mask = PixelParameters.from_maps(list(maps))
+    pixels, mask = UsablePixels.from_maps(list(maps))
     np.testing.assert_array_equal(mask, [[True, False], [False, True]])
     assert len(pixels) == 2
     assert not usable_pixels(good, 0 * good, good, good).any()

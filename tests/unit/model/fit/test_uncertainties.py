@@ -27,7 +27,7 @@ N = 3000
 
 
 def estimates(fit: FitResult) -> Array:
-    return np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+    return fit.columns
 
 
 def fitted(case: tuple[float, float, float], seed: int = 3) -> tuple[Drawn, Array, Array]:

@@ -1,4 +1,4 @@
-"""The fitted parameters of a set of pixels, as the ensemble functions take them."""
+"""The four parameters of pixels (H, g, mu, sigma), and which of them define a density."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FloatArray", "PixelParameters", "usable_pixels"]
+__all__ = ["FloatArray", "PixelParameters", "UsablePixels", "usable_pixels"]
 
 FloatArray = NDArray[np.float64]
 
@@ -38,13 +38,13 @@ def usable_pixels(
 
 @dataclass(frozen=True)
 class PixelParameters:
-    """Parameters of n pixels, each with a usable density.
+    """The four parameters of pixels, NaN where there are none; what else is known of pixels extends it.
 
     Attributes:
-        quanta_exposure: H, e-, shape (n,).
-        conversion_gain: g, e-/DN, shape (n,).
-        bias: mu, DN, shape (n,).
-        read_noise_dn: sigma with quantisation, DN, shape (n,).
+        quanta_exposure: H, e-, any shape; the others have the same, or that of one of several samples.
+        conversion_gain: g, e-/DN.
+        bias: mu, DN.
+        read_noise_dn: sigma with quantisation, DN.
     """
 
     quanta_exposure: FloatArray
@@ -52,28 +52,44 @@ class PixelParameters:
     bias: FloatArray
     read_noise_dn: FloatArray
 
+    @property
+    def maps(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """(H, g, mu, sigma)."""
+        return self.quanta_exposure, self.conversion_gain, self.bias, self.read_noise_dn
+
+    @property
+    def columns(self) -> FloatArray:
+        """(H_1 ... H_J, g, mu, sigma) of the n pixels in C order, shape (n, J + 3)."""
+        n = self.bias.size
+        exposure, *shared = self.maps
+        return np.concatenate([exposure.reshape(n, -1), *(each.reshape(n, 1) for each in shared)], axis=1)
+
+    @property
+    def read_noise_e(self) -> FloatArray:
+        """Read noise with quantisation, sigma_e- = g sigma, e-."""
+        return self.conversion_gain * self.read_noise_dn
+
+
+@dataclass(frozen=True)
+class UsablePixels(PixelParameters):
+    """Parameters of n pixels, each of shape (n,) and with a usable density."""
+
     def __post_init__(self) -> None:
-        columns = self.columns()
-        if any(column.ndim != 1 or column.shape != columns[0].shape for column in columns):
+        if any(column.ndim != 1 or column.shape != self.bias.shape for column in self.maps):
             raise ValueError("the four parameters are one-dimensional and equally long")
-        if not usable_pixels(*columns).all():
+        if not usable_pixels(*self.maps).all():
             raise ValueError("some pixels have no usable parameters: select them with usable_pixels first")
 
     def __len__(self) -> int:
         """Return the number of pixels."""
         return int(self.quanta_exposure.size)
 
-    @property
-    def read_noise_e(self) -> FloatArray:
-        """Read noise with quantisation, sigma_e- = g sigma, e-, shape (n,)."""
-        return self.conversion_gain * self.read_noise_dn
-
-    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return (H, g, mu, sigma)."""
-        return self.quanta_exposure, self.conversion_gain, self.bias, self.read_noise_dn
+    def of(self, pixels: NDArray[np.bool_]) -> UsablePixels:
+        """Return some of them."""
+        return UsablePixels(*(column[pixels] for column in self.maps))
 
     @classmethod
-    def from_maps(cls, maps: Sequence[NDArray[np.floating]]) -> tuple[PixelParameters, NDArray[np.bool_]]:
+    def from_maps(cls, maps: Sequence[NDArray[np.floating]]) -> tuple[UsablePixels, NDArray[np.bool_]]:
         """Select the usable pixels of four maps.
 
         Args:
