@@ -14,11 +14,11 @@ import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup, escape
 
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.data import MAP_NAMES, ReportData
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import pack_counts
 from pchem_pipeline.report.style.palette import MAP_COLOURS
-from pchem_pipeline.report.style.wording import unit_text
+from pchem_pipeline.report.style.wording import symbol, unit_text
 
 __all__ = [
     "PANEL_MAPS",
@@ -144,8 +144,24 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
             "deciding": sample.deciding is not None,
             "masses": len(sample.masses),
         },
-        "notable": [{"words": words, "pixels": list(where)} for words, where in sample.reasons],
+        "notable": [
+            {"words": words, "pixels": list(where), "path": _shown_value(words)}
+            for words, where in sample.reasons
+        ],
     }
+
+
+def _shown_value(reason: str) -> str:
+    """Return the path of the map whose value makes a pixel notable; empty where it is no value."""
+    if reason == "poorest goodness of fit":
+        return "fit/goodness_p"
+    for name in MAP_NAMES:
+        words = symbol(name)[1]
+        if reason.endswith(f"standard error of the {words}"):
+            return f"maps/{name}_stderr"
+        if reason in (f"largest {words}", f"smallest {words}"):
+            return f"maps/{name}"
+    return ""
 
 
 def map_facts(entry: MapEntry) -> dict[str, Any]:

@@ -160,7 +160,7 @@
   };
 
   // -- state ---------------------------------------------------------------------------------
-  const state = { map: null, error: null, colours: "p1", selection: null, pixel: -1, hover: -1, corner: null };
+  const state = { map: null, error: null, colours: "p1", selection: null, selectionLink: "", pixel: -1, hover: -1, corner: null };
   const canvas = byId("inspector-canvas"), context = canvas.getContext("2d");
   const image = document.createElement("canvas");
   image.width = nx;
@@ -266,8 +266,24 @@
     waiting = true;
     requestAnimationFrame(() => { waiting = false; draw(); });
   };
+  const drawAxis = (id, from, scale, length, vertical) => {
+    const axis = byId(id), last = (vertical ? ny : nx) - 1, marks = [];
+    for (const t of ticks(Math.max(from, 0), Math.min(from + length / scale - 1, last), Math.max(Math.floor(length / 70), 1))) {
+      if (!Number.isInteger(t)) continue;
+      const mark = el("span", {}, String(t));
+      mark.style[vertical ? "top" : "left"] = `${(t + 0.5 - from) * scale}px`;
+      marks.push(mark);
+    }
+    axis.replaceChildren(...marks);
+  };
+  const drawMapAxes = () => {
+    drawAxis("inspector-axis-x", view.x, view.scale, view.width, false);
+    byId("inspector-axis-y").hidden = ny === 1;
+    if (ny > 1) drawAxis("inspector-axis-y", view.y, view.scale * tall, view.height, true);
+  };
   const draw = () => {
     const { scale, x, y, ratio } = view;
+    drawMapAxes();
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, view.width, view.height);
     const x0 = clamp(Math.floor(x), 0, nx), y0 = clamp(Math.floor(y), 0, ny);
@@ -309,7 +325,10 @@
     view.scale = scale;
     keepInside();
     redraw();
+    clearTimeout(later);
+    later = setTimeout(keepAddress, 250);
   };
+  let later = 0;
   const layout = () => {
     if (!state.map) return;
     const wasWhole = view.scale <= view.fit * 1.001;
@@ -397,7 +416,8 @@
     if (!drag || pointers.size) return;
     const where = pixelAt(event);
     if (drag.rectangle && drag.far > 4) finishRectangle();
-    else if (drag.far <= 4 && where) choose(where[1] * nx + where[0]);
+    else if (drag.far <= 4 && where) choose(where[1] * nx + where[0]).then(() => bringIntoView());
+    else keepAddress();
     if (drag.far <= 4) state.corner = null;
     drag = null;
   });
@@ -421,10 +441,13 @@
   const finishRectangle = () => {
     const { from: a, to: b } = state.corner;
     state.corner = null;
+    selectBox(a, b);
+  };
+  const selectBox = (a, b) => {
     const [x0, x1, y0, y1] = [Math.min(a[0], b[0]), Math.max(a[0], b[0]), Math.min(a[1], b[1]), Math.max(a[1], b[1])];
     const selection = new Uint8Array(n);
     for (let y = y0; y <= y1; y++) selection.fill(1, y * nx + x0, y * nx + x1 + 1);
-    select(selection, ny === 1 ? `channels ${x0} to ${x1}` : `y ${y0} to ${y1}, x ${x0} to ${x1}`);
+    select(selection, ny === 1 ? `channels ${x0} to ${x1}` : `y ${y0} to ${y1}, x ${x0} to ${x1}`, `box,${x0},${y0},${x1},${y1}`);
   };
   canvas.addEventListener("keydown", (event) => {
     const step = event.shiftKey ? 10 : 1;
@@ -433,6 +456,7 @@
     };
     const at = state.pixel >= 0 ? [state.pixel % nx, Math.floor(state.pixel / nx)] : null;
     if (event.ctrlKey || event.altKey || event.metaKey) return;
+    hover(null);
     if (moves[event.key]) {
       const [dx, dy] = moves[event.key];
       const halves = [view.width / view.scale / 2, view.height / (view.scale * tall) / 2];
@@ -637,7 +661,8 @@
     byId("inspector-from").value = open[0] ? "" : Number(from.toPrecision(5));
     byId("inspector-to").value = open[1] ? "" : Number(to.toPrecision(5));
     const ends = [open[0] ? "" : `from ${short(from)}`, open[1] ? "" : `to ${short(to)}`].filter(Boolean).join(" ");
-    select(selection, `${map.fact.label} ${ends} ${map.fact.unit}`, true);
+    const link = `range,${map.fact.path},${open[0] ? "" : Number(from.toPrecision(7))},${open[1] ? "" : Number(to.toPrecision(7))}`;
+    select(selection, `${map.fact.label} ${ends} ${map.fact.unit}`, link, true);
   };
   const selectCategory = (map, key, text) => {
     const selection = new Uint8Array(n);
@@ -646,10 +671,12 @@
       const value = Math.round(codeValue(map, map.codes[i]));
       selection[i] = (map.fact.kind === "bits" ? (key === 0 ? value === 0 : value & key) : value === key) ? 1 : 0;
     }
-    select(selection, text);
+    select(selection, text, `is,${map.fact.path},${key}`);
   };
-  const select = (selection, words = "", keepFields = false) => {
+  const select = (selection, words = "", link = "", keepFields = false) => {
     state.selection = selection;
+    state.selectionLink = link;
+    keepAddress();
     state.selectionWords = words.trim();
     if (!keepFields) { byId("inspector-from").value = ""; byId("inspector-to").value = ""; }
     paint();
@@ -659,7 +686,7 @@
   };
   const saySelection = () => {
     const { map, selection } = state;
-    byId("inspector-clear").disabled = !selection;
+    for (const id of ["inspector-clear", "inspector-csv", "inspector-mask"]) byId(id).disabled = !selection;
     if (!selection) { say("Nothing selected. Drag over the histogram, or Shift-drag a rectangle on the map."); return; }
     const count = selection.reduce((sum, each) => sum + each, 0);
     let text = `${plural(count, facts.noun)} selected (${percent(count, n)}): ${state.selectionWords}.`;
@@ -669,6 +696,30 @@
       text += ` Median ${map.fact.label} ${some} ${map.fact.unit}, of all ${all}.`;
     }
     say(text);
+  };
+
+  // page.js keeps what is saved
+  const save = (content, type, name) => document.dispatchEvent(new CustomEvent("pchem-save", { detail: [content, type, name] }));
+  const saveCsv = () => {
+    const { map, error, selection } = state, heading = `${map.fact.label}${map.fact.unit && ` (${map.fact.unit})`}`;
+    const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+    const lines = [["y", "x", quoted(heading), ...(error ? ["standard error"] : [])].join(",")];
+    const cell = (from, i) => { const v = valueAt(from, i); return Number.isFinite(v) ? Number(v.toPrecision(7)) : ""; };
+    for (let i = 0; i < n; i++) {
+      if (!selection[i]) continue;
+      lines.push([Math.floor(i / nx), i % nx, cell(map, i), ...(error ? [cell(error, i)] : [])].join(","));
+    }
+    save(`${lines.join("\n")}\n`, "text/csv", "selection.csv");
+  };
+  const saveMask = () => {
+    // numpy's format 1.0: magic, length of the header, header padded to 64 bytes, values of one byte
+    const text = `{'descr': '|b1', 'fortran_order': False, 'shape': (${ny}, ${nx}), }`;
+    const length = Math.ceil((10 + text.length + 1) / 64) * 64 - 10;
+    const head = new Uint8Array(10 + length).fill(32);
+    head.set([0x93, 78, 85, 77, 80, 89, 1, 0, length & 255, length >> 8]);
+    head.set(new TextEncoder().encode(text), 10);
+    head[head.length - 1] = 10;
+    save(new Blob([head, state.selection]), "application/octet-stream", "selection.npy");
   };
 
   // -- one pixel -----------------------------------------------------------------------------
@@ -685,6 +736,20 @@
     const mine = ++turn;
     const pixel = await pixelData(i);
     if (mine === turn) showPixel(pixel);
+  };
+  // on a phone a pixel is shown below the map that was tapped
+  const bringIntoView = () => {
+    const top = byId("inspector-title").getBoundingClientRect().top;
+    if (top < 0 || top > window.innerHeight - 120) byId("inspector-pixel").scrollIntoView({ block: "start" });
+  };
+  const medianPixel = () => {
+    const { map, status } = state, middle = quantile(map, map.counts, 0.5);
+    let best = -1, least = Infinity;
+    for (const i of inFull()) {
+      const away = Math.abs(valueAt(map, i) - middle) + (status && valueAt(status, i) !== 0 ? 1e300 : 0);
+      if (away < least) [best, least] = [i, away];
+    }
+    return best;
   };
   const pixelData = async (i) => {
     const found = { index: i, values: new Map(), counts: null, origin: 0, deciding: null, mass: null };
@@ -977,22 +1042,57 @@
   const address = () => {
     const parts = [`pixel=${Math.floor(state.pixel / nx)},${state.pixel % nx}`, `map=${state.map.fact.path}`];
     if (state.colours !== "p1") parts.push(`colours=${state.colours}`);
+    if (view.scale > view.fit * 1.001) {
+      const middle = [view.x + view.width / view.scale / 2, view.y + view.height / (view.scale * tall) / 2];
+      parts.push(`zoom=${(view.scale / view.fit).toFixed(2)},${middle.map((each) => each.toFixed(1)).join(",")}`);
+    }
+    if (state.selectionLink) parts.push(`select=${state.selectionLink}`);
     return `#${parts.join("&")}`;
   };
+  let ready = false;
   const keepAddress = () => {
-    if (state.pixel < 0 || !state.map) return;
+    if (state.pixel < 0 || !state.map || !ready) return;
     byId("inspector-link").setAttribute("href", address());
-    try { history.replaceState(null, "", address()); } catch { /* some browsers forbid it for files */ }
+    try { history.replaceState(null, "", address()); } catch { /* some browsers forbid it for files, and many in a second */ }
+  };
+  const finite = (texts) => texts.map(Number).every(Number.isFinite);
+  const goTo = ([factor, x, y]) => {
+    view.scale = clamp(view.fit * factor, view.fit, Math.max(64 / Math.sqrt(tall), view.fit));
+    view.x = x - view.width / view.scale / 2;
+    view.y = y - view.height / (view.scale * tall) / 2;
+    keepInside();
+    redraw();
+  };
+  const selectAsked = async ([kind, ...rest], shown) => {
+    if (kind === "box" && rest.length === 4 && finite(rest)) {
+      const [x0, y0, x1, y1] = rest.map((each, i) => clamp(Math.round(Number(each)), 0, (i % 2 ? ny : nx) - 1));
+      selectBox([x0, y0], [x1, y1]);
+      return true;
+    }
+    const [path, ...ends] = rest;
+    if (!factOf.has(path) || !usable(factOf.get(path)) || !finite(ends)) return false;
+    if (kind !== "range" && kind !== "is") return false;
+    if (state.map.fact.path !== path) await showMap(path);
+    if (kind === "is") selectCategory(state.map, Number(ends[0]), wordsOf(state.map.fact, Number(ends[0])));
+    else if (brush) selectRange(ends[0] === "" ? brush.axis.back(brush.axis.low) : Number(ends[0]), ends[1] === "" ? brush.axis.back(brush.axis.high) : Number(ends[1]));
+    if (state.map.fact.path !== shown) await showMap(shown);
+    return true;
   };
   const fromAddress = () => {
     const asked = new URLSearchParams(location.hash.slice(1));
     const position = /^(\d+),(\d+)$/.exec(asked.get("pixel") ?? "");
     const [y, x] = position ? [Number(position[1]), Number(position[2])] : [NaN, NaN];
-    const colours = asked.get("colours"), path = asked.get("map");
+    const colours = asked.get("colours"), path = asked.get("map"), trouble = [];
+    const known = { pixel: y < ny && x < nx, colours: Object.hasOwn(RANGES, colours ?? "") || colours === "beta", map: factOf.has(path) };
+    for (const [name, good] of Object.entries(known)) if (asked.has(name) && !good) trouble.push(`${name} ${asked.get(name)}`);
+    const zoomed = (asked.get("zoom") ?? "").split(",");
     return {
-      pixel: y < ny && x < nx ? y * nx + x : -1,
-      colours: colours in RANGES || colours === "beta" ? colours : null,
-      path: factOf.has(path) ? path : null,
+      pixel: known.pixel ? y * nx + x : -1,
+      colours: known.colours ? colours : null,
+      path: known.map ? path : null,
+      zoom: zoomed.length === 3 && finite(zoomed) ? zoomed.map(Number) : null,
+      select: asked.has("select") ? asked.get("select").split(",") : null,
+      trouble,
     };
   };
 
@@ -1036,18 +1136,39 @@
       groups.get(fact.group).append(option);
     }
     list.append(...groups.values());
-    const notable = byId("inspector-notable");
-    for (const { words, pixels: where } of facts.notable) {
-      const group = el("optgroup", { label: words });
-      for (const i of where) {
-        group.append(el("option", { value: i }, ny === 1 ? place(i) : `y ${Math.floor(i / nx)}, x ${i % nx}`));
-      }
-      notable.append(group);
-    }
     byId("inspector-y").max = ny - 1;
     byId("inspector-x").max = nx - 1;
     byId("inspector-y-label").hidden = ny === 1;
     byId("inspector-truth").hidden = !hasTruth;
+  };
+  // pixels that stand out, with why: sorted by a click on a heading
+  const notable = { rows: [], key: "", up: true };
+  const fillNotable = async () => {
+    for (const { words, pixels: where, path } of facts.notable) {
+      const shown = factOf.has(path) && usable(factOf.get(path)) ? path : "maps/read_noise_e";
+      const map = factOf.has(shown) && usable(factOf.get(shown)) ? await layer(shown) : state.map;
+      for (const i of where) {
+        const value = valueAt(map, i);
+        notable.rows.push({ reason: words, place: i, value, text: `${map.fact.label} ${valueText(map.fact, value, NaN)}` });
+      }
+    }
+    sortNotable("");
+  };
+  const sortNotable = (key) => {
+    const { rows } = notable;
+    notable.up = key === notable.key ? !notable.up : true;
+    notable.key = key;
+    const rank = (a, b) => (Number.isNaN(a) ? 1 : 0) - (Number.isNaN(b) ? 1 : 0) || (a > b ? 1 : a < b ? -1 : 0);
+    const shown = key ? [...rows].sort((a, b) => rank(a[key], b[key]) * (notable.up ? 1 : -1)) : rows;
+    byId("inspector-notable").replaceChildren(...shown.map((row) => {
+      const button = el("button", { type: "button", "data-pixel": row.place }, ny === 1 ? place(row.place) : `y ${Math.floor(row.place / nx)}, x ${row.place % nx}`);
+      button.addEventListener("click", () => choose(row.place).then(bringIntoView));
+      return el("tr", {}, el("th", { scope: "row" }, row.reason), el("td", {}, button), el("td", {}, row.text));
+    }));
+    for (const head of document.querySelectorAll("#inspector-notables th[scope=col]")) {
+      const own = head.firstElementChild.dataset.key === key;
+      head.setAttribute("aria-sort", own ? (notable.up ? "ascending" : "descending") : "none");
+    }
   };
   // words for the eye and for the ear
   const tell = (text, where) => {
@@ -1081,9 +1202,11 @@
     for (const id of ["inspector-y", "inspector-x"]) {
       byId(id).addEventListener("keydown", (event) => { if (event.key === "Enter") go(); });
     }
-    byId("inspector-notable").addEventListener("change", (event) => {
-      if (event.target.value !== "") choose(Number(event.target.value));
-    });
+    for (const head of document.querySelectorAll("#inspector-notables th[scope=col] button")) {
+      head.addEventListener("click", () => sortNotable(head.dataset.key));
+    }
+    byId("inspector-csv").addEventListener("click", saveCsv);
+    byId("inspector-mask").addEventListener("click", saveMask);
     for (const id of ["inspector-from", "inspector-to"]) byId(id).addEventListener("change", () => {
       const [from, to] = ["inspector-from", "inspector-to"].map((each) => byId(each).value);
       if (from === "" && to === "") select(null);
@@ -1102,17 +1225,24 @@
       catch { tell(`Copy this link: ${link}`, "inspector-note"); }
     });
     byId("inspector-link").addEventListener("click", (event) => event.preventDefault());
-    window.addEventListener("hashchange", () => {
+    window.addEventListener("hashchange", async () => {
       const asked = fromAddress();
+      tellTrouble(asked);
       if (asked.colours && asked.colours !== state.colours) {
         byId("inspector-colours").value = asked.colours;
         byId("inspector-colours").dispatchEvent(new Event("change"));
       }
-      if (asked.path && asked.path !== state.map.fact.path) showMap(asked.path);
+      if (asked.path && asked.path !== state.map.fact.path) await showMap(asked.path);
+      if (asked.zoom) goTo(asked.zoom);
+      if (asked.select) await selectAsked(asked.select, state.map.fact.path);
       if (asked.pixel >= 0 && asked.pixel !== state.pixel) choose(asked.pixel, { quiet: true });
     });
     new ResizeObserver(() => { layout(); showHistogram(); if (current) drawPixel(current); }).observe(app);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paint(); redraw(); showScale(); });
+  };
+  const tellTrouble = ({ trouble }) => {
+    if (!trouble.length) return;
+    tell(`The link names what this run does not have: ${trouble.join("; ")}. It may be of another run.`, "inspector-trouble");
   };
   const start = async () => {
     if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old");
@@ -1131,7 +1261,15 @@
     if (!state.map) throw new Error("no map can be read");
     if (state.map && !asked.path && total(state.map.counts) === 0 && state.status) await showMap("fit/fit_status");
     listen();
-    if (asked.pixel >= 0) { await choose(asked.pixel, { quiet: true }); byId("inspector").scrollIntoView(); }
+    if (asked.select && !(await selectAsked(asked.select, state.map.fact.path))) asked.trouble.push(`select ${asked.select}`);
+    await fillNotable();
+    const chosen = asked.pixel >= 0 ? asked.pixel : medianPixel();
+    if (chosen >= 0) await choose(chosen, { quiet: true });
+    if (asked.zoom) goTo(asked.zoom);
+    tellTrouble(asked);
+    if (asked.pixel >= 0 || asked.trouble.length) byId("inspector").scrollIntoView();
+    ready = true;
+    byId("inspector-link").setAttribute("href", address());
     app.dataset.ready = "yes";
   };
   start().catch((error) => {

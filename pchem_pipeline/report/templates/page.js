@@ -12,6 +12,8 @@
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
 
+  document.addEventListener("pchem-save", (event) => save(...event.detail));
+
   // -- figures as files ------------------------------------------------------------------------
   const SVG = "data:image/svg+xml;base64,";
   const savePng = async (image, name) => {
