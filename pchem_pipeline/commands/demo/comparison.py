@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel
 
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.effects.framework.compose import effect_words
@@ -16,10 +17,11 @@ from pchem_pipeline.report.pages.discrepancy import parameter_texts
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from pchem_pipeline.commands.demo.unlisted import Unlisted
     from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["COMPARED", "compare", "judgement"]
+__all__ = ["COMPARED", "compare", "judgement", "unnamed"]
 
 #: Maps whose bias is told, and of which the truth is kept.
 COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
@@ -27,7 +29,7 @@ COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 Maps = Mapping[str, "NDArray[Any]"]
 
 
-def compare(found: Verdict, hidden: Effect, truth: Maps, before: Maps, after: Maps) -> str:
+def compare(found: Verdict, hidden: Effect | Unlisted, truth: Maps, before: Maps, after: Maps) -> str:
     """Return what was hidden, whether it was found, its parameters, and biases before and after.
 
     Args:
@@ -37,13 +39,38 @@ def compare(found: Verdict, hidden: Effect, truth: Maps, before: Maps, after: Ma
         before: maps of the plain model, with ``<name>_stderr`` and ``quality``.
         after: the same of the extended model.
     """
-    title = type(hidden).title
-    words = f"{effect_words(hidden)}{f' ({title})' if title else ''}"
-    lines = [f"hidden was: {words} - {judgement(found, hidden)}"]
-    lines += [f"found in {s.place}" for s in found.steps if s.effect == hidden.tag and s.place]
-    if type(hidden).untestable:
-        lines += textwrap.wrap(f"such frames cannot show it: {type(hidden).untestable}", 100)
-    return "\n".join([*lines, *_parameters(found, hidden), *_biases(truth, before, after)])
+    if isinstance(hidden, BaseModel):
+        title = type(hidden).title
+        words = f"{effect_words(hidden)}{f' ({title})' if title else ''}"
+        lines = [f"hidden was: {words} - {judgement(found, hidden)}", *_place(found, hidden)]
+        if type(hidden).untestable:
+            lines += textwrap.wrap(f"such frames cannot show it: {type(hidden).untestable}", 100)
+        lines += _parameters(found, hidden)
+    else:
+        lines = [f"hidden was: {hidden.words} (outside the library) - {unnamed(found)}"]
+    return "\n".join([*lines, *_biases(truth, before, after)])
+
+
+def _place(found: Verdict, hidden: Effect) -> list[str]:
+    """Return where the effect was found, and how much of its place that is."""
+    lines = [f"found in {step.place}" for step in found.steps if step.effect == hidden.tag and step.place]
+    for step in found.steps:
+        if step.effect == hidden.tag and not step.place and (hidden.region or hidden.when):
+            lines.append("found without a place")
+    return lines
+
+
+def unnamed(found: Verdict) -> str:
+    """Return in words whether a verdict on frames with an effect outside the library is right."""
+    names = [tag for tag in found.effects if tag != "empirical"]
+    if names:
+        return f"wrongly named: {', '.join(names)}"
+    return {
+        "described": "measured without a name, which is right",
+        "unexplained": "noticed and not named, which is right",
+        "ambiguous": "left open between effects of the library, none of which it is",
+        "consistent": "not noticed",
+    }.get(found.verdict, "not named")
 
 
 def judgement(found: Verdict, hidden: Effect) -> str:

@@ -14,8 +14,16 @@ from typer.testing import CliRunner
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands.demo import hidden
-from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement
-from pchem_pipeline.commands.demo.hidden import RANDOM, SEALED_KEY, hidden_effect, run_hidden_demo
+from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement, unnamed
+from pchem_pipeline.commands.demo.hidden import (
+    OUTSIDE,
+    RANDOM,
+    SEALED_KEY,
+    hidden_effect,
+    run_hidden_demo,
+    what_to_hide,
+)
+from pchem_pipeline.commands.demo.unlisted import UNLISTED, Unlisted
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.simulate.maps import draw_truth
@@ -47,28 +55,57 @@ def test_every_effect_can_be_hidden(tag: str) -> None:
 
 
 def test_an_effect_can_be_hidden_in_a_place() -> None:
-    effect = hidden_effect("row_noise@columns=2:5,frames=10:20", SETTINGS, draw_truth(SETTINGS))
+    effect = what_to_hide("row_noise@columns=2:5,frames=10:20", SETTINGS, draw_truth(SETTINGS))
+    assert not isinstance(effect, Unlisted)
     assert effect.tag == "row_noise"
     everywhere = hidden_effect("row_noise", SETTINGS, draw_truth(SETTINGS)).model_dump()["row_noise_dn"]
     assert effect.model_dump()["row_noise_dn"] == pytest.approx(everywhere * (4 * 6) ** 0.5)
     assert effect.region == Region(columns=((2, 5),))
     assert effect.when == When(range=((10, 20),))
-    assert hidden_effect("random@columns=2:5", SETTINGS, draw_truth(SETTINGS)).region == effect.region
+    other = what_to_hide("random@columns=2:5", SETTINGS, draw_truth(SETTINGS))
+    assert not isinstance(other, Unlisted)
+    assert other.region == effect.region
     with pytest.raises(ConfigError, match="columns=A:B"):
         hidden._check_tag("row_noise@colums=2:5")
     with pytest.raises(ConfigError, match="no such effect"):
         hidden._check_tag("rownoise@columns=2:5")
     with pytest.raises(ConfigError, match="the sensor has"):
-        hidden_effect("row_noise@columns=2:9000", SETTINGS, draw_truth(SETTINGS))
+        what_to_hide("row_noise@columns=2:9000", SETTINGS, draw_truth(SETTINGS))
 
 
-def test_random_hides_any_that_can_be_seen() -> None:
+def test_random_hides_any_that_can_be_seen_anywhere_and_some_outside_the_library() -> None:
     truth = draw_truth(SETTINGS)
-    seeds = [SETTINGS.model_copy(update={"seed": seed}) for seed in range(40)]
-    found = [hidden_effect(RANDOM, settings, truth) for settings in seeds]
-    assert len({effect.tag for effect in found}) > 12
-    assert not [effect.tag for effect in found if type(effect).untestable]
-    assert found[:5] == [hidden_effect(RANDOM, settings, truth) for settings in seeds[:5]]
+    seeds = [SETTINGS.model_copy(update={"seed": seed}) for seed in range(80)]
+    found = [what_to_hide(RANDOM, settings, truth) for settings in seeds]
+    listed = [each for each in found if not isinstance(each, Unlisted)]
+    assert len({effect.tag for effect in listed}) > 12
+    assert not [effect.tag for effect in listed if type(effect).untestable]
+    placed = [bool(effect.region) + 2 * bool(effect.when) for effect in listed]
+    assert {0, 1, 2} == set(placed)
+    assert {each.tag for each in found if isinstance(each, Unlisted)} == set(UNLISTED)
+    assert found[:5] == [what_to_hide(RANDOM, settings, truth) for settings in seeds[:5]]
+
+
+@pytest.mark.parametrize("tag", sorted(UNLISTED))
+def test_an_effect_outside_the_library_changes_frames_and_is_none_of_the_library(tag: str) -> None:
+    assert tag not in effect_classes()
+    assert what_to_hide(tag, SETTINGS, draw_truth(SETTINGS)) is UNLISTED[tag]
+    frames = np.random.default_rng(1).integers(90, 140, (600, 12, 12)).astype(np.uint16)
+    changed = UNLISTED[tag].applied(frames, 0, 7)
+    assert changed.dtype == frames.dtype
+    assert 1e-4 < (changed != frames).mean() < 0.6
+    np.testing.assert_array_equal(changed, UNLISTED[tag].applied(frames, 0, 7))
+    assert (changed != UNLISTED[tag].applied(frames, 0, 8)).any()
+    with pytest.raises(ConfigError, match="takes no place"):
+        hidden._check_tag(f"{tag}@columns=2:5")
+
+
+def test_a_name_for_an_effect_outside_the_library_is_wrong() -> None:
+    assert unnamed(verdict_of("named", effects=["row_noise"])) == "wrongly named: row_noise"
+    assert unnamed(verdict_of("consistent", effects=[])) == "not noticed"
+    truth = dict.fromkeys(COMPARED, np.full((8, 8), 2.0))
+    text = compare(verdict_of("consistent"), UNLISTED["late_rows"], truth, maps({}), maps({}))
+    assert "hidden was: some rows are read one column late (outside the library) - not noticed" in text
 
 
 def test_a_hidden_limit_cuts_few_samples_but_some() -> None:
@@ -93,6 +130,9 @@ def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
             assert "truth" not in path.name
     text = (tmp_path / "hidden.yaml").read_text()
     assert "simulate:" not in text
+    hidden._hide(tmp_path / "outside", OUTSIDE, 12, 60, 5)
+    key = json.loads(str(hidden._unpacked(tmp_path / "outside" / SEALED_KEY)["effect"]))
+    assert key["unlisted"] in UNLISTED
     # nor does a random effect show in what lies beside the frames
     other = tmp_path / "other"
     hidden._hide(other, RANDOM, 12, 60, 5)
