@@ -178,13 +178,14 @@ def is_blank(path: Path) -> bool:
 
 
 def sync_folder(path: Path) -> None:
-    """Wait until all that was done below a folder, and on its file system, is on the disk.
+    """Wait until the names in a folder are on the disk, if it is there.
 
     Raises:
         StoreError: the disk could not take it.
     """
     try:
-        disk.sync_all(path)
+        if path.is_dir():
+            disk.sync_folder(path)
     except OSError as error:
         raise storage_error(error, path) from error
 

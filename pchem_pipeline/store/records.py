@@ -90,7 +90,7 @@ class Records:
     def unmark_all(self, stage: str) -> None:
         """Drop all markers of a stage, which has its record still."""
         remove_folder(self._folder / "done" / stage)
-        self._forgotten()
+        self._forgotten(self._folder / "done")
 
     def mark(self, stage: str, fingerprint: str, key: str, summary: dict[str, Any]) -> None:
         """Say that a unit of a stage is whole in the store."""
@@ -102,12 +102,12 @@ class Records:
         for key in sorted(marked):
             remove_file(self._marker(stage, fingerprint, key))
         if marked:
-            self._forgotten()
+            self._forgotten(self._marker(stage, fingerprint, "x").parent)
 
-    def _forgotten(self) -> None:
+    def _forgotten(self, folder: Path) -> None:
         """Wait until markers are gone from the disk, before what they stood for is written anew."""
-        if not isinstance(self._folder, RemotePath) and self._folder.is_dir():
-            sync_folder(self._folder)
+        if not isinstance(folder, RemotePath):
+            sync_folder(folder)
 
     def done(self, stage: str, fingerprint: str) -> set[str]:
         """Return the keys of the finished units of a stage in its present form."""

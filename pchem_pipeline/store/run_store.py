@@ -236,7 +236,7 @@ class RunStore:
         """Remove an array or a group, if it exists, also one whose description a power cut has lost."""
         if not isinstance(self.path, RemotePath):
             remove_folder(self.path / name)
-            disk.unsynced(self.path).note()
+            disk.unsynced(self.path).note(None, [(self.path / name).parent])
         elif self.has(name):
             with self._translated(name):
                 del self._root[name]
@@ -285,10 +285,7 @@ class RunStore:
             check_lease(self.path)
             return
         try:
-            unsynced = disk.unsynced(self.path)
-            if part is not None:
-                unsynced.note()
-            unsynced.sync()
+            disk.unsynced(self.path).sync(part)
         except OSError as error:
             raise storage_error(error, self.path) from error
 

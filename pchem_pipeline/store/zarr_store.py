@@ -39,8 +39,9 @@ class DiskStore(LocalStore):
         self._check_writable()
         path = self.root / key
         # an older description must not be lost with the new one; a new array may be, before its first marker
-        disk.put(path, value.as_numpy_array().data, sync=path.name == "zarr.json" and path.exists())
-        disk.unsynced(self.root).note()
+        described = path.name == "zarr.json" and path.exists()
+        folders = disk.put(path, value.as_numpy_array().data, sync=described)
+        disk.unsynced(self.root).note(path, folders)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
         """Store a value where there is none; the run's lock lets only one process in."""
@@ -56,7 +57,7 @@ class DiskStore(LocalStore):
         self._check_writable()
         path = self.root / key
         (disk.remove_tree if path.is_dir() else disk.remove)(path)
-        disk.unsynced(self.root).note()
+        disk.unsynced(self.root).note(None, [path.parent])
 
     async def delete_dir(self, prefix: str) -> None:
         """Remove all values below a name."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from pchem_pipeline.store import disk
 
 CHANGES = ("make_folder", "write", "replace", "remove", "remove_tree")
-SYNCS = ("sync_file", "sync_folder", "sync_all")
+SYNCS = ("sync_file", "sync_folder")
 
 
 class FailingDisk:
@@ -44,10 +44,14 @@ class ForgetfulDisk:
 
     def _noted(self, name, operation):
         def call(*arguments):
+            entry = (name, *arguments)
+            if name == "make_folder":
+                above = [arguments[0], *arguments[0].parents]
+                entry = (*entry, [folder for folder in above if not folder.exists()])
+            elif name == "write":
+                entry = (name, arguments[0], bytes(arguments[1]))
             result = None if name in SYNCS else operation(*arguments)
-            self.log.append(
-                (name, *arguments) if name != "write" else (name, arguments[0], bytes(arguments[1]))
-            )
+            self.log.append(entry)
             return result
 
         return call
@@ -55,28 +59,28 @@ class ForgetfulDisk:
     def after_power_cut(self, end, rng, honest=True):
         """Return the files (path -> content) where the power is cut behind ``end`` operations.
 
-        What came before the last ``sync_all`` is there. Of what came later, each change of names is there or
-        not, in any order, and a content that was not synced is whole, cut, or empty. A disk that is not
-        ``honest`` forgets what it was told to keep.
+        Each change of names in a folder that was not synced later is there or not, in any order; so is what
+        lies in a new folder whose own name was not. A content that was not synced is whole, cut, or empty. A
+        disk that is not ``honest`` forgets what it was told to keep.
         """
         log = self.log[:end]
-        barriers = [i for i, entry in enumerate(log) if entry[0] == "sync_all"] if honest else []
-        sure = barriers[-1] if barriers else -1
-        files, synced, kept = {}, set(), self._kept(log) if honest else set()
+        files, kept = {}, self._kept(log) if honest else set()
+        lost = []
         for i, (name, *arguments) in enumerate(log):
             path = arguments[0]
-            if name == "sync_file" and honest:
-                synced.add(path)
-            elif name not in CHANGES or (
-                i > sure and i not in kept and rng.random() < 0.5 and name != "write"
+            if name not in CHANGES or (
+                i not in kept and rng.random() < 0.5 and name not in ("write", "make_folder")
             ):
                 continue
+            if name == "make_folder":
+                lost += [
+                    folder
+                    for folder in arguments[1]
+                    if not (honest and ("sync_folder", folder.parent) in log[i:]) and rng.random() < 0.2
+                ]
             elif name == "write":
                 data = arguments[1]
-                whole = i <= sure or any(
-                    entry[:2] == ("sync_file", path) for entry in (log[i:] if honest else ())
-                )
-                files[path] = data if whole else _what_is_left(data, rng)
+                files[path] = data if honest and _is_synced(log[i:]) else _what_is_left(data, rng)
             elif name == "replace":
                 if path in files:
                     files[arguments[1]] = files.pop(path)
@@ -84,19 +88,30 @@ class ForgetfulDisk:
                 files.pop(path, None)
             elif name == "remove_tree":
                 for other in [each for each in files if path in each.parents]:
-                    if i <= sure or i in kept or rng.random() < 0.7:
+                    if i in kept or rng.random() < 0.7:
                         del files[other]
-        return files
+        return {path: data for path, data in files.items() if not set(lost) & set(path.parents)}
 
     def _kept(self, log):
         """Return the numbers of changes of names in folders that were synced later."""
         kept = set()
         for i, (name, *arguments) in enumerate(log):
-            if name in ("replace", "remove"):
+            if name in ("replace", "remove", "remove_tree"):
                 folder = arguments[-1].parent
-                if any(entry[0] == "sync_folder" and entry[1] == folder for entry in log[i:]):
+                if ("sync_folder", folder) in log[i:]:
                     kept.add(i)
         return kept
+
+
+def _is_synced(log):
+    """Tell whether the file that the first entry writes is synced later, under whatever name it has then."""
+    names = {log[0][1]}
+    for name, *arguments in log[1:]:
+        if name == "sync_file" and arguments[0] in names:
+            return True
+        if name == "replace":
+            names = names | {arguments[1]} if arguments[0] in names else names - {arguments[1]}
+    return False
 
 
 def _what_is_left(data, rng):
