@@ -23,21 +23,23 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 GROUP = 4  # frames whose predictions are exchanged
-_MOST_SAMPLES = 1 << 19
+_MOST_SAMPLES = 1 << 18
 _MOST_THRESHOLDS = 96
 _FARTHEST = 4.0  # of the thresholds, standard deviations of the samples
 _TAIL = 3e-3  # of samples above the threshold that is tested
+_EQUAL = 3.0  # standard deviations by which samples equal a prediction too often for it to be looked into
 
 
-def groups_of(edges: IntArray, samples_of_a_frame: int) -> IntArray:
+def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int) -> IntArray:
     """Return positions of the first frames of groups of successive ones, evenly spread, (n,).
 
     Args:
         edges: positions of the blocks, (b + 1,).
-        samples_of_a_frame: of all groups together there are not more than 2^19, or one group.
+        samples_of_a_frame: rows times columns.
+        most_samples: of all groups together, unless there is but one.
     """
     first = np.concatenate([np.arange(a, b - GROUP + 1, GROUP) for a, b in pairwise(edges)])
-    most = max(_MOST_SAMPLES // (GROUP * samples_of_a_frame), 1)
+    most = max(most_samples // (GROUP * samples_of_a_frame), 1)
     chosen = first[:: max(-(-first.size // most), 1)]
     return np.asarray(chosen, np.int64)
 
@@ -54,7 +56,7 @@ def predicted_samples(
     """
     if min(usable.shape) < 3 or not usable[1:-1, 1:-1].any():
         return {}
-    first = groups_of(edges, usable.size)
+    first = groups_of(edges, usable.size, _MOST_SAMPLES)
     if not first.size:
         return {}
     chosen = frames[first[:, None] + np.arange(GROUP)].reshape(-1, *usable.shape)
@@ -65,33 +67,41 @@ def predicted_samples(
     found: dict[str, PredictedSamples] = {}
     for kind in PREDICTORS:
         own = predicted(chosen, kind)[:, inside].reshape(samples.shape)
-        found[kind] = _compared(samples, own, step * np.arange(_MOST_THRESHOLDS))
+        found[kind] = _compared(samples, own, step * np.arange(_MOST_THRESHOLDS), always=kind == "median")
     return found
 
 
 def _compared(
-    samples: NDArray[np.int32], prediction: NDArray[np.int32], thresholds: IntArray
+    samples: NDArray[np.int32], prediction: NDArray[np.int32], thresholds: IntArray, *, always: bool
 ) -> PredictedSamples:
-    """Compare samples (group, frame, pixel), DN, with the predictions of each frame of their group."""
+    """Compare samples (group, frame, pixel), DN, with the predictions of each frame of their group.
+
+    Above thresholds only what equals its prediction too often is looked at, unless ``always``.
+    """
     own = samples - prediction
     others = np.stack([samples - np.roll(prediction, shift, axis=1) for shift in range(1, GROUP)])
     equal = np.count_nonzero(own == 0)
     # as many pairs of a sample with itself as with each other frame, of which the mean is taken
     chance = np.count_nonzero(others == 0) / (GROUP - 1)
-    others.sort(axis=0)
-    at_least = np.array([_above(part, thresholds) for part in others[::-1]])
+    z = float((equal - chance) / np.sqrt(max(chance, 1.0) * GROUP / (GROUP - 1)))
+    if not always and z < _EQUAL:
+        return PredictedSamples(z, thresholds[:0], np.zeros(0), np.zeros((GROUP - 1, 0)))
+    first, second, third = others
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    ordered = np.maximum(high, third), np.maximum(low, np.minimum(high, third)), np.minimum(low, third)
+    at_least = np.array([_above(part, thresholds) for part in ordered])
     # of m of 3 above, one, two, three given ones are so in m, m (m - 1) / 2, ... of 3, 3, 1 choices
     exactly = at_least - np.append(at_least[1:], np.zeros((1, thresholds.size)), axis=0)
     moments = np.array([[1.0 / 3.0, 2.0 / 3.0, 1.0], [0.0, 1.0 / 3.0, 1.0], [0.0, 0.0, 1.0]])
-    z = (equal - chance) / np.sqrt(max(chance, 1.0) * GROUP / (GROUP - 1))
-    return PredictedSamples(float(z), thresholds, _above(own, thresholds), moments @ exactly)
+    return PredictedSamples(z, thresholds, _above(own, thresholds), moments @ exactly)
 
 
 def _above(deviations: NDArray[np.int32], thresholds: IntArray) -> FloatArray:
     """Return how many deviations are above each of evenly spaced thresholds from 0 on."""
     step = int(thresholds[1] - thresholds[0])
+    positive = deviations[deviations > 0]
     # d > i step where i < ceil(d / step)
-    cells = np.clip(-(-deviations.ravel() // step), 0, thresholds.size)
+    cells = np.minimum((positive + (step - 1)) // step, thresholds.size)
     counts = np.bincount(cells, minlength=thresholds.size + 1)
     return np.asarray(counts[::-1].cumsum()[::-1][1:], np.float64)
 

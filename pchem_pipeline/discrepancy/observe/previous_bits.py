@@ -21,6 +21,7 @@ __all__ = ["BITS", "bit_statistics", "previous_bits"]
 FloatArray = NDArray[np.float64]
 
 BITS = 8  # the lowest ones
+_MOST_SAMPLES = 1 << 19
 _SMALLEST = 1e-4  # variance of a bit that the value before leaves, relative: below it is that value
 
 
@@ -39,18 +40,21 @@ def previous_bits(
         noise: standard deviation of the samples of each pixel, DN, (y, x).
     """
     pairs = usable[:, 1:] & usable[:, :-1]
-    first = groups_of(edges, usable.size)
+    first = groups_of(edges, usable.size, _MOST_SAMPLES)
     if not first.size or not pairs.any():
         return None
     # of each group two pairs of frames
     later = (first[:, None] + np.array([1, 3])).ravel()
-    one, two = frames[later].astype(np.int32), frames[later - 1].astype(np.int32)
-    weight = (1.0 / noise[:, 1:][pairs]).astype(np.float32)
-    own = ((one - two)[:, :, 1:][:, pairs] * weight).ravel()
-    before = [part[:, :, :-1][:, pairs] for part in (one, two)]
-    columns = [(before[0] - before[1]) * weight]
-    columns += [((before[0] >> bit & 1) - (before[1] >> bit & 1)) * weight for bit in range(BITS)]
-    design = np.stack([column.ravel() for column in columns])
+    one, two = frames[later], frames[later - 1]
+    weight = np.where(pairs, 1.0 / noise[:, 1:], 0.0).astype(np.float32)
+    value = np.subtract(one, two, dtype=np.float32) if one.itemsize < 4 else one - two.astype(np.float64)
+    own = (value[:, :, 1:] * weight).ravel()
+    design = np.empty((1 + BITS, own.size), np.float32)
+    design[0] = (value[:, :, :-1] * weight).ravel()
+    low = [(part[:, :, :-1] & (2**BITS - 1)).astype(np.uint8) for part in (one, two)]
+    for bit in range(BITS):
+        changed = (low[0] >> bit & 1).view(np.int8) - (low[1] >> bit & 1).view(np.int8)
+        design[1 + bit] = (changed * weight).ravel()
     square = (design @ design.T).astype(np.float64)
     product = (design @ own).astype(np.float64)
     if square[0, 0] <= 0.0:
@@ -58,7 +62,8 @@ def previous_bits(
     # what the value before explains is taken from the bits
     slope = square[1:, 0] / square[0, 0]
     left = square[1:, 1:] - np.outer(slope, square[0, 1:])
-    return PreviousBits(product[1:] - slope * product[0], left, float((own @ own) / own.size))
+    variance = float(own @ own) / (len(one) * int(pairs.sum()))
+    return PreviousBits(product[1:] - slope * product[0], left, variance)
 
 
 def bit_statistics(found: PreviousBits | None) -> dict[str, float]:

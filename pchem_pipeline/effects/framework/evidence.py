@@ -91,7 +91,7 @@ class PredictedSamples:
 
     Attributes:
         equal_z: by how many standard deviations they equal the prediction of their own frame more often.
-        thresholds: DN, increasing, shape (n,).
+        thresholds: DN, increasing, shape (n,); none where they are as often equal as chance makes them.
         above: samples that exceed the prediction of their own frame by more, shape (n,).
         above_chance: those that exceed one, two, three given predictions of other frames, as means over the
             choices, shape (3, n).
