@@ -27,7 +27,7 @@ class EmTrace(NamedTuple):
 
 def one_sample(counts: NDArray[np.integer]) -> tuple[Pixel, Scratch, int]:
     """Return one histogram as the loops take it, room to work in, and its centre in bins after the first."""
-    pixel = make_pixel(FREE, counts.size, 0, 0, np.zeros((0, 2)))
+    pixel = make_pixel(FREE, counts.size, 0, 0)
     scratch = make_scratch(1, counts.size, False)
     centre = load(
         np.asarray(counts, np.uint32), np.zeros(counts.size, np.uint8), pixel.bins[0], pixel.facts[0]

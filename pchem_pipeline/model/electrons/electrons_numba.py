@@ -16,6 +16,7 @@ from pchem_pipeline.model.law.levels_numba import (
     number_range,
     place_codes,
     reach_of_law,
+    share_room,
 )
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN
@@ -98,8 +99,8 @@ def fill_tables(
     """
     most = _longest(start)
     pixel, scratch = pixel_scratch(most + 2, law)
-    detailed = mass.size > 0
-    theta, sums = scratch.small[OWN], np.empty((4, most))
+    detailed, share = mass.size > 0, share_room(most)
+    theta, sums = scratch.small[OWN], np.empty((3, most))
     for p in range(first.size):
         at, n = start[p], start[p + 1] - start[p]
         for i in range(n):
@@ -121,9 +122,9 @@ def fill_tables(
             likely = 1.0 if prior[p] < 0.0 else number_mass(k, prior[p], cells)
             if likely < _LEAST_LIKELY:
                 continue
-            low, high = fill_level(k, likely, theta, cells, codes, sums[3])
+            low, high = fill_level(k, likely, theta, cells, codes, share)
             for i in range(low, high):
-                joint = likely * sums[3, i - low]
+                joint = likely * share[0, i - low]
                 sums[0, i] += joint
                 sums[1, i] += k * joint
                 if joint > sums[2, i]:
@@ -169,7 +170,7 @@ def sum_outcomes(
     """
     most = _longest(start)
     pixel, scratch = pixel_scratch(most + 2, law)
-    theta, share = scratch.small[OWN], np.empty(most)
+    theta, share = scratch.small[OWN], share_room(most)
     for p in range(first.size):
         at, n = start[p], start[p + 1] - start[p]
         errors[p] = math.nan
@@ -185,7 +186,7 @@ def sum_outcomes(
                 continue
             low, high = fill_level(k, mass, theta, cells, codes, share)
             for i in range(low, high):
-                joint = mass * share[i - low]
+                joint = mass * share[0, i - low]
                 found = np.int64(number[at + i])
                 if found < out.size:
                     out[found] += joint

@@ -228,7 +228,7 @@ def observed_covariance(
         evaluate: the density.
         covariance: out, of (H, g, mu, sigma).
     """
-    pixel = make_pixel(np.zeros(1, np.bool_), counts.size, 0, 0, np.zeros((0, 2)))
+    pixel = make_pixel(np.zeros(1, np.bool_), counts.size, 0, 0)
     scratch = make_scratch(1, counts.size, np.bool_(False))
     centre = origin + load(counts, np.zeros(counts.size, np.uint8), pixel.bins[0], pixel.facts[0])
     theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]

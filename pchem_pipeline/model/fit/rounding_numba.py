@@ -57,7 +57,7 @@ def _shift(parameters: NDArray[np.float64], n: float, evaluate: Any, shift: NDAr
     first = math.floor(-_REACH * sigma) - 1
     n_bins = int((exposure + _REACH * math.sqrt(exposure) + 8.0) * a + _REACH * sigma) + 2 - first
     offset = bias - math.floor(bias)
-    pixel = make_pixel(np.zeros(1, np.bool_), n_bins, 0, 0, np.zeros((0, 2)))
+    pixel = make_pixel(np.zeros(1, np.bool_), n_bins, 0, 0)
     scratch = make_scratch(1, n_bins, np.bool_(False))
     places = np.arange(n_bins) + float(first)
     same = np.ones(n_bins)

@@ -698,7 +698,7 @@ def start_tile(
     mask, theta = np.zeros(n_most, np.uint8), np.empty(4)
     scratch, pixel = (
         make_scratch(1, n_most, False),
-        make_pixel(np.zeros(1, np.bool_), n_most, 0, 0, np.zeros((0, 2))),
+        make_pixel(np.zeros(1, np.bool_), n_most, 0, 0),
     )
     for row in range(counts.shape[0]):
         centre = load(counts[row], mask, pixel.bins[0], pixel.facts[0])

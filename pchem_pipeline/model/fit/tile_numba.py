@@ -110,7 +110,7 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
             centre = own
         room.facts[j, CENTRE] = float(own - centre)
         widest = max(widest, room.facts[j, N_BINS])
-    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, room.table, centre, 4.0 * widest + 10.0)
+    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
 
 
 @kernel(inline=True)
@@ -191,7 +191,7 @@ def make_room(given: Histograms, law: Law) -> Pixel:
         most = max(most, given.places[j + 1] - given.places[j])
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
     n_exposures = max(law.exposures.shape[3], law.added.shape[3])
-    room: Pixel = make_pixel(given.dark, most, n_peaks, n_exposures, law.table)
+    room: Pixel = make_pixel(given.dark, most, n_peaks, n_exposures)
     return room
 
 

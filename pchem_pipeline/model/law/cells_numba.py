@@ -120,7 +120,6 @@ class Law(NamedTuple):
         added: weights and values (e-) of added exposures, shape (J, 1 or n, 2, enough).
         edge_shift: shifts of the code edges from ``EDGE_FIRST`` on, DN, shape (J, 1 or n, enough).
         pattern: shift, in units of the amplitude, and weight of free satellites, shape (enough, 2).
-        table: of the normal law.
     """
 
     numbers: NDArray[np.float64]
@@ -131,7 +130,6 @@ class Law(NamedTuple):
     added: NDArray[np.float64]
     edge_shift: NDArray[np.float64]
     pattern: NDArray[np.float64]
-    table: NDArray[np.float64]
 
 
 class Cells(NamedTuple):
@@ -151,7 +149,6 @@ class Cells(NamedTuple):
         peaks: levels of the noise, shape (N_PEAK_ROWS, at least n_peaks).
         n_peaks: levels in use.
         mixtures: of exposures, see :class:`.pixel_numba.Pixel`.
-        table: of the normal law.
         count_law, dispersion: of the electron number.
         level_scale, level_shift, curvature: of the comb; e-.
         extra_e2, extra_dn2, per_electron, per_electron2: variance, e-^2 and DN^2.
@@ -169,7 +166,6 @@ class Cells(NamedTuple):
     peaks: NDArray[np.float64]
     n_peaks: int
     mixtures: NDArray[np.float64]
-    table: NDArray[np.float64]
     count_law: int
     dispersion: float
     level_scale: float
@@ -295,7 +291,6 @@ def cells_of(pixel: Pixel, j: int) -> Cells:
         pixel.peaks[j],
         int(facts[N_PEAKS]),
         pixel.mixtures[j],
-        pixel.table,
         int(facts[COUNT_LAW]),
         facts[DISPERSION],
         facts[LEVEL_SCALE],

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.model.law import electron_laws_numba, normal_numba
+from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.parameters import PixelParameters
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
@@ -50,13 +49,6 @@ class HasSatellites(Protocol):
 Parameters = PixelParameters | Sequence[ArrayLike]
 
 
-@functools.cache
-def _normal_table() -> FloatArray:
-    table = np.empty((int(normal_numba.FARTHEST * normal_numba.STEPS) + 2, 2))
-    normal_numba.fill_normal_table(table)
-    return table
-
-
 def pack(models: Sequence[SampleLaw], n: int) -> Law:
     """Return the laws of the samples of n pixels as the loops take them.
 
@@ -77,7 +69,6 @@ def pack(models: Sequence[SampleLaw], n: int) -> Law:
         _stacked([part.added for part in parts]),
         _stacked([part.edge_shift for part in parts]),
         np.array(models[0].free_satellite_pattern, np.float64).reshape(-1, 2),
-        _normal_table(),
     )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cells_of, component, resolve
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.normal_numba import FARTHEST, REACH, normal_tail, tail_difference
+from pchem_pipeline.model.law.normal_numba import FARTHEST, REACH, normal_mass
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     CLIP_HIGH,
@@ -30,6 +30,8 @@ from pchem_pipeline.model.law.pixel_numba import (
     SHARE_SLOPE,
     Pixel,
 )
+from pchem_pipeline.model.law.simd_math_numba import lanes_tail
+from pchem_pipeline.model.law.simd_numba import LANES, fused, load_lanes, store_lanes
 
 __all__ = [
     "Codes",
@@ -92,9 +94,15 @@ def place_codes(
     codes = Codes(value - whole, parts, n)
     n_whole = math.floor(codes.first + (n - 1) / parts + 0.5) + 1
     pixel.facts[0, N_BINS], pixel.facts[0, FIRST] = float(n_whole), 0.0
-    found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.table, whole, 0.0)
+    found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, whole, 0.0)
     resolve(law, index, satellites[index, 0], found)
     return found, codes
+
+
+@kernel
+def share_room(n_codes: int) -> FloatArray:
+    """Return room for what electron numbers give to so many codes."""
+    return np.zeros((2, n_codes + 2 * LANES))
 
 
 @kernel(borrows=True)
@@ -160,27 +168,19 @@ def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, l
 
 
 @kernel(borrows=True)
-def _tail_between(lower: float, upper: float, mean: float, sd: float, table: FloatArray) -> float:
-    """Return the mass of a normal law between two values."""
-    z0, z1 = (lower - mean) / sd, (upper - mean) / sd
-    # `normal_tail` takes infinity as no tail
-    below, _ = normal_tail(z0, table)
-    above, _ = normal_tail(z1, table)
-    inside: float = tail_difference(below, above, z0, z1)
-    return inside
-
-
-@kernel(borrows=True)
 def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
-    """Add the mass of whole codes, each of whose edges is that of the next one."""
-    inverse = 1.0 / part.sd
-    before = (cells.bins[EDGE, low] - part.mean) * inverse if low < high else 0.0
-    below, _ = normal_tail(before, cells.table)
+    """Add the mass of whole codes to the first row of ``share``; the second gets the tails at their edges."""
+    mean, inverse = part.mean, 1.0 / part.sd
+    for i in range(low, high + 1, LANES):
+        tail, _, _ = lanes_tail((load_lanes(cells.bins, EDGE, i) - mean) * inverse)
+        store_lanes(share, 1, i - low, tail)
+    for i in range(0, high - low, LANES):
+        inside = load_lanes(share, 1, i + 1) - load_lanes(share, 1, i)
+        store_lanes(share, 0, i, fused(inside, weight, load_lanes(share, 0, i)))
     for i in range(low, high):
-        z = (cells.bins[EDGE, i + 1] - part.mean) * inverse
-        above, _ = normal_tail(z, cells.table)
-        share[i - low] += weight * tail_difference(below, above, before, z)
-        before, below = z, above
+        if cells.bins[EDGE, i] <= mean < cells.bins[EDGE, i + 1]:  # both tails are those beyond its edges
+            share[0, i - low] += weight
+            break
 
 
 @kernel(borrows=True)
@@ -209,12 +209,19 @@ def fill_level(
 ) -> tuple[int, int]:
     """Fill P(code | k) of the codes that an electron number reaches; return these, the end excluded.
 
-    ``share[0]`` is that of the first of them. A number of the probability ``likely`` is given fewer of them.
+    Args:
+        k: electron number.
+        likely: its probability; an unlikely one is given fewer codes.
+        theta: parameters of the sample.
+        cells: of the sample.
+        codes: of the pixel.
+        share: out, the first row from the first of these codes on; the second one is worked in; see
+            :func:`share_room`.
     """
     reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(likely), 0.0))
     low, high, _ = _span(k, theta, cells, codes, reach)
     for i in range(high - low):
-        share[i] = 0.0
+        share[0, i] = 0.0
     for peak in range(cells.n_peaks if low < high else 0):
         weight = cells.peaks[SHARE, peak] + theta[4] * cells.peaks[SHARE_SLOPE, peak]
         if weight == 0.0:
@@ -228,7 +235,8 @@ def fill_level(
             whole = math.floor(value + 0.5)
             aside = value - whole
             lower, upper = cells.bins[EDGE, whole] + aside, cells.bins[EDGE, whole + 1] + aside
-            share[i - low] += weight * _tail_between(lower, upper, part.mean, part.sd, cells.table)
+            inside = normal_mass((lower - part.mean) / part.sd, (upper - part.mean) / part.sd)
+            share[0, i - low] += weight * inside
     return low, max(low, high)
 
 
@@ -240,11 +248,11 @@ def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
     for k in range(first, end):
         low, high, _ = _span(k, theta, cells, codes, REACH)
         total += max(high - low, 0)
-    number, share = np.empty(n, np.int64), np.empty(total)
+    number, share = np.empty(n, np.int64), share_room(total)
     lows, highs, start = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     place = 0
     for row in range(n):
-        low, high = fill_level(first + row, 1.0, theta, cells, codes, share[place:])
+        low, high = fill_level(first + row, 1.0, theta, cells, codes, share[:, place:])
         number[row], lows[row], highs[row], start[row] = first + row, low, high, place
         place += high - low
-    return Levels(number, lows, highs, start, share)
+    return Levels(number, lows, highs, start, share[0])

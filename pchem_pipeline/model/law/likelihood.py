@@ -19,7 +19,7 @@ __all__ = ["cells_likelihood", "density_likelihood", "evaluation_arguments"]
 def evaluation_arguments() -> tuple[Any, ...]:
     """Return an example of each argument of a likelihood."""
     vector, rows, stack = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1))
-    pixel = Pixel(stack, rows, stack, stack, rows, 0, 0.0)
+    pixel = Pixel(stack, rows, stack, stack, 0, 0.0)
     flags, evaluations = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1))
     return pixel, vector, False, Scratch(rows, rows, rows, stack, rows, rows, flags, evaluations), stack
 

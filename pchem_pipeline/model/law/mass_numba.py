@@ -43,14 +43,14 @@ def pixel_scratch(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
     """Return room for one sample of so many bins."""
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
     n_exposures = max(law.exposures.shape[3], law.added.shape[3])
-    pixel = make_pixel(np.zeros(1, np.bool_), n_bins, n_peaks, n_exposures, law.table)
+    pixel = make_pixel(np.zeros(1, np.bool_), n_bins, n_peaks, n_exposures)
     return pixel, make_scratch(np.int64(1), n_bins, np.bool_(True))
 
 
 @kernel
 def _at(room: Pixel, centre: int) -> Pixel:
     """Return the pixel counted from a code."""
-    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, room.table, centre, 0.0)
+    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 0.0)
 
 
 @kernel

@@ -14,20 +14,15 @@ __all__ = [
     "FARTHEST",
     "NARROW",
     "REACH",
-    "STEPS",
     "add_component",
     "add_density",
     "add_mass",
-    "fill_normal_table",
     "normal_mass",
-    "normal_tail",
-    "tail_difference",
 ]
 
 FloatArray = NDArray[np.float64]
 
-# the table of the normal law: steps per unit of z, and where a tail ends for all that double can hold
-STEPS = 128
+#: Standard deviations beyond which a tail is below all that double can hold.
 FARTHEST = 38.0
 #: Standard deviations within which a Gaussian is added; it is below 2e-16 of its peak outside.
 REACH = 8.5
@@ -35,49 +30,9 @@ REACH = 8.5
 NARROW = 1.0
 
 
-@kernel(borrows=True)
-def fill_normal_table(table: NDArray[np.float64]) -> None:
-    """Fill the upper tail and the density of the normal law at z = 0, 1/STEPS, ..., shape (n, 2)."""
-    for j in range(table.shape[0]):
-        z = j / STEPS
-        table[j, 0] = 0.5 * math.erfc(z / math.sqrt(2.0))
-        table[j, 1] = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-
-
-@kernel(inline=True)
-def normal_tail(z: float, table: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the nearer tail of the normal law, negative above the middle, and the density at z.
-
-    The difference of two such tails is the mass between two values on one side of the middle without
-    cancellation; where they lie on either side, it is the mass less one. Taylor series around the nearest
-    node: the mass is good to 1e-15 of itself within 8 standard deviations, and to 1e-7 at the far end.
-    """
-    distance = abs(z)
-    if not distance < FARTHEST:
-        return 0.0, 0.0
-    node = int(distance * STEPS + 0.5)
-    z0 = node / STEPS
-    d = distance - z0
-    h2 = z0 * z0 - 1.0
-    h3 = z0 * h2 - 2.0 * z0
-    h4 = z0 * h3 - 3.0 * h2
-    h5 = z0 * h4 - 4.0 * h3
-    series = d * (1.0 - d * (z0 / 2.0 - d * (h2 / 6.0 - d * (h3 / 24.0 - d * (h4 / 120.0 - d * h5 / 720.0)))))
-    tail = table[node, 0] - table[node, 1] * series
-    y = -d * (z0 + 0.5 * d)
-    extended = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y / 120.0))))
-    return (tail if z <= 0.0 else -tail), table[node, 1] * extended
-
-
-@kernel(inline=True)
-def tail_difference(below: float, above: float, z0: float, z1: float) -> float:
-    """Return the mass between two values from their tails (see :func:`normal_tail`)."""
-    return above - below + (1.0 if z0 <= 0.0 < z1 else 0.0)
-
-
 @kernel
 def normal_mass(low: float, high: float) -> float:
-    """Return the standard normal mass of [low, high], without a table, exact in both tails."""
+    """Return the standard normal mass of [low, high], exact in both tails."""
     root = math.sqrt(0.5)
     if low > 0.0:
         return 0.5 * (math.erfc(low * root) - math.erfc(high * root))

@@ -127,7 +127,6 @@ class Pixel(NamedTuple):
         facts: numbers of each sample, shape (J, N_FACTS).
         peaks: satellite peaks of each sample, shape (J, N_PEAK_ROWS, enough); weight 0 where there are fewer.
         mixtures: of exposures, shape (J, N_MIXTURE_ROWS, enough); weight 0 where there are fewer.
-        table: of the normal law.
         centre: DN that all is counted from.
         longest_step: 1/g beyond which there is one Gaussian, DN.
     """
@@ -136,7 +135,6 @@ class Pixel(NamedTuple):
     facts: NDArray[np.float64]
     peaks: NDArray[np.float64]
     mixtures: NDArray[np.float64]
-    table: NDArray[np.float64]
     centre: int
     longest_step: float
 
@@ -183,9 +181,7 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
 
 
 @kernel
-def make_pixel(
-    dark: NDArray[np.bool_], n_bins: int, n_peaks: int, n_exposures: int, table: FloatArray
-) -> Pixel:
+def make_pixel(dark: NDArray[np.bool_], n_bins: int, n_peaks: int, n_exposures: int) -> Pixel:
     """Return room for the histograms of a pixel.
 
     Args:
@@ -193,7 +189,6 @@ def make_pixel(
         n_bins: bins at most.
         n_peaks: levels of the noise at most.
         n_exposures: exposures at most that H is a mixture of.
-        table: of the normal law.
     """
     n = dark.size
     facts = np.zeros((n, N_FACTS))
@@ -204,7 +199,6 @@ def make_pixel(
         facts,
         np.zeros((n, N_PEAK_ROWS, n_peaks)),
         np.zeros((n, N_MIXTURE_ROWS, n_exposures)),
-        table,
         0,
         0.0,
     )

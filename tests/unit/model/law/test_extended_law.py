@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
-import mpmath
 import numpy as np
 import pytest
 from helpers.em_trace import evaluated
@@ -17,12 +14,6 @@ from pchem_pipeline.model.law.electron_laws_numba import _one_law, electron_numb
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
 from pchem_pipeline.model.law.mass import log_likelihood, sample_mass
-from pchem_pipeline.model.law.normal_numba import (
-    FARTHEST,
-    STEPS,
-    fill_normal_table,
-    normal_tail,
-)
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -111,7 +102,7 @@ def test_score_and_information_are_the_derivatives(law: str, satellite: float, a
     packed = pack([model.with_free_satellites((1.3,))], 1)
     n_peaks = packed.peaks.shape[3] * (1 + packed.pattern.shape[0])
     n_exposures = max(packed.exposures.shape[2], packed.added.shape[3])
-    pixel = pixel_numba.make_pixel(np.array([False]), 90, n_peaks, n_exposures, packed.table)
+    pixel = pixel_numba.make_pixel(np.array([False]), 90, n_peaks, n_exposures)
     scratch = pixel_numba.make_scratch(1, 90, True)
     mask = np.zeros(90, np.uint8)
     if aside:
@@ -135,19 +126,6 @@ def test_score_and_information_are_the_derivatives(law: str, satellite: float, a
         assert score[i] == pytest.approx((above - below) / 2 / step[i], rel=1e-6, abs=1e-6 * abs(score).max())
         slope = (score_below - score_above) / 2 / step[i]
         np.testing.assert_allclose(information[i], slope, rtol=1e-6, atol=1e-7 * abs(slope).max())
-
-
-def test_normal_tail_keeps_its_digits() -> None:
-    table = np.empty((int(FARTHEST * STEPS) + 2, 2))
-    fill_normal_table.py_func(table[:3])
-    fill_normal_table(table)
-    for z in (0.0, 1e-9, 0.3, -1.234567, 5.0039, -8.4999, 12.3456, -37.9, 40.0, -math.inf, math.inf):
-        got = normal_tail.py_func(z, table)
-        tail = mpmath.erfc(abs(mpmath.mpf(z)) / mpmath.sqrt(2)) / 2 if math.isfinite(z) else 0
-        expected = float(tail) * (1 if z <= 0 else -1) if abs(z) < FARTHEST else 0.0
-        tolerance = 1e-13 if abs(z) < 8.5 else 1e-7
-        assert got[0] == pytest.approx(expected, rel=tolerance)
-        assert got[1] == pytest.approx(norm.pdf(z) if abs(z) < FARTHEST else 0.0, rel=max(tolerance, 1e-11))
 
 
 @pytest.mark.parametrize(("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2)])
