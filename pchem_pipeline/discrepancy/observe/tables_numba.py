@@ -236,6 +236,30 @@ def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: Fl
 
 
 @kernel
+def _beyond(
+    counts: NDArray[Any], origin: int, ends: tuple[int, int], outside: FloatArray
+) -> tuple[float, float]:
+    """Return the samples of a pixel below and above two DN, those outside of its histogram included."""
+    below, above = outside
+    for b in range(counts.size):
+        if origin + b < ends[0]:
+            below += counts[b]
+        elif origin + b > ends[1]:
+            above += counts[b]
+    return below, above
+
+
+@kernel
+def _add_expected(
+    mass: FloatArray, n: float, expected: FloatArray, low: int, place: int, total: FloatArray
+) -> None:
+    """Add the counts expected of a pixel's codes: ``expected`` from the code ``low`` on, n p elsewhere."""
+    for x in range(mass.size):
+        if 0 <= place + x < total.size:
+            total[place + x] += expected[x - low] if low <= x < low + expected.size else n * mass[x]
+
+
+@kernel
 def summarise_pixels(
     counts: NDArray[Any],
     origin: IntArray,
@@ -305,10 +329,7 @@ def summarise_pixels(
             continue
         under, over = _count(counts[p], origin[p], first, seen, axis, codes)
         _expect(law, inverse, seen, expected)
-        for x in range(full.shape[0]):
-            at = window[p, 0] + x - axis
-            if 0 <= at < codes.shape[1]:
-                codes[1, at] += expected[x - low] if low <= x <= high else n * full[x, 0]
+        _add_expected(full[:, 0], n, expected, low, window[p, 0] - axis, codes[1])
         pixel_scores(law, inverse, seen, gram, exposure, scores[p])
         out = moments[p]
         inside = _total(seen)
@@ -317,13 +338,8 @@ def summarise_pixels(
         out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
         _channels(mass, table[0], table[1], seen, out[SEEN_LOW], out[SEEN_HIGH], out)
         far_low, far_high, out[EXPECTED_FAR_LOW], out[EXPECTED_FAR_HIGH] = within(full, n, allowed_far)
-        out[SEEN_FAR_LOW], out[SEEN_FAR_HIGH] = outside[p]
-        for b in range(counts.shape[1]):
-            at = origin[p] + b - window[p, 0]
-            if at < far_low:
-                out[SEEN_FAR_LOW] += counts[p, b]
-            elif at > far_high:
-                out[SEEN_FAR_HIGH] += counts[p, b]
+        far = far_low + window[p, 0], far_high + window[p, 0]
+        out[SEEN_FAR_LOW], out[SEEN_FAR_HIGH] = _beyond(counts[p], origin[p], far, outside[p])
         support[p, 0], support[p, 1], support[p, 2] = first, size, used
         for x in range(size):
             tables[used + x, 0], tables[used + x, 1] = table[0, x], table[1, x]
