@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,10 +84,6 @@ class Calibration(PixelParameters):
         mean, square = pattern.T[0] @ pattern[:, 1], pattern.T[0] ** 2 @ pattern[:, 1]
         own = (weight * square - (weight * mean) ** 2) * (amplitude / self.columns[:, 1]) ** 2
         return np.asarray((sigma**2 + own).reshape(self.shape))
-
-    def with_law(self, law: SampleLaw) -> Calibration:
-        """Return it with another law of the samples."""
-        return replace(self, law=law)
 
 
 def covariance_of(stderr: FloatArray, correlation: FloatArray) -> FloatArray:

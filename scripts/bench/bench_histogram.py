@@ -25,7 +25,7 @@ from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms, histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator, line_sums
-from pchem_pipeline.stages.histogram.histogram import histogram_tile
+from pchem_pipeline.stages.histogram.counting import TileCounter
 
 Frames = NDArray[np.uint16]
 
@@ -83,8 +83,10 @@ def ours(frames: Frames, repeat: int) -> RowHistograms:
         accumulator.finish()
 
     def whole(settings: HistogramSettings) -> None:
-        blocks = (frames[t : t + 256] for t in range(0, n_frames, 256))
-        histogram_tile(blocks, (rows, columns), bins, n_frames, settings)
+        counter = TileCounter((rows, columns), bins, n_frames, settings)
+        for t in range(0, n_frames, 256):
+            counter.add(frames[t : t + 256])
+        counter.finish()
 
     everything, counts_only = HistogramSettings(), HistogramSettings(summaries=False)
     report("histograms (windows checked, exact under/over)", count, frames.size, repeat)
@@ -101,9 +103,11 @@ def ours(frames: Frames, repeat: int) -> RowHistograms:
                 reader.read_into(buffer[: end - t], t, end)
 
         def from_file(settings: HistogramSettings) -> None:
+            counter = TileCounter((rows, columns), bins, n_frames, settings)
             with FrameStream(reader, [(0, rows)], 256) as stream:
-                blocks = (parts[0] for _, parts in stream)
-                histogram_tile(blocks, (rows, columns), bins, n_frames, settings)
+                for _, (block,) in stream:
+                    counter.add(block)
+            counter.finish()
 
         report("reading the file alone (warm)", read, frames.size, repeat)
         report("file to histograms", lambda: from_file(counts_only), frames.size, repeat)

@@ -77,11 +77,6 @@ class Comparison:
         shared = [Contender(c.hypothesis, c.score, c.stderr, c.probability / total) for c in found.values()]
         return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))
 
-    def with_rival(self, tag: str, rival: str) -> Refitted | None:
-        """Return the best set that has a rival in the place of an effect; None where none was fitted."""
-        wanted = (self.chosen.tags - {tag}) | {rival}
-        return next((one for one in self.tried if one.tags == wanted), None)
-
 
 def compare(
     refitter: Refitter, held: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis], choice: Choice

@@ -1,4 +1,4 @@
-"""The photon counting distribution (PCD): density, moments, quantised mass and draws.
+"""The photon counting distribution (PCD): density, moments, quantised mass and thresholds.
 
 A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
 standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
@@ -14,19 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law import pcd_numba
 
 __all__ = [
     "PcdMoments",
-    "analog_read_noise",
-    "draw_pcd",
     "log_pcd",
     "pcd",
     "pcd_mass",
     "pcd_moments",
     "thresholds",
-    "total_read_noise",
 ]
 
 
@@ -138,35 +134,6 @@ def pcd_moments(
     )
 
 
-def draw_pcd(
-    rng: np.random.Generator,
-    quanta_exposure: ArrayLike,
-    conversion_gain: ArrayLike,
-    bias: ArrayLike,
-    analog_read_noise_e: ArrayLike,
-    size: int | tuple[int, ...] | None = None,
-) -> NDArray[np.int64]:
-    """Draw whole DN from eq. (PCD_RV_definition), rounding included.
-
-    Args:
-        rng: source of random numbers.
-        quanta_exposure: H, e-.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        analog_read_noise_e: sigma_R before quantisation, e-.
-        size: shape of the answer; the broadcast shape of the parameters by default.
-
-    Returns:
-        Draws, DN.
-    """
-    parameters = [np.asarray(a, float) for a in (quanta_exposure, conversion_gain, bias, analog_read_noise_e)]
-    shape = np.broadcast_shapes(*[p.shape for p in parameters]) if size is None else size
-    exposure, gain, offset, noise = parameters
-    electrons = rng.poisson(exposure, shape)
-    signal = electrons + noise * rng.standard_normal(shape)
-    return np.asarray(np.rint(signal / gain + offset), dtype=np.int64)
-
-
 def thresholds(
     quanta_exposure: _Array | float,
     conversion_gain: _Array | float,
@@ -195,17 +162,3 @@ def thresholds(
     k = np.arange(n_thresholds)
     with np.errstate(divide="ignore"):
         return np.asarray(offset + (k + 0.5) / gain + gain * sigma**2 * np.log((k + 1) / exposure))
-
-
-def total_read_noise(analog_read_noise_e: ArrayLike, conversion_gain: ArrayLike) -> _Array:
-    """Return sigma (DN) with quantisation from sigma_R (e-): ``sqrt(sigma_R^2/g^2 + 1/12)``."""
-    gain = np.asarray(conversion_gain, dtype=np.float64)
-    noise = np.asarray(analog_read_noise_e, dtype=np.float64)
-    return np.asarray(np.sqrt((noise / gain) ** 2 + QUANTISATION_VARIANCE))
-
-
-def analog_read_noise(read_noise_dn: ArrayLike, conversion_gain: ArrayLike) -> _Array:
-    """Return sigma_R (e-) without quantisation from sigma (DN); 0 where sigma is below 1/sqrt(12) DN."""
-    gain = np.asarray(conversion_gain, dtype=np.float64)
-    variance = np.asarray(read_noise_dn, dtype=np.float64) ** 2 - QUANTISATION_VARIANCE
-    return np.asarray(gain * np.sqrt(np.where(variance < 0, 0.0, variance)))

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,56 +19,24 @@ from numpy.typing import NDArray
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
-from pchem_pipeline.model.histogram.summaries import CovarianceMaps, frame_statistics
+from pchem_pipeline.model.histogram.summaries import frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, row_frames
-from pchem_pipeline.stages.histogram.counting import CountJob, Emit, StackCounter, TileCounter
+from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import band_bytes, bytes_per_row
 from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
 
 if TYPE_CHECKING:
     from pchem_pipeline.compute.executor import Outcome
     from pchem_pipeline.frames.histogram_files import HistogramInput
-    from pchem_pipeline.model.histogram.settings import HistogramSettings
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["histogram_tile", "run"]
+__all__ = ["run"]
 
 #: samples that one process looks through in a second or so
 _FEW_SAMPLES = 1 << 31
-
-
-def histogram_tile(
-    blocks: Iterable[NDArray[Any]],
-    shape: tuple[int, int],
-    bins: int,
-    n_frames: int,
-    settings: HistogramSettings,
-    emit: Emit | None = None,
-) -> tuple[RowHistograms, CovarianceMaps | None]:
-    """Return histograms and covariances of the pixels of some rows.
-
-    Args:
-        blocks: all frames, (frame, y, x) each; the first of ``window_frames``, further ones of any length.
-        shape: rows (from the top of a group of rows) and columns.
-        bins: bins of a pixel.
-        n_frames: number of frames.
-        settings: the section ``histogram``.
-        emit: told of each piece of the arrays along time as it comes: the variable's name in the group
-            ``summary``, and its next rows (first axis: frame or block).
-
-    Returns:
-        The histograms, and the covariances, or None without summaries.
-
-    Raises:
-        InputError: DN of more than 24 bits.
-    """
-    counter = TileCounter(shape, bins, n_frames, settings, emit)
-    for frames in blocks:
-        counter.add(frames)
-    return counter.finish()
 
 
 # -- the stage ----------------------------------------------------------------------------------

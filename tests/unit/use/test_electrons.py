@@ -1,5 +1,7 @@
 """Frames in electrons: the two parts of the error are what frames scatter by."""
 
+from dataclasses import replace
+
 import numpy as np
 from helpers.known_camera import KnownCamera
 
@@ -56,7 +58,7 @@ def test_offsets_of_rows_and_columns_are_taken_away():
 
 def test_noise_of_effects_is_part_of_the_error():
     calibration = KnownCamera.drawn(np.random.default_rng(43), (2, 2)).calibration()
-    wide = read_stderr(calibration.with_law(SampleLaw().with_variance(dn2=4.0)))
+    wide = read_stderr(replace(calibration, law=SampleLaw().with_variance(dn2=4.0)))
     gain = calibration.conversion_gain
     np.testing.assert_allclose(wide**2, read_stderr(calibration) ** 2 + 4.0 * gain**2)
 

@@ -1,5 +1,7 @@
 """Exposure of frames of known pixels: pulls N(0, 1), and as precise as the samples allow."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.known_camera import KnownCamera
@@ -79,7 +81,7 @@ def test_an_effect_of_the_law_is_in_the_estimate():
     frames = np.rint(camera.bias + (electrons + noise) / camera.gain).astype(np.uint16)
     histograms = histogram_frames(frames)
     law = SampleLaw().with_exposures([0.2, 0.8], [2.0, 0.75])
-    own = camera.calibration().with_law(law)
+    own = replace(camera.calibration(), law=law)
     found = estimate_exposure(histograms.counts, histograms.origin, own)
     plain = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
     assert np.median(found.counting) > 1.05 * np.median(plain.counting)
@@ -107,7 +109,7 @@ def test_samples_at_the_top_of_the_adc_are_taken_as_a_limit():
     _, frames = camera.frames(rng, 4.0, N_FRAMES)
     frames = np.minimum(frames, 63)  # 6 bits: more than 4.3 e- are cut
     histograms = histogram_frames(frames)
-    censored = camera.calibration().with_law(SampleLaw().with_clip(0, 63))
+    censored = replace(camera.calibration(), law=SampleLaw().with_clip(0, 63))
     found = estimate_exposure(histograms.counts, histograms.origin, censored)
     z = pulls(found, 4.0, found.stderr)
     assert abs(z.mean()) < 5 / np.sqrt(N) + 0.05
