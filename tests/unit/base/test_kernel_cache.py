@@ -114,7 +114,7 @@ def test_where_nothing_can_be_written_kernels_are_compiled_each_time(sample):
 def test_the_state_of_a_source_is_that_of_all_that_it_imports():
     found = {}
     kernel_cache._collect(electrons_numba.__name__, {"pchem_pipeline"}, found)
-    assert {"pchem_pipeline.model.ensemble.ensemble_numba", "pchem_pipeline.base.kernel"} <= found.keys()
+    assert {"pchem_pipeline.model.law.cells_numba", "pchem_pipeline.base.kernel"} <= found.keys()
     assert not any(name.startswith(("pchem_pipeline.store", "pchem_pipeline.stages")) for name in found)
 
 
