@@ -9,6 +9,7 @@ histograms they enter the exact likelihood (:mod:`.by_likelihood`). Each way is 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from pchem_pipeline.discrepancy.where import locate
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["Explainer", "search"]
+__all__ = ["Explainer", "search", "silent"]
 
 Explanation = TypeVar("Explanation")
 
@@ -94,12 +95,24 @@ class Explainer(Protocol[Explanation]):
         ...
 
 
-def search(by: Explainer[Explanation]) -> Discrepancy:
-    """Find where data disagree with the fitted model, name the effects, and add them to the model."""
+def silent(_: str) -> None:
+    """Tell nobody."""
+
+
+def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> Discrepancy:
+    """Find where data disagree with the fitted model, name the effects, and add them to the model.
+
+    Args:
+        by: tells effects apart.
+        tell: hears what is done next.
+    """
     significance = by.settings.significance
     present = by.model
+    tell("splitting the samples and looking at each part")
     evidence, examined = by.split()
+    tell("drawing the fitted model")
     first, z = by.null()
+    tell("measuring the gap of the model")
     before = by.gap(first, z)
     places = locate(evidence, first, z.both, significance)
     null, rounds = first, 0
@@ -107,15 +120,21 @@ def search(by: Explainer[Explanation]) -> Discrepancy:
     still = disagrees(null, z, significance)
     wanted = still or (not doubt and by.suspects(null, z))
     while wanted and rounds < by.most_rounds:
+        tell("comparing candidates")
         explanation = by.explain(null, z, still)
+        if explanation is not None:
+            tell("fitting the pixels with the likeliest effects")
         extended = None if explanation is None else by.add(explanation, null, z)
         if extended is None:
             break
         null, rounds = extended, rounds + 1
         wanted = still = disagrees(null, z, significance, by.tolerance())
+    if still:
+        tell("measuring what no effect explains")
     described = by.describe(before, null, z) if still else None
     if described is not None:
         null, still = described, disagrees(described, z, significance, by.tolerance())
+    tell("measuring the gap that is left, with effects and with rivals")
     added = by.close(before, null, z, still)
     found = Findings(by.samples, z, first, null, before, places, still, added, doubt)
     model = found.model(present, by.model)

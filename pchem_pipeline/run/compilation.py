@@ -121,10 +121,14 @@ def announced(reporter: Reporter, stage: str) -> Iterator[None]:
                 f"{stage}: compiling kernels{about}, once after an installation or a change of them"
             )
         share = min(sum(seconds) / total, 1.0) if total else None
+        reporter.compiling(sum(seconds), max(total - sum(seconds), 0.0))
         reporter.event("compiling", stage=stage, kernel=kernel, seconds=took, share=share)
 
-    with listening(listener):
-        yield
+    try:
+        with listening(listener):
+            yield
+    finally:
+        reporter.compiling(0.0, 0.0)
     if seconds:
         reporter.info(f"{stage}: {len(seconds)} kernels compiled in {sum(seconds):.0f} s")
         _remember(stage, len(seconds), sum(seconds))

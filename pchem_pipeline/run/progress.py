@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +19,9 @@ from pchem_pipeline.store.progress_file import ProgressFile
 __all__ = ["Advance", "Reporter", "paced"]
 
 ProgressMode = Literal["auto", "on", "off"]
+
+#: Seconds of silence after which a phase says that it is still at work.
+_SILENCE = 20.0
 
 
 class Advance(Protocol):
@@ -69,6 +73,9 @@ class Reporter:
         self._disable = {"auto": None, "on": False, "off": True}[progress] if not quiet else True
         self._quiet = quiet
         self._log: TextIO | None = None
+        self._lock = threading.Lock()
+        self._told = time.monotonic()
+        self._compiled, self._to_compile = 0.0, 0.0
         if log is not None:
             try:
                 self._log = log.open("a", encoding="utf-8")
@@ -90,12 +97,56 @@ class Reporter:
         """Write one JSON line to the log file, if there is one."""
         if self._log is not None:
             stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
+            line = json.dumps({"time": stamp, "event": kind, **fields}, default=str) + "\n"
             try:
-                self._log.write(json.dumps({"time": stamp, "event": kind, **fields}, default=str) + "\n")
-                self._log.flush()
+                with self._lock:
+                    self._log.write(line)
+                    self._log.flush()
             except OSError as error:  # it is no result
                 self._end_log()
                 self._line(f"warning: --log-json ends here: {error.strerror or error}")
+
+    def compiling(self, spent: float, left: float) -> None:
+        """Hear how long kernels were compiled so far, and about how long they will be: no work is done then.
+
+        Args:
+            spent: s, of this stage.
+            left: s; 0 where it is not known.
+        """
+        self._compiled, self._to_compile = spent, left
+
+    @contextmanager
+    def phases(self, stage: str) -> Iterator[Callable[[str], None]]:
+        """Yield a function that names what a stage does next; one that is silent for long is named again."""
+        ended = threading.Event()
+        phase, began = "", time.monotonic()
+
+        def show(kind: str, more: str = "") -> None:
+            self._told = time.monotonic()
+            elapsed = self._told - began
+            if not self._quiet:
+                self._line(f"{stage}: {phase}{more}")
+            self.event(kind, stage=stage, phase=phase, elapsed=round(elapsed, 3))
+            if self._file is not None:
+                self._file.show({"stage": f"{stage}: {phase}", "elapsed": round(elapsed, 3)})
+
+        def tell(words: str) -> None:
+            nonlocal phase, began
+            phase, began = words, time.monotonic()
+            show("phase")
+
+        def watch() -> None:
+            while not ended.wait(1.0):
+                if phase and time.monotonic() - self._told > _SILENCE:
+                    show("still", f", {time.monotonic() - began:.0f} s so far")
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield tell
+        finally:
+            ended.set()
+            watcher.join()
 
     @contextmanager
     def progress(
@@ -120,12 +171,17 @@ class Reporter:
             file=sys.stderr,
             leave=False,
         ) as bar:
-            count, start, last = done, time.monotonic(), -1.0
+            count, start, last, compiled = done, time.monotonic(), -1.0, self._compiled
 
             def tell() -> None:
                 nonlocal last
-                last = time.monotonic()
-                pace = paced(label, unit, count, total, count - done, last - start)
+                last = self._told = time.monotonic()
+                worked = max(last - start - (self._compiled - compiled), 1e-3)
+                pace = paced(label, unit, count, total, count - done, worked)
+                if pace["remaining"] is not None:
+                    pace["remaining"] = round(pace["remaining"] + self._to_compile, 3)
+                left = f"about {self._to_compile:.0f} s to compile" if self._to_compile > 1 else ""
+                bar.set_postfix_str(left, refresh=False)
                 self.event("progress", **pace)
                 if self._file is not None:
                     self._file.show(pace)
@@ -155,4 +211,5 @@ class Reporter:
     def _line(self, message: str) -> None:
         from tqdm import tqdm
 
+        self._told = time.monotonic()
         tqdm.write(message, file=sys.stderr)

@@ -7,7 +7,7 @@ histograms (:mod:`pchem_pipeline.model.fit.shared`), so that no simulation is ne
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.skeleton import search
+from pchem_pipeline.discrepancy.skeleton import search, silent
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.framework.effect import Effect
@@ -73,6 +73,7 @@ def find_in_histograms(
     *,
     model: Sequence[Effect] = (),
     width: int | None = None,
+    tell: Callable[[str], None] = silent,
 ) -> Discrepancy:
     """Find where histograms disagree with the fitted model, name the effects, and add them.
 
@@ -84,6 +85,7 @@ def find_in_histograms(
         settings: the section ``discrepancy``; the defaults if None.
         model: effects that the model has already; none of them is added again.
         width: pixels in a row of the sensor; None: it has one row.
+        tell: hears what is done next.
 
     Returns:
         The verdict, with everything that supports it.
@@ -94,7 +96,8 @@ def find_in_histograms(
         ConfigError: a candidate is unknown.
     """
     _check(samples)
-    found = search(HistogramExplainer(tuple(samples), settings or DiscrepancySettings(), tuple(model)))
+    explainer = HistogramExplainer(tuple(samples), settings or DiscrepancySettings(), tuple(model))
+    found = search(explainer, tell)
     n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n
     shape = n // row, row

@@ -8,7 +8,7 @@ anything; what it does not show at all is not named.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -51,7 +51,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import EXACT
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.skeleton import search
+from pchem_pipeline.discrepancy.skeleton import search, silent
 from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
@@ -88,6 +88,7 @@ def find_discrepancies(
     model: Sequence[Effect] = (),
     mapper: Mapper = serial,
     window: SensorWindow | None = None,
+    tell: Callable[[str], None] = silent,
 ) -> Discrepancy:
     """Find where frames disagree with the fitted model, name the effects, and add them.
 
@@ -101,6 +102,7 @@ def find_discrepancies(
         model: effects that the model has already; none of them is added again.
         mapper: runs the simulated stacks; None of the answers depends on how.
         window: of the sensor that the frames are; None: all of it.
+        tell: hears what is done next.
 
     Returns:
         The verdict, with everything that supports it.
@@ -117,7 +119,7 @@ def find_discrepancies(
         bit_depth = min(int(stack.max()).bit_length() + 1, 24)
     frames = FrameStack(stack, numbers, splits, n_run or int(numbers[-1]) + 1, bit_depth, integration_time)
     frames = replace(frames, window=window)
-    return search(FrameExplainer(frames, settings, tuple(model), mapper))
+    return search(FrameExplainer(frames, settings, tuple(model), mapper), tell)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ leaves its statistics in its marker, so that a stopped search goes on where it w
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
@@ -55,13 +55,21 @@ def run(context: StageContext) -> None:
         InputError: the frames are too few, or there are none.
         StoreError: the store refuses.
     """
+    sensor, (before, roi) = context.sensor, _start(context)
+    with context.reporter.phases(_STAGE) as tell:
+        if sensor.kind == "frames":
+            _run_frames(context, before, roi, tell)
+        else:
+            _run_histograms(context, before, tell)
+
+
+def _run_frames(
+    context: StageContext, before: Sequence[Effect], roi: tuple[int, ...] | None, tell: Callable[[str], None]
+) -> None:
     settings, sensor = context.config.discrepancy, context.sensor
-    before, roi = _start(context)
-    if sensor.kind != "frames":
-        _run_histograms(context, before)
-        return
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
+    tell("looking at every pixel and every frame")
     seen = survey(context, source, settings.max_samples)
     window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi, seen.places)
     found = find_discrepancies(
@@ -74,6 +82,7 @@ def run(context: StageContext) -> None:
         model=before,
         mapper=_Mapper(context),
         window=SensorWindow(window.rows, window.columns, (source.shape[1], source.shape[2])),
+        tell=tell,
     )
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
     found = replace(found, verdict=seen.told(verdict, window.share(source.shape)))
@@ -88,10 +97,12 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
     return (context.model if model is None else model).effects, tuple(roi) or None
 
 
-def _run_histograms(context: StageContext, before: Sequence[Effect]) -> None:
+def _run_histograms(context: StageContext, before: Sequence[Effect], tell: Callable[[str], None]) -> None:
     """Do the same with ready-made histograms, or with those of several samples together, in one unit."""
     samples = _samples(context) if context.sensor.samples else [_histograms(context.store)]
-    found = find_in_histograms(samples, context.config.discrepancy, width=context.sensor.nx, model=before)
+    found = find_in_histograms(
+        samples, context.config.discrepancy, width=context.sensor.nx, model=before, tell=tell
+    )
     _write(context, found)
     context.run_units([WHOLE], _nothing_left, by_tiles=False)
 

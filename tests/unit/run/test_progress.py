@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,41 @@ def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
     assert (first["done"], first["rate"], first["remaining"]) == (1, None, None)
     assert (last["done"], last["total"], last["unit"], last["remaining"]) == (4, 4, "tile", 0.0)
     assert last["rate"] > 100
+
+
+def test_what_is_still_to_compile_is_part_of_the_remaining_time(tmp_path: Path) -> None:
+    reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
+    with reporter.progress("fit", 1000, "tile") as advance:
+        reporter.compiling(5.0, 300.0)
+        for _ in range(1000):
+            advance()
+    reporter.close()
+    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    assert events[-1]["remaining"] == 300.0
+
+
+def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pchem_pipeline.run.progress._SILENCE", 0.5)
+    store = tmp_path / "run.zarr"
+    (store / ".pchem").mkdir(parents=True)
+    reporter = Reporter("off", log=tmp_path / "run.log", progress_file=ProgressFile(store))
+    with reporter.phases("discrepancy") as tell:
+        tell("drawing the fitted model")
+        tell("comparing candidates")
+        time.sleep(2.3)
+        seen = read_progress(store)
+        assert seen is not None
+        assert seen["stage"] == "discrepancy: comparing candidates"
+    reporter.close()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["discrepancy: drawing the fitted model", "discrepancy: comparing candidates"]
+    assert lines[2:]
+    assert all(line.startswith("discrepancy: comparing candidates, ") for line in lines[2:])
+    assert lines[-1].endswith(" s so far")
+    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    assert [event["event"] for event in events[:3]] == ["phase", "phase", "still"]
 
 
 def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str]) -> None:
