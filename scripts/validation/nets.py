@@ -45,6 +45,7 @@ RENAMED: Mapping[str, tuple[str, ...]] = {
     "joint/": ("samples/", "fit/", "maps/"),
     "fit/lobe_": ("fit/satellite_",),
     "discrepancy/code_grown": ("discrepancy/code_extended",),
+    "maps/dark_current": ("maps/charge_rate",),
 }
 #: Not compared: what a kill-safe run notes for itself, and how many steps a fit took.
 NO_RESULT = ("n_iterations", "ensemble_tiles/", "summary/open_")
@@ -369,6 +370,11 @@ class Comparison:
             with np.errstate(invalid="ignore"):
                 lower = change < -LOWER * np.abs(old[name])
                 rose = change > HIGHER
+            nothing = lower & np.isnan(old["maps/bias"]) & np.isnan(new["maps/bias"])
+            if nothing.any():
+                words = f"lower in {int(nothing.sum())} pixels without a value before and after"
+                self.say(f"{run}:{name}", f"{words}: {places(nothing)}")
+            lower &= ~nothing
             if lower.any():
                 worst = np.nanmin(change)
                 words = f"lower in {int(lower.sum())} pixels, by up to {-worst:.3g} nats: {places(lower)}"

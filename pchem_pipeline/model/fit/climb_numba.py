@@ -53,6 +53,7 @@ CONVERGED = 0
 NOT_CONVERGED = 1
 DEGENERATE = 2  # ran towards one Gaussian: g to infinity, or an empty second peak
 FAR_BELOW = 3  # given up: too far below the likelihood to beat
+_GOING, _AT_KNOWN = 4, 5  # within a climb: not there yet; heading for the maximum that is known
 
 
 MIN_LOG_VARIANCE = math.log(QUANTISATION_VARIANCE)
@@ -317,6 +318,41 @@ def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
         block[SCORE, step] += slope * block[SCORE, noise]
 
 
+@kernel(inline=True)
+def _tie_of(
+    theta: FloatArray, goal: Goal, flags: NDArray[np.bool_], limits: Limits, rounding: float
+) -> float:
+    """Return the variance of rounding with which sigma moves with 1/g; negative where it does not."""
+    noise = theta.size - N_BLOCK + 1 + LOG_VARIANCE
+    if flags[HELD, noise] and not flags[FIXED, noise]:  # at its floor, which moves with 1/g
+        return 0.0 if floor_in_electrons(theta[noise - LOG_VARIANCE + STEP], limits.cells) else -1.0
+    return rounding if goal.tied else -1.0
+
+
+@kernel(inline=True)
+def _end_of(
+    theta: FloatArray, known: FloatArray, loglik: float, rise: float, limits: Limits, goal: Goal
+) -> int:
+    """Tell how a climb ends whose next step is Newton's own, or that it goes on."""
+    if rise < limits.tolerance:
+        return CONVERGED
+    if loglik + 2.0 * rise + 1.0 < goal.to_beat:
+        return FAR_BELOW
+    if loglik + rise > goal.known - 1.0 and same_place(known, theta, limits.cells):
+        return _AT_KNOWN
+    return _GOING
+
+
+@kernel(inline=True)
+def _damping_after(risen: float, expected: float, rise: float, share: float) -> float:
+    """Return the share of the damping matrix for the step after one that rose by so much."""
+    if risen > 0.75 * expected:
+        return 0.1 * share if share > 10.0 * _LEAST_SHARE else 0.0
+    if risen < 0.25 * expected and rise > 1e-3:
+        return max(4.0 * share, _LEAST_SHARE)
+    return share
+
+
 def climb(
     pixel: Pixel,
     evaluate: Any,
@@ -343,9 +379,9 @@ def climb(
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
         that is trusted), number of evaluations.
     """
-    trial, step, noise = scratch.small[TRIAL], scratch.small[STEPS], theta.size - N_BLOCK + 1 + LOG_VARIANCE
+    trial, step = scratch.small[TRIAL], scratch.small[STEPS]
     rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
-    at, ahead, held = scratch.evaluations[AT], scratch.evaluations[AHEAD], scratch.flags[HELD]
+    at, ahead, flags = scratch.evaluations[AT], scratch.evaluations[AHEAD], scratch.flags
     keep_inside(theta, limits)
     if not sensible(theta, pixel.longest_step, limits.cells):
         return DEGENERATE, -math.inf, 0
@@ -355,10 +391,8 @@ def climb(
     used, damping, fresh = 1, 0.0, limits.most > 0
     least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
     while used < limits.most:
-        find_held(theta, at, scratch.flags[FIXED], limits, held)
-        tied = rounding if goal.tied else -1.0
-        if held[noise] and not scratch.flags[FIXED, noise]:  # at its floor, which moves with 1/g
-            tied = 0.0 if floor_in_electrons(theta[noise - LOG_VARIANCE + STEP], limits.cells) else -1.0
+        find_held(theta, at, flags[FIXED], limits, flags[HELD])
+        tied = _tie_of(theta, goal, flags, limits, rounding)
         if tied >= 0.0 and fresh:
             tie_noise(theta, at, tied)
         fresh = False
@@ -368,16 +402,14 @@ def climb(
         if damping > 0.0 and rise < limits.tolerance:
             damping = 0.0  # only Newton's own step says that it has arrived
             continue
-        if share == 0.0 and rise < limits.tolerance:
-            if not only_em:
-                copy(theta, trial)
-                _take_step(trial, step, tied, limits, theta)
-                loglik += rise
-            return CONVERGED, loglik, used
-        if share == 0.0 and loglik + 2.0 * rise + 1.0 < goal.to_beat:
-            return FAR_BELOW, loglik + rise, used
-        if share == 0.0 and loglik + rise > goal.known - 1.0 and same_place(known, theta, limits.cells):
-            return CONVERGED, goal.known, used
+        end = _end_of(theta, known, loglik, rise, limits, goal) if share == 0.0 else _GOING
+        if end == CONVERGED and not only_em:
+            copy(theta, trial)
+            _take_step(trial, step, tied, limits, theta)
+            loglik += rise
+        if end != _GOING:
+            reached = goal.known if end == _AT_KNOWN else loglik + rise if end == FAR_BELOW else loglik
+            return (CONVERGED if end == _AT_KNOWN else end), reached, used
         newton = limits.cells or goal.tied or (not only_em and used > warm_up and share <= _LARGEST_SHARE)
         factor = 1.0
         if newton:
@@ -390,7 +422,6 @@ def climb(
             used += 1
         elif not limits.cells:
             return DEGENERATE, loglik, used
-        expected = (2.0 * factor - factor * factor) * rise
         if newton and not risen >= loglik - 1e-11 * abs(loglik):
             damping = max(4.0 * share, _REFUSED_CELLS if limits.cells else _REFUSED)
             if damping > _MOST_SHARE:
@@ -398,14 +429,8 @@ def climb(
             continue
         if not math.isfinite(risen):
             return NOT_CONVERGED, loglik, used
-        fresh = True
-        if risen - loglik > 0.75 * expected:
-            damping = 0.1 * share if share > 10.0 * _LEAST_SHARE else 0.0
-        elif risen - loglik < 0.25 * expected and rise > 1e-3:
-            damping = max(4.0 * share, _LEAST_SHARE)
-        else:
-            damping = share
+        damping = _damping_after(risen - loglik, (2.0 * factor - factor * factor) * rise, rise, share)
         copy(trial, theta)
         copy_evaluation(ahead, at)
-        loglik = risen
+        loglik, fresh = risen, True
     return NOT_CONVERGED, loglik, used

@@ -12,10 +12,13 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, Limits, min_log_variance
+from pchem_pipeline.model.fit.search_numba import Tools, climb_on
 from pchem_pipeline.model.fit.tile_numba import Histograms, load_pixel, make_room, theta_of
 from pchem_pipeline.model.law.cells_numba import Law, resolve
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
+    BIAS,
+    DARK,
     FIXED,
     HELD,
     HERE,
@@ -26,7 +29,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     SATELLITE,
     STEP,
     Pixel,
-    Scratch,
     copy,
     make_scratch,
 )
@@ -51,13 +53,16 @@ def _set(
         theta[noise] = math.log(max(math.exp(own) * theta[step] ** 2 - rounding, 1e-12))
 
 
+@kernel(inline=True)
+def _of_profile(tied: bool) -> Goal:
+    """Return the goal of a climb with a parameter fixed; tied: the read noise in e-."""
+    return Goal(np.bool_(False), -math.inf, math.inf, tied)
+
+
 @kernel
 def _end(
     pixel: Pixel,
-    evaluate: Any,
-    climb: Any,
-    limits: Limits,
-    scratch: Scratch,
+    tools: Tools,
     best: FloatArray,
     top: float,
     place: int,
@@ -71,10 +76,7 @@ def _end(
 
     Args:
         pixel: its samples.
-        evaluate: the likelihood.
-        climb: on it.
-        limits: bounds and limits.
-        scratch: room to work in, with the parameters that stay.
+        tools: likelihood and climb; its scratch holds the parameters that stay.
         best: theta at the maximum.
         top: log-likelihood there.
         place: of the parameter in theta.
@@ -85,8 +87,9 @@ def _end(
     Returns:
         Whether there is such an end.
     """
+    limits, scratch = tools.limits, tools.scratch
     theta, good = scratch.small[HERE], scratch.small[OTHER]
-    goal = Goal(np.bool_(False), -math.inf, math.inf, tied)
+    goal = _of_profile(tied)
     rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
     n = theta.size - N_SHARED
     copy(best, good)
@@ -98,7 +101,7 @@ def _end(
         drop = math.inf
         low = min_log_variance(theta[n + STEP], limits.cells) if place == n + LOG_VARIANCE else limits.bound
         if theta[n + STEP] > 0.0 and (place == n + STEP or place == n + 1 or wanted >= low):
-            outcome, loglik, _ = climb(pixel, evaluate, limits, goal, theta, theta, scratch)
+            outcome, loglik, _ = climb_on(pixel, tools, goal, theta, theta)
             if outcome == CONVERGED and (tied or theta[place] == wanted):
                 drop = math.sqrt(max(0.0, 2.0 * (top - loglik)))
         if abs(drop - root) < _CLOSE * root:
@@ -120,6 +123,65 @@ def _end(
         if outside - inside < 1e-7 * root:
             return above < math.inf
     return False
+
+
+@kernel(inline=True)
+def _maximum(
+    pixel: Pixel, tools: Tools, weight: float, best: FloatArray, covariance: FloatArray
+) -> tuple[bool, float]:
+    """Climb to the maximum near a fit, with free satellites of that weight; fill the covariance there.
+
+    Returns:
+        Whether there is one, and its log-likelihood.
+    """
+    n, fixed = pixel.facts.shape[0], tools.scratch.flags[FIXED]
+    rounding = QUANTISATION_VARIANCE if tools.limits.cells else 0.0
+    best[n + LOG_VARIANCE] = math.log(max(math.exp(best[n + LOG_VARIANCE]) - rounding, 1e-12))
+    best[n + SATELLITE] = weight
+    for i in range(best.size):
+        fixed[i] = i < n and pixel.facts[min(i, n - 1), DARK] > 0.0
+    fixed[n + SATELLITE] = not weight > 0.0
+    outcome, top, _ = climb_on(pixel, tools, _of_profile(np.bool_(False)), best, best)
+    at, held = tools.scratch.evaluations[AT], tools.scratch.flags[HELD]
+    return outcome == CONVERGED and invert_arrow(at, best, held, covariance), top
+
+
+@kernel(inline=True)
+def _direction(
+    target: int, best: FloatArray, covariance: FloatArray, rounding: float, direction: FloatArray
+) -> None:
+    """Fill the change of all coordinates per standard error of a parameter; the last is ``sigma g``."""
+    size = best.size
+    n = size - N_SHARED
+    tied, place = target == n + 3, min(target, n + LOG_VARIANCE)
+    slope = 1.0 / (1.0 + rounding * math.exp(-best[n + LOG_VARIANCE]))
+    for i in range(size):
+        direction[i] = covariance[i, place]
+        if tied:
+            direction[i] = slope * direction[i] - 2.0 / best[n + STEP] * covariance[i, n + STEP]
+    if tied:
+        direction[place] = slope * direction[place] - 2.0 / best[n + STEP] * direction[n + STEP]
+    sd = math.sqrt(direction[place])
+    for i in range(size):
+        direction[i] /= sd
+        if i < n:
+            direction[i] *= math.exp(-best[i])  # of log H
+
+
+@kernel(inline=True)
+def _value_at(end: FloatArray, target: int, centre: int, rounding: float) -> float:
+    """Return a parameter at an end of its interval, in its own unit; 1/g for the gain."""
+    n = end.size - N_SHARED
+    place = min(target, n + LOG_VARIANCE)
+    value: float = end[place]
+    if place < n:
+        value = math.exp(value)
+    elif place == n + BIAS:
+        value += centre
+    elif place == n + LOG_VARIANCE:
+        value = math.sqrt(math.exp(value) + rounding)
+        value = value / end[n + STEP] if target == n + 3 else value
+    return value
 
 
 @kernel
@@ -152,59 +214,31 @@ def profile_tile(
     size = n + N_SHARED
     room = make_room(given, law)
     scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
-    fixed, at, best = scratch.flags[FIXED], scratch.evaluations[AT], scratch.small[KEPT_STARTS]
-    direction, covariance = np.empty(size), np.empty((size, size))
+    tools = Tools(limits, evaluate, climb, np.empty((0, 0)), scratch)
+    best, direction, covariance = scratch.small[KEPT_STARTS], np.empty(size), np.empty((size, size))
     rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
-    goal = Goal(np.bool_(False), -math.inf, math.inf, np.bool_(False))
     for index in range(given.counts.shape[0]):
         pixel = load_pixel(given, index, room)
         if not theta_of(parameters[index], pixel, limits, best):
             continue
-        best[n + LOG_VARIANCE] = math.log(max(math.exp(best[n + LOG_VARIANCE]) - rounding, 1e-12))
-        best[n + SATELLITE] = satellites[index, 1]
         if limits.cells:
             resolve(law, index, satellites[index, 0], pixel)
-        for j in range(n):
-            fixed[j] = given.dark[j]
-        for i in range(n, size):
-            fixed[i] = False
-        fixed[n + SATELLITE] = not satellites[index, 1] > 0.0
-        outcome, top, _ = climb(pixel, evaluate, limits, goal, best, best, scratch)
+        found, top = _maximum(pixel, tools, satellites[index, 1], best, covariance)
         held = scratch.flags[HELD].copy()
-        if outcome != CONVERGED or not invert_arrow(at, best, held, covariance):
-            continue
-        slope = 1.0 / (1.0 + rounding * math.exp(-best[n + LOG_VARIANCE]))
-        for target in range(size):
-            tied = target == n + 3
-            place = min(target, n + LOG_VARIANCE)
+        for target in range(size if found else 0):
+            tied, place = target == n + 3, min(target, n + LOG_VARIANCE)
             if held[place]:
                 continue
-            for i in range(size):
-                direction[i] = covariance[i, place]
-                if tied:
-                    direction[i] = slope * direction[i] - 2.0 / best[n + STEP] * covariance[i, n + STEP]
-            if tied:
-                direction[place] = slope * direction[place] - 2.0 / best[n + STEP] * direction[n + STEP]
-            sd = math.sqrt(direction[place])
-            for i in range(size):
-                direction[i] /= sd
-                if i < n:
-                    direction[i] *= math.exp(-best[i])  # of log H
-            fixed[place] = True
+            _direction(target, best, covariance, rounding, direction)
+            scratch.flags[FIXED, place] = True
             for side in range(2):
                 for i in range(size):
                     direction[i] = -direction[i]
-                if not _end(pixel, evaluate, climb, limits, scratch, best, top, place, tied, root, direction):
+                if not _end(pixel, tools, best, top, place, tied, root, direction):
                     continue
-                end = scratch.small[HERE]
-                value = math.exp(end[place]) if place < n else end[place]
+                value = _value_at(scratch.small[HERE], target, pixel.centre, rounding)
                 if place == n + STEP:
                     out[index, target, 1 - side] = 1.0 / value  # a larger step is a smaller gain
-                    continue
-                if place == n + 1:
-                    value += pixel.centre
-                if place == n + LOG_VARIANCE:
-                    value = math.sqrt(math.exp(value) + rounding)
-                    value = value / end[n + STEP] if tied else value
-                out[index, target, side] = value
-            fixed[place] = False
+                else:
+                    out[index, target, side] = value
+            scratch.flags[FIXED, place] = False
