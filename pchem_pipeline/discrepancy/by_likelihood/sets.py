@@ -289,6 +289,9 @@ class SetComparison:
 
 def _one_step(information: FloatArray, score: FloatArray, n_own: int) -> tuple[float, float]:
     """Return the rise that the last parameter (shared) promises, the pixels' own free, and its step."""
+    # a pixel none of whose samples count says nothing
+    some = np.einsum("naa->n", information[:, :n_own, :n_own]) > 0.0
+    information, score = information[some], score[some]
     own = information[:, :n_own, :n_own]
     own = own + 1e-9 * np.einsum("naa->na", own)[:, :, None] * np.eye(n_own)
     through = np.linalg.solve(own, information[:, :n_own, -1:])[:, :, 0]
