@@ -24,6 +24,7 @@ FloatArray = NDArray[np.float64]
 #: Why effects in time and space cannot be looked for.
 NO_ORDER = "ready-made histograms hold no order in time and no neighbours"
 _SAME_LAW = "it leaves the law of a single pixel's samples as it is, or only widens its read noise"
+_FEW_PIXELS = "it is told from the peaks of a histogram only by many pixels of different bias"
 _FAMILIES = ("shape", "code", "tail")  # of statistics that histograms have
 _MOST_EXTRA = 2
 _MOST_STARTS = 6  # of one effect
@@ -205,6 +206,9 @@ def find_members(
             continue
         if effect.signature and effect.signature[0].partition(".")[0] not in _FAMILIES:
             untestable[tag] = NO_ORDER
+            continue
+        if effect.rough_law:
+            untestable[tag] = _FEW_PIXELS
             continue
         # whatever a stranger's effect raises must not stop the others
         try:

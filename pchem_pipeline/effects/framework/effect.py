@@ -73,6 +73,8 @@ class Effect(Section):
         erratic: whether its time profile is drawn anew in every simulation, so that a fingerprint is one of
             many and another effect outdoes it only by a clear margin.
         untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
+        rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
+            of a few pixels do not tell whether they have the effect.
         measured_only: whether it is no hypothesis, but what is measured where all of those have failed.
     """
 
@@ -86,6 +88,7 @@ class Effect(Section):
     separate: ClassVar[Mapping[str, str]] = {}
     erratic: ClassVar[bool] = False
     untestable: ClassVar[str] = ""
+    rough_law: ClassVar[bool] = False
     measured_only: ClassVar[bool] = False
     region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
     when: When | None = Field(default=None, description="in which frames it acts; null: in all")

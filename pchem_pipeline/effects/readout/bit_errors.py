@@ -56,6 +56,7 @@ class BitErrors(Effect):
         "shape.goodness.mean",
     )
     strength: ClassVar[str] = "share"
+    rough_law: ClassVar[bool] = True
     separate: ClassVar[Mapping[str, str]] = {
         "adc_dnl": "a ramp of light: a wrong bit puts samples far from the ramp, a wrong code width does not",
         "heavy_tailed_noise": "a shifted bias: a bit's errors follow the codes, a noise's the peaks",
