@@ -201,8 +201,9 @@ def _applied() -> list[Variable]:
         ("exposure_stderr_counting", _MAP, "float64", "e-", "its part from the samples"),
         ("exposure_stderr_calibration", _MAP, "float64", "e-", "its part from the calibration"),
         ("quality", _MAP, "uint32", "1", "why a pixel has no value, or deserves caution; 0 is fine"),
-        ("row_offset", ("frame", "y"), "float32", "DN", "offset of the row that was taken from the samples"),
-        ("column_offset", ("frame", "x"), "float32", "DN", "offset of the column, likewise"),
+        ("row_offset", ("frame", "part", "y"), "float32", "DN", "offset of the row that was taken"),
+        ("column_offset", ("frame", "part", "x"), "float32", "DN", "offset of the column, likewise"),
+        ("offset_part", ("part", *_MAP), "bool", "1", "pixels that share the offsets of the part"),
         ("noise_before", _MAP, "float64", "e-", "standard deviation over the frames as they came"),
         ("noise_after", _MAP, "float64", "e-", "standard deviation without the offsets"),
     ]

@@ -1,9 +1,12 @@
-"""Offsets that pixels of a frame, a row or a column share: which a model names, and what they were."""
+"""Offsets that pixels of a frame, a row or a column share, all of them or those of a part of the sensor.
+
+Which a model names, and what they were in some frames.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +19,7 @@ from pchem_pipeline.use.calibration import Calibration
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["CommonModes", "Offsets", "estimate_offsets", "scene_of"]
+__all__ = ["CommonModes", "Offsets", "estimate_offsets", "offsets_of_samples", "scene_of"]
 
 FRAME, ROW, COLUMN = range(3)
 _LEAST_SCENE = 0.02  # e-
@@ -34,36 +37,47 @@ _OFFSETS = (
 
 @dataclass(frozen=True)
 class CommonModes:
-    """Variances of the offsets that a model names, DN^2; 0 where it names none.
+    """The offsets that a model names, by parts of the sensor (all of it, a readout tap, ...) that share them.
 
     Attributes:
         removed: tags of the effects that are taken from the frames.
-        variances: of the offsets of frames, rows and columns.
+        parts: pixels of each part, shape (part, y, x); parts may overlap.
+        variances: of offsets of the frames, rows and columns of each part, DN^2, shape (part, 3); 0: none.
         left: tags of effects on many pixels alike that no offset of a frame, row or column describes.
     """
 
     removed: tuple[str, ...] = ()
-    variances: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    parts: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0, 0), np.bool_))
+    variances: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     left: tuple[str, ...] = ()
 
     @classmethod
-    def of_model(cls, effects: Sequence[Effect]) -> CommonModes:
-        """Return those of the effects of a model."""
-        found = [(effect.tag, *_mode(effect)) for effect in effects]
+    def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
+        """Return those of the effects of a model of a sensor of (rows, columns)."""
+        found = [(effect, *_mode(effect)) for effect in effects]
         # of a tag that is there several times, all or none
-        left = dict.fromkeys(tag for tag, place, _ in found if place is None)
-        variances = [0.0, 0.0, 0.0]
-        for tag, place, variance in found:
-            if place is not None and tag not in left:
-                variances[place] += variance
-        removed = dict.fromkeys(tag for tag, _, _ in found if tag not in left)
-        modes = tuple(tag for tag in left if tag in _OFFSETS)
-        return cls(tuple(removed), (variances[0], variances[1], variances[2]), modes)
+        left = dict.fromkeys(effect.tag for effect, axis, _ in found if axis is None)
+        parts: dict[bytes, NDArray[np.bool_]] = {}
+        variances: dict[bytes, FloatArray] = {}
+        for effect, axis, variance in found:
+            if axis is None or effect.tag in left:
+                continue
+            mask = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
+            key = mask.tobytes()
+            parts[key] = mask
+            variances.setdefault(key, np.zeros(3))[axis] += variance
+        removed = dict.fromkeys(effect.tag for effect, _, _ in found if effect.tag not in left)
+        return cls(
+            tuple(removed),
+            np.array(list(parts.values()), np.bool_).reshape(-1, *shape),
+            np.array(list(variances.values())).reshape(-1, 3),
+            tuple(tag for tag in left if tag in _OFFSETS),
+        )
 
 
 def _mode(effect: Effect) -> tuple[int | None, float]:
     """Return which offset an effect is, and its variance, DN^2; None where it is none."""
-    if effect.region is not None or effect.when is not None:
+    if effect.when is not None:  # other frames are taken at other times
         return None, 0.0
     values: dict[str, Any] = effect.model_dump()
     match effect.tag:
@@ -86,17 +100,35 @@ def _mode(effect: Effect) -> tuple[int | None, float]:
 
 @dataclass(frozen=True)
 class Offsets:
-    """What was found in some frames.
+    """What was found in some frames, for each part of the sensor.
 
     Attributes:
-        rows: offset of each row, that of the frame included, DN, shape (frame, y).
-        columns: offset of each column, DN, shape (frame, x).
-        left: variance of a sample's offset that stays unknown, DN^2, shape (frame,).
+        rows: offset of each row, that of the frame included, DN, shape (frame, part, y).
+        columns: offset of each column, DN, shape (frame, part, x).
+        left: variance of a sample's offset that stays unknown, DN^2, shape (frame, part).
     """
 
     rows: FloatArray
     columns: FloatArray
     left: FloatArray
+
+    def of_samples(self, parts: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Return the offset of each sample, DN, shape (frame, y, x).
+
+        Args:
+            parts: pixels of each part, shape (part, y, x).
+        """
+        return offsets_of_samples(self.rows, self.columns, parts)
+
+
+def offsets_of_samples(
+    rows: NDArray[np.floating[Any]], columns: NDArray[np.floating[Any]], parts: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return the offset of each sample, DN, shape (frame, y, x); see `Offsets`."""
+    out = np.zeros((len(rows), *parts.shape[1:]), np.float32)
+    for part, mask in enumerate(parts):
+        out += mask * (rows[:, part, :, None] + columns[:, part, None, :]).astype(np.float32)
+    return out
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
@@ -128,7 +160,8 @@ def estimate_offsets(
         modes: which offsets there are.
     """
     n, ny, nx = frames.shape
-    rows, columns, left = np.empty((n, ny)), np.empty((n, nx)), np.empty(n)
+    m = len(modes.parts)
+    rows, columns, left = np.empty((n, m, ny)), np.empty((n, m, nx)), np.empty((n, m))
     sigma = np.sqrt(calibration.noise_variance_dn2)
     known = np.where(np.isfinite(sigma), scene, np.nan)
     common_modes_numba.find_offsets(
@@ -137,7 +170,8 @@ def estimate_offsets(
         calibration.conversion_gain,
         calibration.bias,
         sigma,
-        np.array(modes.variances),
+        modes.parts,
+        modes.variances,
         rows,
         columns,
         left,

@@ -13,6 +13,7 @@ from pchem_pipeline.base.kernel import kernel
 __all__ = ["find_offsets"]
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _ROUNDS = 5  # of the expansion in the offsets
 _SWEEPS = 4  # of frame, rows and columns within one
@@ -77,22 +78,62 @@ def _from_electrons(
     gain: FloatArray,
     bias: FloatArray,
     sigma: FloatArray,
-    offsets: tuple[float, FloatArray, FloatArray],
+    offset: FloatArray,
     form: FloatArray,
 ) -> None:
     """Fill the quadratic form of the offsets by the electron numbers of the samples, around some offsets."""
-    whole, row, column = offsets
     for y in range(frame.shape[0]):
         for x in range(frame.shape[1]):
             form[0, y, x] = form[1, y, x] = 0.0
             if math.isnan(exposure[y, x]):
                 continue
-            offset = whole + row[y] + column[x]
             reach = 2 + math.ceil(4.0 * sigma[y, x] * gain[y, x])
-            difference = frame[y, x] - bias[y, x] - offset
+            difference = frame[y, x] - bias[y, x] - offset[y, x]
             score, information = _score(difference, exposure[y, x], gain[y, x], sigma[y, x], reach)
             # the form is that of the offset itself, not of its change
-            form[0, y, x], form[1, y, x] = score + information * offset, information
+            form[0, y, x], form[1, y, x] = score + information * offset[y, x], information
+
+
+@kernel
+def _add(
+    mask: BoolArray, sign: float, whole: float, row: FloatArray, column: FloatArray, out: FloatArray
+) -> None:
+    """Add the offsets of a part of the sensor to those of its samples."""
+    for y in range(mask.shape[0]):
+        for x in range(mask.shape[1]):
+            if mask[y, x]:
+                out[y, x] += sign * (whole + row[y] + column[x])
+
+
+@kernel
+def _of_part(form: FloatArray, mask: BoolArray, offset: FloatArray, out: FloatArray) -> None:
+    """Fill the form of what a part's pixels share, the offsets of all other parts held."""
+    for y in range(mask.shape[0]):
+        for x in range(mask.shape[1]):
+            weight = form[1, y, x] if mask[y, x] else 0.0
+            out[1, y, x] = weight
+            out[0, y, x] = form[0, y, x] - weight * offset[y, x] if mask[y, x] else 0.0
+
+
+@kernel
+def _climb_parts(
+    form: FloatArray,
+    parts: BoolArray,
+    variances: FloatArray,
+    whole: FloatArray,
+    rows: FloatArray,
+    columns: FloatArray,
+    offset: FloatArray,
+    own: FloatArray,
+) -> None:
+    """Bring the offsets of all parts to the top of a quadratic form, part by part."""
+    for _ in range(1 if len(parts) == 1 else _SWEEPS):
+        for part in range(len(parts)):
+            mask, row, column = parts[part], rows[part], columns[part]
+            _add(mask, -1.0, whole[part], row, column, offset)
+            _of_part(form, mask, offset, own)
+            whole[part] = _climb(own, variances[part], whole[part], row, column)
+            _add(mask, 1.0, whole[part], row, column, offset)
 
 
 @kernel
@@ -131,12 +172,34 @@ def _climb_lines(
 
 
 @kernel
+def _unknown(weight: FloatArray, mask: BoolArray, variances: FloatArray) -> float:
+    """Return the variance of a sample's offset after all that is known, DN^2."""
+    ny, nx = mask.shape
+    found = 0.0
+    total, n_rows = 0.0, 0
+    crossed = np.zeros(nx, np.bool_)
+    for y in range(ny):
+        some = False
+        for x in range(nx):
+            if mask[y, x]:
+                total += weight[y, x]
+                some = crossed[x] = True
+        n_rows += some
+    sizes = (1, max(n_rows, 1), max(crossed.sum(), 1))
+    for i in range(3):
+        if variances[i] > 0.0:
+            found += 1.0 / (total / sizes[i] + 1.0 / variances[i])
+    return found
+
+
+@kernel
 def find_offsets(
     frames: NDArray[Any],
     exposure: FloatArray,
     gain: FloatArray,
     bias: FloatArray,
     sigma: FloatArray,
+    parts: BoolArray,
     variances: FloatArray,
     rows: FloatArray,
     columns: FloatArray,
@@ -153,29 +216,25 @@ def find_offsets(
         gain: g, e-/DN, shape (y, x).
         bias: mu, DN, shape (y, x).
         sigma: noise of the pixel alone, DN, shape (y, x).
-        variances: of the offsets of frames, rows and columns, DN^2, shape (3,).
-        rows: out, DN, shape (frame, y).
-        columns: out, DN, shape (frame, x).
-        left: out, variance of a sample's offset after all that is known, DN^2, shape (frame,).
+        parts: pixels that share offsets, shape (part, y, x).
+        variances: of the offsets of frames, rows and columns of each part, DN^2, shape (part, 3).
+        rows: out, DN, shape (frame, part, y).
+        columns: out, DN, shape (frame, part, x).
+        left: out, variance of a sample's offset after all that is known, DN^2, shape (frame, part).
     """
-    n_frames, ny, nx = frames.shape
-    form = np.empty((2, ny, nx))
-    row, column = np.empty(ny), np.empty(nx)
-    sizes = (1, ny, nx)
-    for t in range(n_frames):
-        row[:] = 0.0
-        column[:] = 0.0
+    n_parts, ny, nx = parts.shape
+    form, own, offset = np.empty((2, ny, nx)), np.empty((2, ny, nx)), np.empty((ny, nx))
+    whole = np.empty(n_parts)
+    for t in range(len(frames)):
+        whole[:] = 0.0
+        rows[t] = 0.0
+        columns[t] = 0.0
+        offset[:] = 0.0
         _from_means(frames[t], exposure, gain, bias, sigma, form)
-        whole = _climb(form, variances, 0.0, row, column)
+        _climb_parts(form, parts, variances, whole, rows[t], columns[t], offset, own)
         for _ in range(_ROUNDS - 1):
-            _from_electrons(frames[t], exposure, gain, bias, sigma, (whole, row, column), form)
-            whole = _climb(form, variances, whole, row, column)
-        for y in range(ny):
-            rows[t, y] = whole + row[y]
-        for x in range(nx):
-            columns[t, x] = column[x]
-        total = form[1].sum()
-        left[t] = 0.0
-        for i in range(3):
-            if variances[i] > 0.0:
-                left[t] += 1.0 / (total / sizes[i] + 1.0 / variances[i])
+            _from_electrons(frames[t], exposure, gain, bias, sigma, offset, form)
+            _climb_parts(form, parts, variances, whole, rows[t], columns[t], offset, own)
+        for part in range(n_parts):
+            rows[t, part] += whole[part]
+            left[t, part] = _unknown(form[1], parts[part], variances[part])

@@ -17,14 +17,14 @@ __all__ = ["calibration_variance", "electrons", "read_stderr", "stderr_at"]
 def electrons(
     frames: NDArray[np.unsignedinteger[Any]],
     calibration: Calibration,
-    offsets: tuple[FloatArray, FloatArray] | None = None,
+    offsets: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """Return ``g (x - mu)``, less the offsets of rows and columns of each frame.
+    """Return ``g (x - mu)``, less the offsets that frames, rows and columns share.
 
     Args:
         frames: DN, shape (frame, y, x).
         calibration: of these pixels.
-        offsets: DN, of each row (frame, y) and of each column (frame, x) of each frame; None: none.
+        offsets: of each sample, DN, shape of the frames; none: None, or an empty array.
 
     Returns:
         e-, shape (frame, y, x); NaN for pixels without a calibration.
@@ -32,10 +32,8 @@ def electrons(
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan).astype(np.float32)
     bias = calibration.bias.astype(np.float32)
     out = np.empty(frames.shape, np.float32)
-    rows, columns = offsets or (np.zeros((0, 0)), np.zeros((0, 0)))
-    electrons_numba.subtract_and_scale(
-        frames, gain, bias, rows.astype(np.float32), columns.astype(np.float32), out
-    )
+    given = np.zeros((0, 0, 0), np.float32) if offsets is None else offsets
+    electrons_numba.subtract_and_scale(frames, gain, bias, given, out)
     return out
 
 

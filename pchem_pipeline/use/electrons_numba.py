@@ -19,43 +19,38 @@ def subtract_and_scale(
     frames: NDArray[Any],
     gain: Float32Array,
     bias: Float32Array,
-    rows: Float32Array,
-    columns: Float32Array,
+    offsets: Float32Array,
     out: Float32Array,
 ) -> None:
-    """Fill ``g (x - mu - row - column)``.
+    """Fill ``g (x - mu - b)``.
 
     Args:
         frames: DN, shape (frame, y, x).
         gain: e-/DN, shape (y, x).
         bias: DN, shape (y, x).
-        rows: offset of each row of each frame, DN, shape (frame, y), or (0, 0): none.
-        columns: offset of each column of each frame, DN, shape (frame, x), or (0, 0): none.
+        offsets: b of each sample, DN, shape of the frames, or (0, 0, 0): none.
         out: out, e-.
     """
-    offset = np.zeros(frames.shape[2], np.float32)
     for t in range(frames.shape[0]):
         for y in range(frames.shape[1]):
-            if rows.shape[0] > 0:
-                for x in range(frames.shape[2]):
-                    offset[x] = rows[t, y] + columns[t, x]
             for x in range(frames.shape[2]):
-                out[t, y, x] = gain[y, x] * (np.float32(frames[t, y, x]) - bias[y, x] - offset[x])
+                out[t, y, x] = gain[y, x] * (np.float32(frames[t, y, x]) - bias[y, x])
+            if offsets.shape[0] > 0:
+                for x in range(frames.shape[2]):
+                    out[t, y, x] -= gain[y, x] * offsets[t, y, x]
 
 
 @kernel
 def add_up(
     frames: NDArray[Any],
-    rows: NDArray[np.float64],
-    columns: NDArray[np.float64],
+    offsets: Float32Array,
     sums: NDArray[np.float64],
 ) -> None:
     """Add x, x^2 and, where there are offsets, those of x - b of each pixel to its sums, and see its range.
 
     Args:
         frames: DN, shape (frame, y, x).
-        rows: offsets, DN, as in `subtract_and_scale`.
-        columns: likewise.
+        offsets: b, DN, as in `subtract_and_scale`.
         sums: out, shape (6, y, x): x, x^2, the same without offsets (they stay where there are none), and
             the smallest and largest x.
     """
@@ -67,8 +62,8 @@ def add_up(
                 sums[1, y, x] += value * value
                 sums[4, y, x] = min(sums[4, y, x], value)
                 sums[5, y, x] = max(sums[5, y, x], value)
-                if rows.shape[0] > 0:
-                    value -= rows[t, y] + columns[t, x]
+                if offsets.shape[0] > 0:
+                    value -= offsets[t, y, x]
                     sums[2, y, x] += value
                     sums[3, y, x] += value * value
 
@@ -76,8 +71,7 @@ def add_up(
 @kernel
 def whole_parts(
     frames: NDArray[Any],
-    rows: NDArray[np.float64],
-    columns: NDArray[np.float64],
+    offsets: Float32Array,
     parts: int,
     lift: int,
     out: NDArray[np.uint32],
@@ -86,8 +80,7 @@ def whole_parts(
 
     Args:
         frames: DN, shape (frame, y, x).
-        rows: offsets, DN, shape (frame, y).
-        columns: offsets, DN, shape (frame, x).
+        offsets: b, DN, shape of the frames.
         parts: codes in a DN.
         lift: DN.
         out: out, shape of the frames.
@@ -95,5 +88,5 @@ def whole_parts(
     for t in range(frames.shape[0]):
         for y in range(frames.shape[1]):
             for x in range(frames.shape[2]):
-                value = np.float64(frames[t, y, x]) + lift - rows[t, y] - columns[t, x]
+                value = np.float64(frames[t, y, x]) + lift - offsets[t, y, x]
                 out[t, y, x] = np.uint32(max(value * parts + 0.5, 0.0))

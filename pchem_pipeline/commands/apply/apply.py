@@ -134,7 +134,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files)
     top = top_code(frames, sensor)
-    modes = _modes(run, wanted)
+    modes = _modes(run, wanted, sensor.shape)
     calibration = read_calibration(run, top=top, removed=modes.removed)
     remarks = check_camera(frames, sensor) + check_level(frames, calibration)
     if modes.left and wanted.remove:
@@ -181,10 +181,12 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     return _Made(job, content, remarks, calibration, frames)
 
 
-def _modes(run: RunStore, wanted: ApplySettings) -> CommonModes:
+def _modes(run: RunStore, wanted: ApplySettings, shape: tuple[int, int]) -> CommonModes:
     """Return the offsets that the model of the run names, where they are to be removed."""
     version = model_of(run, "fit")
-    return CommonModes() if version is None or not wanted.remove else CommonModes.of_model(version.effects)
+    if version is None or not wanted.remove:
+        return CommonModes()
+    return CommonModes.of_model(version.effects, shape)
 
 
 def _digest(values: Any) -> str:
@@ -362,18 +364,26 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     chosen = np.unique(np.linspace(0, n - 1, _SCENE_FRAMES).astype(int)).tolist()
     mean = sum(made.frames.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
     job = replace(job, scene=scene_of(np.asarray(mean), made.calibration))
+    parts = job.modes.parts
     for name, length in (("row_offset", ny), ("column_offset", nx)):
-        context.create(f"applied/{name}", (n, length), chunks=(job.depth, length), removed=list(job.removed))
+        context.create(
+            f"applied/{name}",
+            (n, len(parts), length),
+            chunks=(job.depth, len(parts), length),
+            removed=list(job.removed),
+        )
+    context.store.write_array("applied/offset_part", parts)
     length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (8 * ny * nx * job.depth)))
     pieces = [Piece("offsets", 0, ny, t0, min(t0 + length, n)) for t0 in range(0, n, length)]
     done = context.run_units(
         pieces, functools.partial(offsets_piece, job=job), unit_name="piece", by_tiles=False
     )
     found = [summary for key, summary in done.items() if key.startswith("offsets-")]
-    left = sum(float(each["left"]) for each in found) / n
+    left = sum((np.array(each["left"]) for each in found), start=np.zeros(len(parts))) / n
     lift = int(np.ceil(max(float(each["largest"]) for each in found))) + 1 if found else 0
     # codes are cut to parts of a DN: their own rounding is part of what is not known
-    return replace(job, parts=_PARTS, lift=lift, offset_variance=left + QUANTISATION_VARIANCE / _PARTS**2)
+    variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / _PARTS**2
+    return replace(job, parts=_PARTS, lift=lift, offset_variance=variance)
 
 
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:

@@ -9,6 +9,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.stages.fit.fitted_model import fitted_law, fitted_satellites
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
@@ -39,7 +40,7 @@ def read_calibration(
     rows: slice = slice(None),
     *,
     removed: Sequence[str] = (),
-    extra_variance: float = 0.0,
+    extra_variance: FloatArray | None = None,
     top: int | None = None,
 ) -> Calibration:
     """Return the calibration of some rows.
@@ -48,7 +49,7 @@ def read_calibration(
         store: the run.
         rows: of the sensor.
         removed: tags of effects that the frames no longer have.
-        extra_variance: of what took them away, DN^2.
+        extra_variance: of what took them away, DN^2, of these rows (y, x); None: none.
         top: largest code of the ADC, DN: codes there and at 0 are limits; None: not known.
     """
     region = (rows, slice(None))
@@ -56,8 +57,8 @@ def read_calibration(
     stderr = np.stack([store.read(f"fit/{name}_stderr", region) for name in PARAMETERS])
     covariance = covariance_of(stderr, store.read("fit/correlation", region))
     law = fitted_law(store, maps, region, without=removed)
-    if extra_variance > 0.0:
-        law = law.with_variance(dn2=extra_variance)
+    if extra_variance is not None:
+        law = law.with_variance(dn2=extra_variance.ravel())
     if top is not None:
         law = law.with_clip(0, top)
     satellites = fitted_satellites(store, region)

@@ -74,7 +74,8 @@ def _write_errors(output: RunStore, calibration: Calibration, sums: NDArray[np.f
 
 def _law(calibration: Calibration, job: Job) -> SampleLaw:
     """Return the law of the samples without the offsets, with what stays unknown of them."""
-    return calibration.law.with_variance(dn2=job.offset_variance) if job.offset_variance else calibration.law
+    extra = job.offset_variance
+    return calibration.law if extra is None else calibration.law.with_variance(dn2=extra.ravel())
 
 
 def _write_noise(

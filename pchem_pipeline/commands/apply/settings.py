@@ -92,7 +92,7 @@ class Job:
         top: largest code of the ADC, DN; None: not known.
         modes: offsets that are taken from the frames; none: the frames as they come.
         scene: exposure to expect while the offsets are found (y, x), e-.
-        offset_variance: variance of the offsets' estimates, DN^2.
+        offset_variance: variance of the offsets' estimates, DN^2, (y, x); None without offsets.
         parts: codes in a DN.
         lift: DN by which codes are raised so that none is negative.
         bins: of the histograms.
@@ -111,7 +111,7 @@ class Job:
     top: int | None = None
     modes: CommonModes = field(default_factory=CommonModes)
     scene: Any = None
-    offset_variance: float = 0.0
+    offset_variance: Any = None
     parts: int = 1
     lift: int = 0
     bins: int = 0

@@ -16,7 +16,7 @@ from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistog
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
-from pchem_pipeline.use.common_modes import estimate_offsets
+from pchem_pipeline.use.common_modes import estimate_offsets, offsets_of_samples
 from pchem_pipeline.use.electrons import electrons
 from pchem_pipeline.use.electrons_numba import add_up, whole_parts
 from pchem_pipeline.use.exposure import estimate_exposure
@@ -29,33 +29,30 @@ N_SUMS = 6
 _WHOLE = slice(None)
 
 
-def offsets_of(
-    output: RunStore, job: Job, t0: int, t1: int, rows: slice
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the offsets of rows (frame, y) and columns (frame, x) of some frames, DN; empty without any."""
+def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> NDArray[np.float32]:
+    """Return the offset of each sample of some rows of some frames, DN; empty where there are none."""
     if not job.removed:
-        return np.zeros((0, 0)), np.zeros((0, 0))
+        return np.zeros((0, 0, 0), np.float32)
     frames = slice(t0, t1)
-    found = (
-        output.read("applied/row_offset", (frames, rows)),
-        output.read("applied/column_offset", (frames, _WHOLE)),
+    return offsets_of_samples(
+        output.read("applied/row_offset", (frames, _WHOLE, rows)),
+        output.read("applied/column_offset", (frames, _WHOLE, _WHOLE)),
+        job.modes.parts[:, rows],
     )
-    return found[0].astype(np.float64), found[1].astype(np.float64)
 
 
 def _calibration(job: Job, rows: slice) -> Calibration:
     run = RunStore.open(job.run)
-    return read_calibration(run, rows, removed=job.removed, extra_variance=job.offset_variance, top=job.top)
+    extra = None if job.offset_variance is None else job.offset_variance[rows]
+    return read_calibration(run, rows, removed=job.removed, extra_variance=extra, top=job.top)
 
 
-def _codes(
-    frames: NDArray[Any], job: Job, offsets: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> NDArray[Any]:
+def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDArray[Any]:
     """Return the codes of samples: DN, or parts of a DN without the offsets."""
     if not job.removed:
         return frames
     out = np.empty(frames.shape, np.uint32)
-    whole_parts(frames, *offsets, job.parts, job.lift, out)
+    whole_parts(frames, offsets, job.parts, job.lift, out)
     return out
 
 
@@ -66,17 +63,16 @@ def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     """Find and write the offsets of some frames; the summary tells how well they are known."""
     output = open_store(job.output)
     calibration = _calibration(job, _WHOLE)
-    left, largest = 0.0, 0.0
+    left, largest = np.zeros(len(job.modes.parts)), 0.0
     with FrameStream(job.source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
         for start, (frames,) in stream:
             found = estimate_offsets(frames, job.scene, calibration, job.modes)
-            region = (slice(start, start + len(frames)), _WHOLE)
+            region = (slice(start, start + len(frames)), _WHOLE, _WHOLE)
             output.write("applied/row_offset", region, found.rows.astype(np.float32))
             output.write("applied/column_offset", region, found.columns.astype(np.float32))
-            left += float(found.left.sum())
-            widest = abs(found.rows).max(axis=1) + abs(found.columns).max(axis=1)
-            largest = max(largest, float(widest.max()))
-    return {"left": left, "largest": largest}
+            left += found.left.sum(axis=0)
+            largest = max(largest, float(abs(found.of_samples(job.modes.parts)).max()))
+    return {"left": left.tolist(), "largest": largest}
 
 
 # -- histograms and exposure -----------------------------------------------------------------------
@@ -137,7 +133,7 @@ def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
         for start, (frames,) in stream:
             offsets = offsets_of(output, job, start, start + len(frames), rows)
             region = (slice(start, start + len(frames)), rows, _WHOLE)
-            add_up(frames, *offsets, sums)
+            add_up(frames, offsets, sums)
             if "electrons" in job.kinds:
                 output.write("applied/electrons", region, electrons(frames, calibration, offsets))
             if tables is not None:

@@ -14,6 +14,7 @@ from pchem_pipeline.use.common_modes import CommonModes, estimate_offsets, scene
 from pchem_pipeline.use.electrons import electrons
 
 SHAPE, N_FRAMES = (24, 40), 60
+EVERYWHERE = np.ones((1, *SHAPE), bool)
 SPREAD = {"frame": 1.0, "row": 1.5, "column": 1.2}
 
 
@@ -25,7 +26,8 @@ def taken(seed, read_noise, spread, exposure=1.0):
     columns = spread["column"] * rng.standard_normal((N_FRAMES, SHAPE[1]))
     offset = (frame + rows)[:, :, None] + columns[:, None, :]
     true, frames = camera.frames(rng, exposure, N_FRAMES, offset)
-    modes = CommonModes(("row_noise",), tuple(spread[name] ** 2 for name in ("frame", "row", "column")))
+    variances = np.array([[spread[name] ** 2 for name in ("frame", "row", "column")]])
+    modes = CommonModes(("row_noise",), np.ones((1, *SHAPE), bool), variances)
     calibration = camera.calibration()
     scene = scene_of(frames.mean(axis=0), calibration)
     return camera, true, frames, offset, estimate_offsets(frames, scene, calibration, modes)
@@ -34,15 +36,13 @@ def taken(seed, read_noise, spread, exposure=1.0):
 @pytest.mark.parametrize(("read_noise", "share"), [((0.15, 0.25), 0.1), ((0.3, 0.45), 0.5)])
 def test_offsets_are_as_near_as_they_say(read_noise, share):
     camera, true, frames, offset, found = taken(50, read_noise, SPREAD)
-    total = found.rows[:, :, None] + found.columns[:, None, :]
+    total = found.of_samples(EVERYWHERE)
     variance = ((total - offset) ** 2).mean()
     # where peaks overlap, a sample says less of an offset than its read noise allows
     assert variance < share * (offset**2).mean()
     assert 0.6 < variance / found.left.mean() < 1.6
     calibration = camera.calibration()
-    before, after = (
-        (electrons(frames, calibration, each) - true).var() for each in (None, (found.rows, found.columns))
-    )
+    before, after = ((electrons(frames, calibration, each) - true).var() for each in (None, total))
     own = (camera.read_noise_e**2 + camera.gain**2 / 12).mean()
     square = (camera.gain**2).mean()
     assert before > own + 0.9 * square * (offset**2).mean()
@@ -65,11 +65,11 @@ def test_a_model_names_its_offsets():
         PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.1),
         NoiseSkew.typical()[0],
     )
-    modes = CommonModes.of_model(effects)
+    modes = CommonModes.of_model(effects, SHAPE)
     assert modes.removed == ("row_noise", "column_noise", "frame_noise", "bias_drift", "periodic_pickup")
-    np.testing.assert_allclose(modes.variances, (0.09 + 0.04, 0.25 + 0.5, 0.16))
+    np.testing.assert_allclose(modes.variances[0], (0.09 + 0.04, 0.25 + 0.5, 0.16))
     slanted = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.1, cycles_per_column=0.2)
-    assert CommonModes.of_model([slanted]).left == ("periodic_pickup",)
+    assert CommonModes.of_model([slanted], SHAPE).left == ("periodic_pickup",)
 
 
 def test_pixels_without_calibration_tell_nothing():
@@ -78,7 +78,39 @@ def test_pixels_without_calibration_tell_nothing():
     _, frames = camera.frames(rng, 1.0, 5)
     calibration = camera.calibration()
     calibration.bias[0] = np.nan
-    modes = CommonModes(("row_noise",), (0.0, 1.0, 0.0))
+    modes = CommonModes(("row_noise",), EVERYWHERE, np.array([[0.0, 1.0, 0.0]]))
     found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
-    assert (found.rows[:, 0] == 0).all()
+    assert (found.rows[:, 0, 0] == 0).all()
     assert np.isfinite(found.rows).all()
+
+
+def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
+    """Row noise of one readout tap, frame noise everywhere: each is found, and none is invented elsewhere."""
+    rng = np.random.default_rng(54)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.25))
+    tap = RowNoise(row_noise_dn=1.5, region="columns=24:40")
+    whole = FrameNoise(frame_noise_dn=1.0)
+    modes = CommonModes.of_model([tap, whole], SHAPE)
+    assert modes.removed == ("row_noise", "frame_noise")
+    assert [int(part.sum()) for part in modes.parts] == [24 * 16, 24 * 40]
+    np.testing.assert_allclose(modes.variances, [[0, 2.25, 0], [1, 0, 0]])
+    rows = 1.5 * rng.standard_normal((N_FRAMES, SHAPE[0], 1)) * (np.arange(40) >= 24)
+    offset = rows + rng.standard_normal((N_FRAMES, 1, 1))
+    _, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
+    calibration = camera.calibration()
+    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    error = (found.of_samples(modes.parts) - offset) ** 2
+    # a frame's offset is known from 960 samples, a row's from 16
+    inside, outside = error[..., 24:].mean(), error[..., :24].mean()
+    assert outside < 0.02
+    assert inside < 0.2 * 2.25
+    assert 0.6 < inside / found.left.sum(axis=1).mean() < 1.6
+    # taken for all of the row, the tap's noise would be smeared over the pixels beside it
+    smeared = CommonModes.of_model([RowNoise(row_noise_dn=1.5), whole], SHAPE)
+    wrong = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, smeared)
+    assert ((wrong.of_samples(smeared.parts) - offset) ** 2)[..., :24].mean() > 10 * outside
+
+
+def test_what_has_a_time_stays():
+    modes = CommonModes.of_model([RowNoise(row_noise_dn=1.0, when="frames=3:9")], SHAPE)
+    assert (modes.removed, modes.left) == ((), ("row_noise",))

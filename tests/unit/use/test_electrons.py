@@ -51,7 +51,9 @@ def test_offsets_of_rows_and_columns_are_taken_away():
     camera = KnownCamera.drawn(rng, (6, 7))
     _, frames = camera.frames(rng, 5.0, 9)
     rows, columns = rng.normal(size=(9, 6)), rng.normal(size=(9, 7))
-    found = electrons(frames, camera.calibration(), (rows, columns))
+    found = electrons(
+        frames, camera.calibration(), (rows[:, :, None] + columns[:, None, :]).astype(np.float32)
+    )
     expected = (frames - camera.bias - rows[:, :, None] - columns[:, None, :]) * camera.gain
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
