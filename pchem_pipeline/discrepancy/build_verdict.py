@@ -29,6 +29,7 @@ from pchem_pipeline.discrepancy.verdict import (
     State,
     Step,
     Verdict,
+    micronats,
     parameters_of,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
@@ -53,7 +54,6 @@ LARGEST_REST = 0.2
 _MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
-_MICRO = 1e-3  # nats: smaller gaps are said in millionths
 
 
 @dataclass(frozen=True)
@@ -323,14 +323,16 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
         lacks = f"{also}{_and(sets)}{_rest(found)}{_left(added)}"
         return f"The model lacks something that these {data} cannot tell apart: {lacks}."
     if found.before.at_floor:
-        limit = f"{1e6 * found.before.floor:.2g} micronats per sample"
+        limit = f"{micronats(found.before.floor)} micronats per sample"
         return f"The model was missing {_and(titles)}; on the final {data} alone its gap is below {limit}."
     if state == "named_in_part":
-        words = f"{_closed(found)}{_rest(found)}{_nearest(found)}{_left(added)}{_compared(added)}"
+        words = (
+            f"{_closed(found)}{_rest(found)}{_nearest(found)}{_left(added)}{_compared(added)}{_gaps(found)}"
+        )
         return f"A part of what the model was missing is {_and(titles)}: {words}."
     them = "them" if len(titles) > 1 else "it"
     words = f"with {them}, {_closed(found)} and what is left is at its floor{_left(added)}{_compared(added)}"
-    return f"The model was missing {_and(titles)}; {words}."
+    return f"The model was missing {_and(titles)}; {words}{_gaps(found)}."
 
 
 def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
@@ -345,8 +347,15 @@ def _described(found: Findings, titles: Sequence[str]) -> str:
     besides = f" besides {_and(titles)}" if titles else ""
     return (
         f"No known effect explains the {found.samples}{besides}, but what they hold is measured: {words}; "
-        f"with it {_closed(found)}{_rest(found)}."
+        f"with it {_closed(found)}{_rest(found)}; {_alike(found)}{_gaps(found)}."
     )
+
+
+def _alike(found: Findings) -> str:
+    """Return in words whether a measured component is alike in all that it is said of."""
+    if found.still or not found.added.after.at_floor:
+        return "whether all pixels and frames have it alike is not known"
+    return "as far as these statistics show, its pixels and frames have it alike"
 
 
 def _nearest(found: Findings) -> str:
@@ -357,13 +366,16 @@ def _nearest(found: Findings) -> str:
 
 
 def _closed(found: Findings) -> str:
-    """Return the share of the gap that is closed, with the gap before and after and its floor, in words."""
-    before, after = found.before.value, found.added.after
-    unit, scale = ("micronats", 1e6) if before < _MICRO else ("nats", 1.0)
-    left, floor = scale * max(after.value, 0.0), scale * after.floor
-    share = 1.0 - max(after.value, 0.0) / before
-    gaps = f"{scale * before:.3g} -> {left:.3g} {unit} per sample, floor {floor:.2g}"
-    return f"{_share(share)} of the gap on unseen {found.samples} is closed ({gaps})"
+    """Return the share of the gap that is closed, in words."""
+    share = 1.0 - max(found.added.after.value, 0.0) / found.before.value
+    return f"{_share(share)} of the gap on unseen {found.samples} is closed"
+
+
+def _gaps(found: Findings) -> str:
+    """Return the gap before and after, and its floor, in words; they come last."""
+    after = found.added.after
+    gaps = f"{micronats(found.before.value)} -> {micronats(after.value)} micronats per sample"
+    return f" (gap {gaps}, floor {micronats(after.floor)})"
 
 
 def _share(share: float) -> str:

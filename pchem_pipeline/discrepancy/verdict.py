@@ -46,6 +46,7 @@ __all__ = [
     "Step",
     "Surveyed",
     "Verdict",
+    "micronats",
     "parameters_of",
     "read_verdict",
 ]
@@ -489,6 +490,12 @@ class Verdict(_Part):
         examined = self.examined.model_copy(update={"rows": rows, "columns": columns})
         where = tuple(moved(place) for place in self.where)
         return self.model_copy(update={"examined": examined, "where": where})
+
+
+def micronats(gap: float) -> str:
+    """Return a gap, nats per sample, in millionths; less than nothing is chance, and shown as nothing."""
+    value = 1e6 * max(gap, 0.0)
+    return "not known" if not math.isfinite(gap) else f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
 def read_verdict(folder: Path) -> Verdict | None:

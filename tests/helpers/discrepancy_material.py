@@ -314,8 +314,11 @@ def verdict_of(verdict: str, **changes: Any) -> Verdict:
 def discrepancy_data(verdict: str = "named", **changes: Any) -> DiscrepancyData:
     """What the page is drawn from."""
     seen = evidence()
+    pulls = [] if verdict == "consistent" else _pulls(extended=True)
+    before = seen.z | {pull["statistic"]: pull["before"] for pull in pulls}
     after = {name: float(np.tanh(z)) for name, z in seen.z.items()}
-    arrays = evidence_arrays(seen, after=after if verdict in ("named", "named_in_part") else None)
+    after |= {pull["statistic"]: pull["after"] for pull in pulls}
+    arrays = evidence_arrays(seen, before, after=after if verdict in ("named", "named_in_part") else None)
     if verdict == "named":
         position = arrays["frame_number"] / arrays["frame_number"][-1] - 0.5
         arrays["frame_readout_model"] = 0.12 * position

@@ -16,7 +16,7 @@ from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -58,17 +58,17 @@ class AddedSets:
         self.gaps = LikelihoodGap(self.parts[2], kept, carried, self.replicates, self.rng)
 
     def close(
-        self, before: Gap, nulls: tuple[NullModel, NullModel], z: FloatArray, still: bool
+        self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
     ) -> tuple[Added, FittedSet]:
         """Return the added effects and what is left, and the fit with all of them.
 
         Args:
             before: gap without effects.
             nulls: of the model without and with all effects.
-            z: statistics of the final part.
+            z: statistics of the parts.
             still: whether the data disagree with the final model.
         """
-        pulls = [null.pulls(z) for null in nulls]
+        pulls = [null.pulls(z.both, splits=2) for null in nulls]
         moved = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
         gap, fitted = before, self.plain
         additions: list[Addition] = []

@@ -237,7 +237,7 @@ class HistogramExplainer:
         if self.found is None:
             return Added((), before)
         closing = AddedSets(self.parts, self.found, self.plain, self._count, self.rng)
-        added, self.final_fit = closing.close(before, (self.first, null), z.final, disagrees)
+        added, self.final_fit = closing.close(before, (self.first, null), z, disagrees)
         self.code = closing.codes(self.final_fit, self.evidence)
         self.model = (*self.present, *(each.effect for each in added.additions))
         return added

@@ -138,7 +138,6 @@ class AddedRounds:
         others = self._others(this, member)
         ranked = others[:_MOST_RIVALS]
         placebo = next((o for o in others[1:] if o.closes and unrelated(o.effect, added.effect)), None)
-        off = self.z.final - this.null.mean
         return Addition(
             effect=added.effect if named else compared[0][0],
             alone=len(kept) == 1,
@@ -153,8 +152,8 @@ class AddedRounds:
             pulls=largest_pulls(
                 this.null.names,
                 added.fingerprint / this.null.std,
-                off / this.null.std,
-                (off - parts.sum(axis=0)) / this.null.std,
+                this.null.pulls(self.z.both, 2),
+                this.extended.pulls(self.z.both, 2),
             ),
             moved=this.moved,
         )
@@ -193,7 +192,9 @@ class AddedRounds:
         if not other.closes:
             why = "at no strength does it explain anything"
         elif abs(other.rest[worst]) > _LEFT:
-            why = f"leaves {STATISTICS[this.null.names[worst]].sentence} ({other.rest[worst]:+.1f} sd)"
+            # in the unit in which the statistic is told elsewhere
+            left = this.null.shifted(other.mean - this.null.mean).pulls(self.z.both, 2)[worst]
+            why = f"leaves {STATISTICS[this.null.names[worst]].sentence} ({left:+.1f} sd)"
         else:
             why = "leaves no single statistic far off, but all of them together fit worse"
         return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)

@@ -302,9 +302,9 @@ class FrameExplainer:
         maps, frames = self.plain.maps, self.frames.seen.size
         noise = np.nanmedian(maps.read_noise_dn * maps.conversion_gain)
         lost = (
-            f"the bias of {share:.0%} of the pixels may be off by an electron"
+            f"the bias of {100 * share:.0f} % of the pixels may be off by an electron"
             if share >= _NOT_IDENTIFIED
-            else f"only {usable:.0%} of the pixels have a fit that can be relied upon"
+            else f"only {100 * usable:.0f} % of the pixels have a fit that can be relied upon"
         )
         return (
             f"{lost} (fitted read noise {noise:.2f} e-, {frames} frames): several exposures fitted together "
@@ -367,6 +367,7 @@ class FrameExplainer:
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
         """Measure what no effect explains as shifts of the samples, and put it into the model.
 
+        Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
         First without the effects that were added, since one that merely mimics has no place beside it; with
         them where that does not close the gap. None where it closes less than half of what is left.
         """
@@ -376,7 +377,8 @@ class FrameExplainer:
         rounds, model = self.rounds, self.model
         held = tuple(h for this in rounds for h in this.added.hypotheses)
         for kept in [(), held] if held else [()]:
-            found = self._described(z, kept)
+            each = [self._described(z, kept, part) for part in (Part(), *self.frames.parts)]
+            found = max((one for one in each if one is not None), key=lambda one: one.score, default=None)
             if found is None:
                 continue
             gap = self.gaps.gap(z.final, found.mean, found.vectors)
@@ -486,17 +488,21 @@ class FrameExplainer:
         events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
         return Noise(covariance, self.settings.model_error, events)
 
-    def _described(self, z: Measured, kept: tuple[Hypothesis, ...]) -> Refitted | None:
-        """Return effects with measured shifts beside them at their best fit; None where there are none."""
+    def _described(self, z: Measured, kept: tuple[Hypothesis, ...], part: Part) -> Refitted | None:
+        """Return effects with shifts measured in a part beside them at their best fit, or None."""
         refitter = self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses))
-        seen, effects = self.frames.stack[self.frames.seen], tuple(h.effect for h in kept)
+        effects, window = tuple(h.effect for h in kept), self.frames.window
+        inside = (window or SensorWindow.whole(self.frames.stack.shape)).mask(part.region)
+        seen = self.frames.stack[self.frames.seen][part.frames(self.frames.numbers[self.frames.seen])]
         found: Refitted | None = None
         for _ in range(_MEASUREMENTS):
             present = refitter.model(found.effects if found else effects)
-            fit = self._mapped(present)[0]
-            measured = measured_shifts(seen, fit.maps, refitter.model(effects))
+            maps = self._mapped(present)[0].maps
+            own = replace(maps, usable=maps.usable & inside)
+            measured = measured_shifts(seen, own, refitter.model(effects)) if own.usable.any() else None
             if measured is None:
                 return None
+            measured = measured.at_place(part.region, part.when)
             _, vectors = refitter.draw((*effects, measured), self.settings.extended_replicates)
             shift = vectors.mean(axis=0) - self.first.mean - sum(h.fingerprint for h in kept)
             found = refitter.refined((*kept, Hypothesis(measured, shift)))

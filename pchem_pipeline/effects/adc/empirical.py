@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -83,8 +84,9 @@ class Empirical(Effect):
         """Return what is known of it."""
         shares = self.shares()
         order = np.argsort(-shares)
+        place = f" in {place_words(self)}" if place_words(self) else ""
         parts = [f"{shares[i]:.2g} by {self.shift_dn[i]:+.3g} DN" for i in order[:4]]
         return (
-            f"a share of {self.share:.2g} of the samples, of any pixel at any time, comes out moved at the "
-            f"converter ({', '.join(parts)})"
+            f"a share of {self.share:.2g} of the samples{place} comes out moved at the converter "
+            f"({', '.join(parts)})"
         )

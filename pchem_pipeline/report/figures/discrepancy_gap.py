@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from pchem_pipeline.discrepancy.verdict import Pull, Verdict
+from pchem_pipeline.discrepancy.verdict import Pull, Verdict, micronats
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.palette import Palette
@@ -60,7 +60,7 @@ def gap_figures(data: DiscrepancyData) -> list[Figure]:
             "shown",
             "The gap against its floor",
             _GAP_CAPTION,
-            f"Gap in 10⁻⁶ nats per sample: {_gap_alt(found)}.",
+            f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
             tables,
             partial(draw_gap, bars=gap_bars(found), families=families(found), floor=MICRO * found.gap.floor),
             PAGE_MM,
@@ -118,24 +118,22 @@ _GAP_UNIT = "1e-6 nats/sample"
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
-    """Return the statistics farthest from chance before and after.
+    """Return the statistics farthest from chance before and after: of the vectors ``z_before``, ``z_after``.
 
-    Those that the JSON tells, else those of the vectors ``z_before`` and ``z_after``.
+    Where those are not kept, those that the JSON tells.
     """
-    found = data.found
     rows: dict[str, Pull] = {}
-    for step in found.steps:
-        for pull in step.pulls:
-            known = rows.get(pull.statistic, pull)
-            after = pull.after if math.isfinite(pull.after) else known.after
-            rows[pull.statistic] = known.model_copy(update={"after": after})
-    if not rows and "z_before" in data.arrays:
+    if "z_before" in data.arrays:
         before = np.asarray(data.arrays["z_before"], dtype=np.float64)
         after_all = np.asarray(data.arrays.get("z_after", np.full(before.size, np.nan)), dtype=np.float64)
         for i, (name, (_, sentence)) in enumerate(data.statistics.items()):
             if i < before.size and np.isfinite(before[i]):
                 later = float(after_all[i]) if i < after_all.size else math.nan
                 rows[name] = Pull(statistic=name, sentence=sentence, before=float(before[i]), after=later)
+    for pull in () if rows else [pull for step in data.found.steps for pull in step.pulls]:
+        known = rows.get(pull.statistic, pull)
+        after = pull.after if math.isfinite(pull.after) else known.after
+        rows[pull.statistic] = known.model_copy(update={"after": after})
 
     def far(pull: Pull) -> float:
         return max((abs(v) for v in (pull.before, pull.after) if math.isfinite(v)), default=0.0)
@@ -162,8 +160,8 @@ def _gap_alt(found: Verdict) -> str:
 
 
 def gap_text(gap: float) -> str:
-    """Return a gap in 10⁻⁶ nats, without the unit."""
-    return short(MICRO * gap) if math.isfinite(gap) else "not known"
+    """Return a gap in micronats, without the unit."""
+    return micronats(gap)
 
 
 @dataclass(frozen=True)
@@ -256,7 +254,7 @@ def draw_gap(
     for axes in both:
         axes.set_xscale("log")
         axes.set_xlim(left, right)
-        axes.set_xlabel("gap (10⁻⁶ nats per sample)")
+        axes.set_xlabel("gap (micronats per sample)")
         axes.grid(axis="x", color=look.palette.grid, linewidth=0.5)
     return figure
 

@@ -30,7 +30,7 @@ _SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN")}
 
 _CODES_CAPTION = (
     "All usable pixels together. Top: samples at each DN (gray) and those that the fitted PCDs lead to "
-    "expect (black; with the named effects: orange). Below: the difference from the plain model in "
+    "expect (black; with what was added: orange). Below: the difference from the plain model in "
     "standard deviations, even and odd DN in two colours; the gray band is two standard deviations. A "
     "single tall line is a pile-up, alternating colours are a comb of the ADC, a slow wave is its "
     "nonlinearity. Yellow: what the verdict points to."
@@ -134,7 +134,7 @@ def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
     return DataTable({name: values[kept] for name, values in columns.items()}, units)
 
 
-_NAMED = "expected with the named effects"
+_NAMED = "expected with what was added"
 
 
 def frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
@@ -177,7 +177,7 @@ def draw_codes(look: Look, *, table: DataTable, marked: Sequence[Place] = ()) ->
     top.stairs(observed, edges, fill=True, color=colours.bars, label="observed")
     top.stairs(expected, edges, color=colours.ink, linewidth=0.9, label="expected from the fitted PCDs")
     if _NAMED in table:
-        label = "with the named effects"
+        label = "with what was added"
         top.stairs(table[_NAMED], edges, color=colours.vermilion, linewidth=0.9, label=label)
     top.set_yscale("log")
     top.set_ylim(0.5, (4.0 if look.wide else 200.0) * max(observed.max(), 1.0))

@@ -45,12 +45,19 @@ VERDICT_WORDS: dict[str, tuple[Level, str]] = {
 #: (id, heading, introduction) of the parts of the page.
 PARTS: tuple[tuple[str, str, str], ...] = (
     (
+        "signature",
+        "What shows most, before and after",
+        "The picture of the statistic that the added effect moves most (of the largest disagreement, where "
+        "nothing was added), and beside it each statistic before and after. All is in standard deviations "
+        "of what chance alone makes of it, from stacks simulated from the fitted model.",
+    ),
+    (
         "where",
         "Where data and model disagree",
         "Every sample is split into a charge channel (the expected electron number) and a readout channel "
         "(what is left). Effects of light and charge show in the first, effects of the electronics in the "
-        "second. All is in standard deviations of what the plain model would show by chance. The pictures "
-        "are of the frames in which effects were looked for; the table is of these and others to confirm it.",
+        "second. The pictures are of the frames to find with; numbers in text, table and in the figure of "
+        "pulls are means of these and of the frames to confirm with.",
     ),
     (
         "evidence",
@@ -62,8 +69,11 @@ PARTS: tuple[tuple[str, str, str], ...] = (
     (
         "shown",
         "How much of the gap is closed",
-        "The gap is the distance between data and model in nats per sample, on frames that no fit has seen. "
-        "It does not grow with the amount of data; more data only lower its floor, which chance alone makes.",
+        "The gap is how far the law of the data is from that of the model (Kullback and Leibler), measured "
+        "on frames that no fit has seen. At G nats per sample, N samples are exp(N G) times as likely under "
+        "the true law as under the model; a micronat is 10⁻⁶ of a nat, so at 1 micronat it takes a million "
+        "samples for a factor e. It does not grow with the data; more of them only lower its floor, which "
+        "chance alone makes.",
     ),
     (
         "parameters",
@@ -125,6 +135,7 @@ class DiscrepancyView:
         level: how grave it is (a class of the style sheet).
         name: the verdict's name.
         sentence: the verdict in one sentence.
+        frames: which samples it rests on.
         facts: the key numbers.
         remarks: what speaks for and against it.
         parts: figures and tables.
@@ -133,6 +144,7 @@ class DiscrepancyView:
     level: str
     name: str
     sentence: str
+    frames: str
     facts: list[KeyFact]
     remarks: list[Flag]
     parts: list[Part]
@@ -148,13 +160,57 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
     level, name = verdict_level(data.found)
     tables = discrepancy_tables(data)
     parts = []
+    first = _signature(data.found)
     for id_, title, intro in PARTS:
-        shown = [picture for picture in pictures if picture.figure.section == id_]
+        shown = [
+            picture
+            for picture in pictures
+            if id_ == ("signature" if picture.figure.name in first else picture.figure.section)
+        ]
+        shown.sort(
+            key=lambda picture: first.index(picture.figure.name) if picture.figure.name in first else 0
+        )
         rows = tables.get(id_, [])
+        if id_ == "signature" and not shown:
+            continue  # nothing disagrees, or nothing was kept to draw
+        if id_ == "where" and not data.found.where:
+            title = "Data and model side by side"
         empty = "" if shown or rows else _EMPTY[id_]
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
     sentence = data.found.sentence.replace(" -> ", " → ")
-    return DiscrepancyView(level, name, sentence, key_facts(data.found), remarks(data), parts)
+    return DiscrepancyView(
+        level, name, sentence, frames_text(data.found), key_facts(data.found), remarks(data), parts
+    )
+
+
+#: Family of a statistic, or its beginning, to the figure that shows it.
+_PICTURES = (
+    ("code.", "discrepancy_codes"),
+    ("frame.", "discrepancy_frames"),
+    ("space.row.", "discrepancy_lines"),
+    ("space.column.", "discrepancy_lines"),
+    ("", "discrepancy_maps"),
+)
+
+
+def _signature(found: Verdict) -> tuple[str, ...]:
+    """Return the figures that come first: of the statistic that matters most, and all before and after."""
+    pulls = [pull for step in found.steps[:1] for pull in step.pulls]
+    statistic = pulls[0].statistic if pulls else next((place.statistic for place in found.where), "")
+    if not statistic:
+        return ()
+    return next(name for start, name in _PICTURES if statistic.startswith(start)), "discrepancy_pulls"
+
+
+def frames_text(found: Verdict) -> str:
+    """Return which samples the verdict rests on."""
+    seen = found.examined
+    dealt = f"{seen.train:,} to find with, {seen.test:,} to confirm with, {seen.final:,} only for the gap"
+    if seen.histograms is not None:
+        return f"{count(seen.histograms, 'histogram')}; their samples were dealt at random: {dealt}."
+    share = f" ({percent(seen.share, 1.0)} of the run's samples)" if math.isfinite(seen.share) else ""
+    place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
+    return f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left."
 
 
 def verdict_level(found: Verdict) -> tuple[Level, str]:
@@ -198,9 +254,10 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
     nats = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
-    more = (f"{nats} micronats per sample", f"chance alone: up to {gap_text(gap.floor)}{_interval(gap)}")
+    words, chance = f"{nats} micronats per sample", f"chance alone: up to {gap_text(gap.floor)}"
     if not extended:
-        return [KeyFact("distance of data and model", more[0], more[1:])]
+        return [KeyFact("distance of data and model", words, (chance,))]
+    more = (words, chance + _interval(gap))
     return [KeyFact("of the gap closed", percent(max(gap.closed_fraction, 0.0), 1.0), more)]
 
 
@@ -208,18 +265,20 @@ def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
-    return f"; left: {gap_text(low)} to {gap_text(high)}"
+    return (
+        f"; left: {gap_text(low)} to {gap_text(high)}" if low > 0.0 else f"; left: at most {gap_text(high)}"
+    )
 
 
 def _effect_facts(found: Verdict) -> list[KeyFact]:
     facts = []
     for step in found.steps:
-        if step.effect and step.parameters:
+        if (step.effect or step.verdict == "described") and step.parameters:
             values = [
                 f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}"
                 for name, p in step.parameters.items()
             ]
-            facts.append(KeyFact(step.effect, *_size_texts(step, values)))
+            facts.append(KeyFact(step.likeliest, *_size_texts(step, values)))
     return facts[:4]
 
 
@@ -473,8 +532,8 @@ def _gaps(found: Verdict) -> Table:
     return Table(
         "discrepancy-gap",
         "Gap by step",
-        "In 10⁻⁶ nats per sample on frames that no fit has seen, with its interval; runner-up and placebo "
-        "were added in the place of the named effect.",
+        "In micronats per sample on frames that no fit has seen, with its interval; runner-up and placebo "
+        "were fitted in the place of the named effect.",
         ("step", "before", "after", "floor", "runner-up instead", "placebo instead"),
         tuple(rows),
     )

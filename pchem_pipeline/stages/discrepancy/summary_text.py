@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Sequence
 
-from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict
+from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats
 
 __all__ = ["verdict_text"]
 
@@ -103,7 +103,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
 
 
 def _beaten(effect: str, rival: Rival) -> list[str]:
-    behind = f" ({_number(-rival.behind)} nats behind)" if math.isfinite(rival.behind) else ""
+    behind = f" ({-rival.behind:.3g} nats behind)" if math.isfinite(rival.behind) else ""
     return _wrapped(
         f"{effect}, not {rival.effect}{behind}: {rival.why}"
         if rival.why
@@ -124,20 +124,16 @@ def _gap(found: Verdict) -> list[str]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
-    words = f"gap: {_micro(gap.before)}"
+    words = f"gap: {micronats(gap.before)}"
     if found.steps and math.isfinite(gap.after):
-        words += f" -> {_micro(gap.after)}"
-    words += f" micro-nats per sample (floor {_micro(gap.floor)}"
+        words += f" -> {micronats(gap.after)}"
+    words += f" micronats per sample (floor {micronats(gap.floor)}"
     if found.steps and math.isfinite(gap.closed_fraction):
         words += f", {100 * gap.closed_fraction:.1f} % closed"
     words += ")"
     for step in found.steps:
         for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo)):
             if rival is not None and step.effect:
-                left = f"{rival.effect} leaves {_micro(rival.gap_after)}"
+                left = f"{rival.effect} leaves {micronats(rival.gap_after)}"
                 words += f"; in the place of {step.effect} the {role} {left}"
     return _wrapped(words)
-
-
-def _micro(gap: float) -> str:
-    return f"{1e6 * gap:.3g}" if math.isfinite(gap) else "not known"

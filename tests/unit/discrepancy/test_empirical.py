@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -105,3 +107,5 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
 
     assert "0.004 of the samples" in _sentence(found, {})
     assert "-8 DN" in _sentence(found, {})
+    assert "have it alike" in _sentence(found, {})
+    assert "not known" in _sentence(replace(found, still=True), {})

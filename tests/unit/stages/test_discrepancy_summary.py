@@ -25,7 +25,7 @@ def test_what_a_named_effect_is_told_with() -> None:
     assert "148 to 152 DN" in text
     assert "and 1 more" in text
     assert "row_noise_dn = 0.3512 +- 0.0041 DN" in text
-    assert "gap: 477 -> 0.4 micro-nats per sample (floor 0.66, 99.9 % closed)" in text
+    assert "gap: 477 -> 0.4 micronats per sample (floor 0.66, 99.9 % closed)" in text
     assert "in the place of row_noise the runner-up periodic_pickup leaves 120" in text
     assert "placebo flicker_noise leaves 116" in text
     assert "DEFECT: the candidate odd_plugin failed and was not compared: ValueError: boom" in text
