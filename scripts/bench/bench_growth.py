@@ -46,8 +46,8 @@ class Row:
         return self.took.seconds.get("fit", math.nan)
 
 
-def write_stack(path: Path, frames: int, side: int) -> None:
-    """Write a raw file of uint16 frames of ``side`` columns and rows, with its sidecar.
+def write_stack(path: Path, frames: int, shape: tuple[int, int]) -> None:
+    """Write a raw file of uint16 frames of some rows and columns, with its sidecar.
 
     The first 1,000 frames are simulated, and repeated from then on: a fit would find that out.
     """
@@ -57,13 +57,14 @@ def write_stack(path: Path, frames: int, side: int) -> None:
 
     settings = SimulateSettings(shape=(64, 64), n_frames=_SIMULATED, seed=3)
     small, _ = simulate_block(draw_truth(settings), settings, (0, _SIMULATED), electron_frames=0)
-    times = -(-side // 64)
+    rows, columns = shape
+    times = -(-rows // 64), -(-columns // 64)
     with path.open("wb") as stream:
         for start in range(0, frames, _AT_ONCE):
             first = start % _SIMULATED
             some = small[first : first + min(_AT_ONCE, frames - start)].astype("<u2")
-            stream.write(np.ascontiguousarray(np.tile(some, (1, times, times))[:, :side, :side]).data)
-    path.with_name(f"{path.name}.json").write_text(json.dumps({"shape": [side, side], "dtype": "uint16"}))
+            stream.write(np.ascontiguousarray(np.tile(some, (1, *times))[:, :rows, :columns]).data)
+    path.with_name(f"{path.name}.json").write_text(json.dumps({"shape": shape, "dtype": "uint16"}))
 
 
 def measure(folder: Path, frames: int, side: int, workers: int) -> Row:
@@ -73,7 +74,7 @@ def measure(folder: Path, frames: int, side: int, workers: int) -> Row:
     from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 
     raw, config = folder / "stack.raw", folder / "stack.yaml"
-    write_stack(raw, frames, side)
+    write_stack(raw, frames, (side, side))
     content = {"run": {"store": "stack.zarr"}, "compute": {"workers": workers}}
     content["input"] = {"files": ["stack.raw"], "mode": "reference", "bit_depth": 14}
     config.write_text(json.dumps(content))

@@ -48,7 +48,7 @@ class Row:
 def make_stack(folder: Path, frames: int, side: int) -> Path:
     """Write a simulated stack as a raw file."""
     raw = folder / "stack.raw"
-    write_stack(raw, frames, side)
+    write_stack(raw, frames, (side, side))
     return raw
 
 

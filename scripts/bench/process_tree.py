@@ -1,7 +1,7 @@
 """What a command takes with all its processes, as the kernel counts: ``process_tree.py pchem run ...``.
 
-Shared pages count once (PSS of /proc/*/smaps_rollup, Linux), added over the tree and looked at every 50 ms;
-the largest resident set of a single process comes from the kernel's own high-water marks.
+Resident sets are added over the tree five times a second: pages that processes share count in each, so this
+is no less than they take. The largest of a single process comes from the kernel's own high-water marks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 __all__ = ["Took", "run_measured"]
 
-_EVERY = 0.05
+_EVERY = 0.2
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def _watch(root: int, highest: list[int], ended: threading.Event) -> None:
     """Keep the largest sum over the tree, and the largest resident set of a process, kB."""
     while not ended.wait(_EVERY):
         tree = _tree(root)
-        highest[0] = max(highest[0], sum(_kilobytes(pid, "smaps_rollup", "Pss") for pid in tree))
-        highest[1] = max([highest[1], *(_kilobytes(pid, "status", "VmHWM") for pid in tree)])
+        highest[0] = max(highest[0], sum(_kilobytes(pid, "VmRSS") for pid in tree))
+        highest[1] = max([highest[1], *(_kilobytes(pid, "VmHWM") for pid in tree)])
 
 
 def _tree(root: int) -> list[int]:
@@ -86,9 +86,9 @@ def _tree(root: int) -> list[int]:
     return found
 
 
-def _kilobytes(pid: int, file: str, name: str) -> int:
+def _kilobytes(pid: int, name: str) -> int:
     try:
-        match = re.search(rf"^{name}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.M)
+        match = re.search(rf"^{name}:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(), re.M)
     except OSError:
         return 0
     return int(match[1]) if match else 0
