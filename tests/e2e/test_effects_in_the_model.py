@@ -144,7 +144,7 @@ def test_report_names_the_model(both) -> None:
     path, _ = both
     words = "PCD + signal_dependent_noise + row_noise + nonlinearity"
     html = (path.parent / "run.zarr/report.html").read_text()
-    assert f"The model is {words}." in html
+    assert f"model {words}" in html
     assert words in (path.parent / "run.zarr/report.json").read_text()
 
 

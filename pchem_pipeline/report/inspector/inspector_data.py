@@ -69,7 +69,7 @@ class InspectorData:
     Attributes:
         maps: in the order of the list; those not packed are shown by ``pchem view`` only.
         sample: the pixels in full.
-        kept_to: to which part of a standard error the packed maps are true, in words.
+        kept_to: how true the packed maps are: a part of a standard error, in words.
         command: what shows every pixel.
     """
 

@@ -59,9 +59,9 @@ def render_report(
         draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
     settings = settings or ReportSettings()
-    shown = [figure for figure in report_figures(data, settings) if figure.section]
-    others = discrepancy_figures(data.discrepancy)
-    drawn = (draw or draw_here)([*shown, *others], settings)
+    every, others = report_figures(data, settings), discrepancy_figures(data.discrepancy)
+    shown = [figure for figure in every if figure.section]
+    drawn = (draw or draw_here)([*(every if settings.figure_formats else shown), *others], settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
     pictures, evidence = (
         [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)

@@ -1005,7 +1005,7 @@
     const notes = [];
     if (pixel.trouble) notes.push(pixel.trouble);
     if (!pixel.exact) {
-      notes.push(`Values to ${facts.keptTo} of a standard error; this ${facts.noun}'s histogram is not in the file, which`);
+      notes.push(`Values to ${facts.keptTo}; this ${facts.noun}'s histogram is not in the file, which`);
       notes.push(`holds ${whole(facts.sample.n)} of ${whole(n)}. To see every one: ${facts.command}`);
     } else if (facts.model && !pixel.mass && parametersOf(pixel)) {
       notes.push(`The curve of the model ${facts.model} is not in the file for this ${facts.noun}: ${facts.command}`);

@@ -15,7 +15,7 @@
   document.addEventListener("pchem-save", (event) => save(...event.detail));
 
   // -- figures as files ------------------------------------------------------------------------
-  const SVG = "data:image/svg+xml;base64,";
+  const SVG = "data:image/svg+xml,";
   const savePng = async (image, name) => {
     await image.decode();
     const scale = 2400 / image.naturalWidth, canvas = document.createElement("canvas");
@@ -45,7 +45,7 @@
       row.append(made);
     };
     if (image.src.startsWith(SVG)) {
-      button("SVG", `${name} as SVG`, () => save(bytesOf(image.src.slice(SVG.length)), "image/svg+xml", `${name}.svg`));
+      button("SVG", `${name} as SVG`, () => save(decodeURIComponent(image.src.slice(SVG.length)), "image/svg+xml", `${name}.svg`));
     }
     button("PNG", `${name} as PNG`, () => savePng(image, `${name}.png`));
     for (const [part, content] of tables[name] ?? []) {

@@ -6,6 +6,7 @@ shown, with its words and unit.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,13 +28,18 @@ from pchem_pipeline.stages.report.stored import FittedModel
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
-#: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9.
-_MAPS_BUDGET, _MAPS_POWER = 2.8e6, 0.9
+#: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9, and
+#: at most so many: what does not fit is shown by ``pchem view`` and, of all pixels, in the figures.
+_MAPS_BUDGET, _MAPS_POWER, _MOST_BYTES = 2.8e6, 0.9, 6.8e6
 _PAPER_PIXELS = 512 * 512
-#: Steps of a map's codes: an eighth of a pixel's standard error, and 4 % of a standard error itself; four
-#: times that for sensors beyond a million pixels.
+#: Steps of a map's codes: an eighth of a pixel's standard error, and 4 % of a standard error itself; so many
+#: times that for sensors of more pixels, with how true the values are then.
 _STEPS_PER_ERROR, _STEP_OF_ERRORS = 8.0, 0.04
-_COARSE_PIXELS, _COARSE = 1_000_000, 4.0
+_COARSE = (
+    (4_000_000, 16.0, "a standard error"),
+    (1_000_000, 4.0, "a quarter of a standard error"),
+    (0, 1.0, "a sixteenth of a standard error"),
+)
 
 #: What people call maps whose names are short for the store.
 _LABELS = {
@@ -73,6 +79,7 @@ _FIRST = (
 )
 #: Groups in the order of the list; what a group of ``fit`` repeats of ``maps`` is left out.
 _GROUPS = ("maps", "fit", "discrepancy", "summary", "histogram", "truth")
+_MANY_PIXELS = 1_000_000
 _WORDS = re.compile(r"(\d+) ([^,;:]+)")
 
 
@@ -153,14 +160,15 @@ def inspector_data(
     name: str, shape: tuple[int, int], maps: Sequence[MapEntry], sample: PixelSample
 ) -> InspectorData:
     """Return all that the inspector of a run holds."""
-    kept_to = "a quarter" if shape[0] * shape[1] > _COARSE_PIXELS else "a sixteenth"
-    return InspectorData(tuple(maps), sample, kept_to, f"pchem view {quoted(Path(name))}")
+    return InspectorData(
+        tuple(maps), sample, _coarse(shape[0] * shape[1])[1], f"pchem view {quoted(Path(name))}"
+    )
 
 
 def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
     """Pack maps, the important ones first, until the budget is spent."""
     n = shape[0] * shape[1]
-    budget = _MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER
+    budget = min(_MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER, _MOST_BYTES)
     order = sorted(listed, key=lambda each: _importance(each.variable.path))
     found: dict[str, MapEntry] = {}
     for each in order:
@@ -169,13 +177,12 @@ def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -
         if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
             found[entry.path] = replace(entry, same_as=alike)
             continue
-        packed = packed_map(store, each.variable)
-        size = 4 * len(packed.data) / 3
-        if size <= budget:
-            budget -= size
-            found[entry.path] = replace(entry, packed=packed)
-        else:
-            found[entry.path] = entry
+        # packing takes long where pixels are many: there the first map that does not fit is the last tried
+        packed = packed_map(store, each.variable) if budget > 0 else None
+        size = math.inf if packed is None else 4 * len(packed.data) / 3
+        fits = size <= budget
+        budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
+        found[entry.path] = replace(entry, packed=packed) if fits else entry
     return [found[each.variable.path] for each in listed]
 
 
@@ -193,13 +200,18 @@ def packed_map(store: RunStore, variable: Variable) -> PackedMap:
         StoreError: it is missing or corrupt.
     """
     values = store.read(variable.path)
-    coarse = _COARSE if values.size > _COARSE_PIXELS else 1.0
+    coarse, _ = _coarse(values.size)
     step = 0.0
     if variable.name.endswith("_stderr"):
         step = _STEP_OF_ERRORS * _median(values)
     elif store.has(f"{variable.path}_stderr"):
         step = _median(store.read(f"{variable.path}_stderr")) / _STEPS_PER_ERROR
     return pack_map(values, choose_scale(values, step=step, coarse=coarse))
+
+
+def _coarse(n_pixels: int) -> tuple[float, str]:
+    """Return the factor on the steps of a sensor's maps, and how true its values are."""
+    return next((factor, words) for most, factor, words in _COARSE if n_pixels > most)
 
 
 def _median(values: NDArray[Any]) -> float:

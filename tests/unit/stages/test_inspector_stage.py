@@ -91,6 +91,23 @@ def test_what_does_not_fit_is_left_to_the_server(
     assert set(shown.sample.exact) == {*here, *alike}
 
 
+def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(
+    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspector, "_MOST_BYTES", 1500.0)
+    monkeypatch.setattr(inspector, "_MANY_PIXELS", 0)
+    tried = []
+    pack = inspector.packed_map
+    monkeypatch.setattr(inspector, "packed_map", lambda *a: tried.append(a[1].path) or pack(*a))
+    shown = inspector_of(store, data.maps, data.fit)
+    here = [each.path for each in shown.maps if each.packed is not None]
+    assert "fit/fit_status" in here
+    assert len(tried) == len(here) + 1
+    assert 4 * sum(len(each.packed.data) for each in shown.maps if each.packed) / 3 <= 1500
+    assert inspector._coarse(4096 * 2304) == (16.0, "a standard error")
+    assert inspector._coarse(512 * 512)[1].startswith("a sixteenth")
+
+
 def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> None:
     shown = inspector_of(store, data.maps, data.fit)
     entry = next(each for each in shown.maps if each.path == "maps/charge_rate")
