@@ -21,6 +21,7 @@ _UNITS = {
     "e-": "e⁻",
     "e-2": "e⁻²",
     "e-/DN": "e⁻/DN",
+    "DN/e-": "DN/e⁻",
     "e-/px/s": "e⁻/px/s",
     "e-/level": "e⁻/level",
     "1/e-": "1/e⁻",
