@@ -6,14 +6,14 @@ import importlib
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 
-__all__ = ["WRITERS", "write_frames"]
+__all__ = ["WRITERS", "StackFacts", "write_frames"]
 
 #: module and usual suffix of each format that can be written
 WRITERS = {
@@ -25,6 +25,22 @@ WRITERS = {
     "zarr": ("omezarr", ".zarr"),
     "ser": ("ser", ".ser"),
 }
+
+
+class StackFacts(NamedTuple):
+    """What the writer of a format is told of a stack.
+
+    Attributes:
+        shape: (frames, rows, columns).
+        dtype: of the samples.
+        integration_time: s; None: not known.
+        bit_depth: bits of the ADC; None: not known.
+    """
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    integration_time: float | None = None
+    bit_depth: int | None = None
 
 
 def write_frames(
@@ -68,10 +84,10 @@ def write_frames(
     writer = importlib.import_module(f"pchem_pipeline.frames.formats.{module}").write_frames
     path = path if path.suffix else path.with_suffix(suffix)
     stream = _Stream(blocks, shape)
-    facts = {"integration_time": integration_time, "bit_depth": bit_depth}
     written: list[Path] = []
     for part, count in _parts(path, shape[0], frames_per_file):
-        written += writer(part, stream.take(count), (count, *shape[1:]), kind.newbyteorder("="), **facts)
+        stack = StackFacts((count, *shape[1:]), kind.newbyteorder("="), integration_time, bit_depth)
+        written += writer(part, stream.take(count), stack)
     stream.finish()
     return written
 

@@ -46,6 +46,22 @@ def _widest(mean):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _fill_tables(exposure, tables, first, length):  # type: ignore[no-untyped-def]
+    """Fill the tables of the electron numbers of a row of pixels."""
+    for x in range(exposure.size):
+        first[x], length[x] = poisson_table(exposure[x], tables[x])
+
+
+@kernel
+def _draw_row(frame, y, xs, k0, k1, tables, first, length, u, v, k, z):  # type: ignore[no-untyped-def]
+    """Fill the electron numbers ``k`` of a row in a frame, and its normal numbers ``z``."""
+    uniform_row(frame, y, xs, np.uint64(0), k0, k1, u, v)
+    normal_from_uniform(v, z)
+    for x in range(xs.size):
+        k[x] = first[x] + _look_up(tables[x], length[x], u[x])
+
+
+@kernel
 def simulate_rows(  # type: ignore[no-untyped-def]
     exposure, gain, bias, noise, frames, ys, xs, k0, k1, top, dn, electrons
 ):
@@ -54,22 +70,13 @@ def simulate_rows(  # type: ignore[no-untyped-def]
     Maps are (y, x) of the band, e-, e-/DN, DN, e-; coordinates uint64; ``top`` the largest DN.
     """
     nx = xs.size
-    zero = np.uint64(0)
-    u = np.empty(nx)
-    v = np.empty(nx)
-    z = np.empty(nx)
-    k = np.empty(nx)
-    first = np.empty(nx, np.int64)
-    length = np.empty(nx, np.int64)
+    u, v, z, k = np.empty(nx), np.empty(nx), np.empty(nx), np.empty(nx)
+    first, length = np.empty(nx, np.int64), np.empty(nx, np.int64)
     for y in range(ys.size):
         tables = np.empty((nx, _widest(exposure[y])))
-        for x in range(nx):
-            first[x], length[x] = poisson_table(exposure[y, x], tables[x])
+        _fill_tables(exposure[y], tables, first, length)
         for t in range(frames.size):
-            uniform_row(frames[t], ys[y], xs, zero, k0, k1, u, v)
-            normal_from_uniform(v, z)
-            for x in range(nx):
-                k[x] = first[x] + _look_up(tables[x], length[x], u[x])
+            _draw_row(frames[t], ys[y], xs, k0, k1, tables, first, length, u, v, k, z)
             line = dn[t, y]
             for x in range(nx):
                 value = np.rint((k[x] + noise[y, x] * z[x]) / gain[y, x] + bias[y, x])
@@ -86,19 +93,12 @@ def draw_rows(exposure, noise, frames, ys, xs, k0, k1, charge, read_noise):  # t
     For chains whose exposure is the same in all frames: a table for each pixel is built once.
     """
     nx = xs.size
-    zero = np.uint64(0)
-    u = np.empty(nx)
-    v = np.empty(nx)
-    z = np.empty(nx)
-    first = np.empty(nx, np.int64)
-    length = np.empty(nx, np.int64)
+    u, v, z = np.empty(nx), np.empty(nx), np.empty(nx)
+    first, length = np.empty(nx, np.int64), np.empty(nx, np.int64)
     for y in range(ys.size):
         tables = np.empty((nx, _widest(exposure[y])))
-        for x in range(nx):
-            first[x], length[x] = poisson_table(exposure[y, x], tables[x])
+        _fill_tables(exposure[y], tables, first, length)
         for t in range(frames.size):
-            uniform_row(frames[t], ys[y], xs, zero, k0, k1, u, v)
-            normal_from_uniform(v, z)
+            _draw_row(frames[t], ys[y], xs, k0, k1, tables, first, length, u, v, charge[t, y], z)
             for x in range(nx):
-                charge[t, y, x] = first[x] + _look_up(tables[x], length[x], u[x])
                 read_noise[t, y, x] = noise[y, x] * z[x]

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import LockedError, StoreError
+from pchem_pipeline.store.progress_file import process_lives
 from pchem_pipeline.store.remote_path import RemotePath
 
 __all__ = ["check_lease", "leased"]
@@ -123,7 +124,7 @@ class _Lease:
     def _refuse_living(self, held: dict[str, Any]) -> None:
         """Raise LockedError unless the owner of the lock is gone."""
         mine = held.get("machine") == _machine() and isinstance(held.get("pid"), int)
-        if held["age"] > LEFT_BEHIND or (mine and not _lives(held["pid"])):
+        if held["age"] > LEFT_BEHIND or (mine and not process_lives(held["pid"])):
             return
         raise LockedError(
             f"{self._run} is in use by pchem on {held.get('host', 'another machine')} (process "
@@ -147,13 +148,3 @@ def _machine() -> str:
     with contextlib.suppress(OSError):
         return f"{socket.gethostname()} {Path('/proc/sys/kernel/random/boot_id').read_text().strip()}"
     return socket.gethostname()
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # somebody else's
-        return True
-    return True

@@ -14,7 +14,7 @@ from typing import Any
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store.files import write_atomic
 
-__all__ = ["ProgressFile", "read_progress"]
+__all__ = ["ProgressFile", "process_lives", "read_progress"]
 
 
 class ProgressFile:
@@ -55,17 +55,18 @@ def read_progress(store: Path) -> dict[str, Any] | None:
     try:
         content: dict[str, Any] = dict(json.loads(_place(store).read_text(encoding="utf-8")))
         here = content["host"] == socket.gethostname()
-        return content if not here or _lives(int(content["pid"])) else None
+        return content if not here or process_lives(int(content["pid"])) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def _lives(pid: int) -> bool:
+def process_lives(pid: int) -> bool:
+    """Tell whether a process of this machine is there."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # somebody else's
+    except OSError:  # somebody else's
         return True
     return True
 

@@ -25,6 +25,7 @@ from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["FitsReader", "write_frames"]
@@ -209,16 +210,9 @@ def _samples(path: Path, header: Any) -> tuple[np.dtype[Any], bool]:
     return stored, zero != 0
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as one cube (one frame: one image); see `frames.writing.write_frames`."""
+    shape, dtype, integration_time, bit_depth = stack
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 

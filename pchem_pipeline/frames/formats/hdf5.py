@@ -26,6 +26,7 @@ from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["Hdf5Reader", "write_frames"]
@@ -215,16 +216,9 @@ def _require() -> None:
         require("hdf5plugin", "hdf5", "compressed HDF5 files")  # its import registers the filters
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as the dataset ``frames``, stored plainly; see `frames.writing.write_frames`."""
+    shape, dtype, integration_time, bit_depth = stack
     _require()
     import h5py
 

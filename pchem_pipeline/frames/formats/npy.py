@@ -14,6 +14,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["NpyReader", "write_frames"]
@@ -67,16 +68,9 @@ class NpyReader(ContiguousReader):
         return reader
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as one npy array; the format has no place for times and bit depth."""
+    shape, dtype, *_ = stack
     header = {"descr": npy_format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     with whole_file(path) as part, part.open("wb") as stream:
         npy_format.write_array_header_1_0(stream, header)

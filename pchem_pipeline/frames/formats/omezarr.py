@@ -18,6 +18,7 @@ from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["ZarrReader", "write_frames"]
@@ -145,16 +146,9 @@ def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
     return {name: tuple(node.shape) for name, node in group.members(max_depth=None) if hasattr(node, "shape")}
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as one zarr array (format 3) in chunks along time; see `frames.writing.write_frames`."""
+    shape, dtype, integration_time, bit_depth = stack
     import zarr
     from zarr.codecs import BloscCodec
 

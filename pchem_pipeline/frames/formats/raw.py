@@ -22,6 +22,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import camera_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["RawReader", "find_sidecar", "write_frames"]
@@ -145,16 +146,9 @@ def _size(path: Path) -> int:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as bytes, with a sidecar ``<path>.json``; see `frames.writing.write_frames`."""
+    shape, dtype, integration_time, bit_depth = stack
     little = dtype.newbyteorder("<")
     with whole_file(path) as part, part.open("wb") as stream:
         for block in blocks:

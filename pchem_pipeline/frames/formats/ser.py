@@ -18,6 +18,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import CameraFacts, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["SerReader", "write_frames"]
@@ -84,16 +85,9 @@ def _seconds(ticks: int) -> float | None:
     return (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as SER video (uint8 or uint16) without times; see `frames.writing.write_frames`."""
+    shape, dtype, _, bit_depth = stack
     if dtype.itemsize > 2:
         raise InputError(f"{path}: SER holds at most 16 bits, not {dtype.name}; choose another format")
     n, rows, columns = shape

@@ -39,6 +39,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
 )
 from pchem_pipeline.frames.reader import check_window
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 __all__ = ["TiffReader", "write_frames"]
@@ -302,16 +303,9 @@ def _adjoining(page: Any, total: int) -> bool:
     return bool(sum(counts) == total and list(offsets[1:]) == ends[:-1])
 
 
-def write_frames(
-    path: Path,
-    blocks: Iterator[NDArray[Any]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    integration_time: float | None = None,
-    bit_depth: int | None = None,
-) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as pages of one file, BigTIFF above 2 GiB; see `frames.writing.write_frames`."""
+    shape, dtype, integration_time, bit_depth = stack
     import tifffile
 
     facts = {"integration_time": integration_time, "bit_depth": bit_depth}

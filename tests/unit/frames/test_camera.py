@@ -17,6 +17,7 @@ from pchem_pipeline.frames.camera import CameraFacts, celsius, seconds_of, share
 from pchem_pipeline.frames.formats import ser
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.writing import StackFacts
 
 STACK = np.random.default_rng(5).integers(0, 4096, (5, 6, 7)).astype(np.uint16)
 TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
@@ -86,7 +87,7 @@ def test_hdf5_and_zarr(tmp_path: Path) -> None:
 
 
 def test_ser_and_raw(tmp_path: Path) -> None:
-    ser.write_frames(tmp_path / "a.ser", iter([STACK]), STACK.shape, STACK.dtype, bit_depth=12)
+    ser.write_frames(tmp_path / "a.ser", iter([STACK]), StackFacts(STACK.shape, STACK.dtype, bit_depth=12))
     head = bytearray((tmp_path / "a.ser").read_bytes())
     head[82:122] = b"Planetary cam".ljust(40, b"\0")
     head[170:178] = struct.pack("<q", 621_355_968_000_000_000 + int(TAKEN * 1e7))
