@@ -140,15 +140,15 @@ class KernelCache:
         if found is not None:
             return found
         self._begun = time.monotonic()
-        self._tell(None)
+        self._report(None)
         if self._lock(path):
             found = self._read(path, target_context)
             if found is not None:
                 self._unlock(path)
-                self._tell(time.monotonic() - self._begun)
+                self._report(time.monotonic() - self._begun)
         return found
 
-    def _tell(self, seconds: float | None) -> None:
+    def _report(self, seconds: float | None) -> None:
         for listener in _listeners:
             listener(self._function.__name__, seconds)
 
@@ -165,7 +165,7 @@ class KernelCache:
                 _write(path, dumps(result._reduce()))
         finally:
             self._unlock(path)
-            self._tell(time.monotonic() - self._begun)
+            self._report(time.monotonic() - self._begun)
 
     def _path(self, signature: Any, codegen: Any) -> Path:
         import llvmlite

@@ -16,7 +16,7 @@ from pchem_pipeline.model.law.levels_numba import (
     number_range,
     place_codes,
     reach_of_law,
-    share_room,
+    share_scratch,
 )
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN
@@ -99,7 +99,7 @@ def fill_tables(
     """
     most = _longest(start)
     pixel, scratch = pixel_scratch(most + 2, law)
-    detailed, share = mass.size > 0, share_room(most)
+    detailed, share = mass.size > 0, share_scratch(most)
     theta, sums = scratch.small[OWN], np.empty((3, most))
     for p in range(first.size):
         at, n = start[p], start[p + 1] - start[p]
@@ -170,7 +170,7 @@ def sum_outcomes(
     """
     most = _longest(start)
     pixel, scratch = pixel_scratch(most + 2, law)
-    theta, share = scratch.small[OWN], share_room(most)
+    theta, share = scratch.small[OWN], share_scratch(most)
     for p in range(first.size):
         at, n = start[p], start[p + 1] - start[p]
         errors[p] = math.nan

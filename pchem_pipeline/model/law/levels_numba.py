@@ -100,8 +100,8 @@ def place_codes(
 
 
 @kernel
-def share_room(n_codes: int) -> FloatArray:
-    """Return room for what electron numbers give to so many codes."""
+def share_scratch(n_codes: int) -> FloatArray:
+    """Return an array for what electron numbers give to so many codes, see `fill_level`."""
     return np.zeros((2, n_codes + 2 * LANES))
 
 
@@ -216,7 +216,7 @@ def fill_level(
         cells: of the sample.
         codes: of the pixel.
         share: out, the first row from the first of these codes on; the second one is worked in; see
-            :func:`share_room`.
+            :func:`share_scratch`.
     """
     reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(likely), 0.0))
     low, high, _ = _span(k, theta, cells, codes, reach)
@@ -248,7 +248,7 @@ def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
     for k in range(first, end):
         low, high, _ = _span(k, theta, cells, codes, REACH)
         total += max(high - low, 0)
-    number, share = np.empty(n, np.int64), share_room(total)
+    number, share = np.empty(n, np.int64), share_scratch(total)
     lows, highs, start = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     place = 0
     for row in range(n):

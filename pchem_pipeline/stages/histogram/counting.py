@@ -77,8 +77,8 @@ class TileCounter:
         self._histograms.add(frames)
         if self._summaries is not None:
             for sums in self._summaries.add(frames):
-                self._tell({name: part[None] for name, part in vars(sums).items()})
-            self._tell(vars(line_sums(frames)))
+                self._emit_parts({name: part[None] for name, part in vars(sums).items()})
+            self._emit_parts(vars(line_sums(frames)))
 
     def open_sums(self) -> OpenSums | None:
         """Return what the summaries need to go on later, to be taken before `finish`."""
@@ -90,10 +90,10 @@ class TileCounter:
             return self._histograms.finish(), None
         rest, covariances = self._summaries.finish()
         for sums in rest:
-            self._tell({name: part[None] for name, part in vars(sums).items()})
+            self._emit_parts({name: part[None] for name, part in vars(sums).items()})
         return self._histograms.finish(), covariances
 
-    def _tell(self, parts: dict[str, NDArray[Any]]) -> None:
+    def _emit_parts(self, parts: dict[str, NDArray[Any]]) -> None:
         for name, part in parts.items():
             self._emit(name, part)
 
