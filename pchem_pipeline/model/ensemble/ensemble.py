@@ -26,6 +26,7 @@ __all__ = [
     "curve_errors",
     "electron_pmf",
     "ensemble_sums",
+    "mass_sums",
     "nuced_axis",
     "tally",
 ]
@@ -167,6 +168,33 @@ def ensemble_sums(pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis | None = No
         bins_square,
     )
     return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square)
+
+
+def mass_sums(
+    mass: FloatArray, first: IntArray, start: IntArray, pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis
+) -> tuple[EnsembleSums, FloatArray]:
+    """Sum the masses that any law gives to the codes of pixels, at the integer DN and sorted into NUCed bins.
+
+    Their mean replaces that of the PCDs (Hendrickson et al. 2023, eq. full_ensemble_dist).
+
+    Args:
+        mass: of successive codes, one pixel after the other.
+        first: first code of each pixel, DN, shape (n,).
+        start: place of its mass, shape (n + 1,).
+        pixels: the n pixels.
+        dn: axis of the raw prediction; it should hold all of the data.
+        nuced: axis of the NUCed prediction.
+
+    Returns:
+        The sums, and those of the means of the NUCed value (e-) and of its square (e-^2), shape (2,).
+    """
+    raw, raw_square = np.zeros((2, dn.size))
+    bins, bins_square = np.zeros((2, nuced.size))
+    moments = np.zeros(2)
+    _, gain, bias, _ = pixels.maps
+    places = mass, first, start, gain, bias, dn.start
+    ensemble_numba.sort_masses(*places, raw, raw_square, nuced.width, nuced.start, bins, bins_square, moments)
+    return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square), moments
 
 
 def curve_errors(

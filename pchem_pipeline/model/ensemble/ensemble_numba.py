@@ -17,6 +17,7 @@ from pchem_pipeline.model.law.normal_numba import REACH, add_component, add_mass
 __all__ = [
     "curve_variance",
     "poisson_weights",
+    "sort_masses",
     "sum_nuced_cells",
     "sum_nuced_product",
     "sum_pcd_cells",
@@ -131,6 +132,54 @@ def _add_nuced(
     if 0 <= bin_open < nuced.size:
         nuced[bin_open] += held
         nuced_square[bin_open] += held * held
+
+
+@kernel
+def sort_masses(
+    mass: FloatArray,
+    first: IntArray,
+    start: IntArray,
+    gain: FloatArray,
+    bias: FloatArray,
+    dn_start: int,
+    total: FloatArray,
+    total_square: FloatArray,
+    width: float,
+    nuced_start: int,
+    nuced: FloatArray,
+    nuced_square: FloatArray,
+    moments: FloatArray,
+) -> None:
+    """Add every pixel's masses, and their squares, at the integers and in the NUCed bins.
+
+    Args:
+        mass: of successive DN, one pixel after the other.
+        first: first DN of each pixel, shape (n,).
+        start: place of its mass, shape (n + 1,).
+        gain: g, shape (n,).
+        bias: mu, shape (n,).
+        dn_start: first DN of the raw axis.
+        total: out, sums of the masses at each DN.
+        total_square: out, sums of their squares.
+        width: of a NUCed bin, e-.
+        nuced_start: index of the first bin.
+        nuced: out, sums of the masses.
+        nuced_square: out, sums of their squares.
+        moments: out, sums over pixels of the mean of the NUCed value and of its square.
+    """
+    for p in range(first.size):
+        begin = start[p] + max(0, dn_start - first[p])
+        end = min(start[p + 1], start[p] + dn_start + total.size - first[p])
+        if begin >= end:
+            continue
+        part, base = mass[begin:end], first[p] + begin - start[p]
+        for i in range(part.size):
+            value = (base + i - bias[p]) * gain[p]
+            moments[0] += part[i] * value
+            moments[1] += part[i] * value * value
+            total[base + i - dn_start] += part[i]
+            total_square[base + i - dn_start] += part[i] * part[i]
+        _add_nuced(part, float(base), gain[p], bias[p], width, nuced_start, nuced, nuced_square)
 
 
 @kernel

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
-from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, tally
-from pchem_pipeline.model.ensemble.extended_ensemble import extended_sums
+from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, number_tables
+from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, mass_sums, tally
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -98,14 +97,12 @@ def ensemble_tile(
     return integers, floats
 
 
-def _predicted(known: KnownPixels, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
+def _predicted(tables: NumberTables, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
     """Return what the law predicts of pixels that have n samples each."""
     parts: dict[str, Any] = {}
     if axes.extended:
-        extended = extended_sums(pixels, known.satellites, known.law, axes.dn, axes.nuced)
-        sums = extended.sums
-        parts["nuced_predicted_sum"] = extended.nuced_sum
-        parts["nuced_predicted_sum_square"] = extended.nuced_sum_square
+        sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
+        parts["nuced_predicted_sum"], parts["nuced_predicted_sum_square"] = moments
     else:
         sums = ensemble_sums(pixels, axes.dn, axes.nuced)
     return parts | {
@@ -128,7 +125,10 @@ def _group_sums(
     (histograms, n), (histograms_all, n_all) = chosen, everything
     data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
     data_all = tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
-    tables = number_tables(*known.codes(histograms.counts, origin), known.exposure, known, detailed=True)
+    low, high = known.codes(histograms.counts, origin)
+    if np.any(known.law.outlier_share):  # may be anything, on the whole axis
+        low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
+    tables = number_tables(low, high, known.exposure, known, detailed=True)
     numbers, beyond = tables.tally(histograms.counts, origin, axes.n_k)
     expected = tables.outcomes(axes.n_k)
     outside = int(histograms.outside.sum())
@@ -153,4 +153,4 @@ def _group_sums(
         "error": expected.error.sum(),
         "error_variance": np.sum(expected.error * (1.0 - expected.error)),
     }
-    return tallies, parts | _predicted(known, pixels, n, axes)
+    return tallies, parts | _predicted(tables, pixels, n, axes)

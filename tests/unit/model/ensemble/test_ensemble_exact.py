@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import (
     DnAxis,
     NucedAxis,
     electron_pmf,
     ensemble_numba,
     ensemble_sums,
+    mass_sums,
     nuced_axis,
     tally,
 )
 from pchem_pipeline.model.law import normal_numba
+from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.parameters import UsablePixels, usable_pixels
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> UsablePixels:
@@ -179,3 +183,23 @@ def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
     columns = [np.array([v, v]) for v in (2.0, 0.1, 100.0, 3.0)]
     columns[place][1] = value
     np.testing.assert_array_equal(usable_pixels(*columns), [True, False])
+
+
+def test_masses_of_any_law_are_sorted_onto_both_axes() -> None:
+    pixels, dn = make_pixels(8), DnAxis(40, 220)
+    axis = NucedAxis(0.1, -100, 400)
+    law = SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])
+    known = KnownPixels(pixels, law)
+    tables = number_tables(*known.codes(), known.exposure, known, detailed=True)
+    sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, dn, axis)
+    mass = sample_mass(law, pixels, dn.dn)
+    np.testing.assert_allclose(sums.raw, mass.sum(axis=0), atol=1e-11)
+    np.testing.assert_allclose(sums.raw_square, (mass**2).sum(axis=0), atol=1e-11)
+    values = (dn.dn - pixels.bias[:, None]) * pixels.conversion_gain[:, None]
+    place = np.floor(values / axis.width + 0.5).astype(int) - axis.start
+    bins = np.array(
+        [np.bincount(at, weights=row, minlength=400) for at, row in zip(place, mass, strict=True)]
+    )
+    np.testing.assert_allclose(sums.nuced, bins.sum(axis=0), atol=1e-11)
+    np.testing.assert_allclose(sums.nuced_square, (bins**2).sum(axis=0), atol=1e-11)
+    np.testing.assert_allclose(moments, [(mass * values).sum(), (mass * values**2).sum()], rtol=1e-10)
