@@ -237,7 +237,8 @@ class Place(_Part):
 
     def shifted(self, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Place:
         """Return it with its region counted from the corner of a sensor of some shape."""
-        if self.region is None or (rows, columns) == ((0, shape[0]), (0, shape[1])):
+        # a statistic of a part is told on the sensor
+        if self.region is None or "@" in self.statistic or (rows, columns) == ((0, shape[0]), (0, shape[1])):
             return self
         mask = np.zeros(shape, np.bool_)
         inside = mask[slice(*rows), slice(*columns)]

@@ -14,6 +14,7 @@ from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+from pchem_pipeline.effects.framework.region import parse_place
 
 __all__ = [
     "PAIRS",
@@ -243,6 +244,11 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
             spots["region_share"] = suspect.share
         for stretch in frames.get(series_of(name) or "", ())[:1]:
             spots |= {"when": stretch.when.numbers(), "when_p": stretch.p}
+        if (
+            "@" in name
+        ):  # of a part, which is told on the sensor: that is the place, not what stands out of it
+            part = zip(("region", "when"), parse_place(name.partition("@")[2]), strict=True)
+            spots |= {key: place.numbers() for key, place in part if place is not None}
         places.append(
             Place.of(
                 name,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from pchem_pipeline.effects.framework.evidence import SCORES
+from pchem_pipeline.effects.framework.region import parse_place
 
 __all__ = ["EXACT", "FAMILIES", "STATISTICS", "VERSION", "Statistic"]
 
@@ -181,7 +182,8 @@ class _Catalogue(dict[str, Statistic]):
         if not at or whole not in self:
             raise KeyError(name)
         known = self[whole]
-        return replace(known, name=name, sentence=f"{known.sentence} (in {place})")
+        words = ", ".join(each.words() for each in parse_place(place) if each is not None)
+        return replace(known, name=name, sentence=f"{known.sentence} (in {words})")
 
 
 #: Every statistic by name, in the order of the vector.

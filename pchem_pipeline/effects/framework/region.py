@@ -312,7 +312,10 @@ def parse_place(text: str) -> tuple[Region | None, When | None]:
     """
     region: dict[str, Any] = {}
     when: dict[str, Any] = {}
-    for part in text.split(","):
+    if text.startswith("{"):  # as :meth:`Region.text` writes what the grammar has no words for
+        region, end = json.JSONDecoder().raw_decode(text)
+        text = text[end:].removeprefix(",")
+    for part in text.split(",") if text or not region else ():
         name, equals, value = (piece.strip() for piece in part.partition("="))
         try:
             if not equals or name not in _KEYS or not value:

@@ -105,7 +105,9 @@ def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
     assert found[name] == pytest.approx(alone.z["space.x.rr"], rel=0.01)
     assert found[name] > 20.0
     assert STATISTICS[name].family == "space"
-    assert "columns=24:29" in STATISTICS[name].sentence
+    assert "in columns 24 to 28" in STATISTICS[name].sentence
+    boxes = '{"pixels":[[1,2,4]]},frames=3:9'  # what the grammar has no words for
+    assert "frames 3 to 8" in STATISTICS[f"space.x.rr@{boxes}"].sentence
     with pytest.raises(KeyError):
         STATISTICS["nothing@columns=24:29"]
 
@@ -141,4 +143,7 @@ def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     [step] = found.verdict.steps
     assert abs(effect.row_noise_dn - 1.2) < 4.0 * step.parameters["row_noise_dn"].stderr + 0.06
     assert "in columns 64 to 68" in found.verdict.sentence
+    told = [place for place in found.verdict.where if "@" in place.statistic]
+    assert told[0].region == {"columns": [[64, 69]]}
+    assert told[0].shifted((512, 512), window.rows, window.columns) == told[0]
     assert step.place == "columns 64 to 68"
