@@ -30,6 +30,8 @@ DISCREPANCY_PAGE = "discrepancy.html"
 _MOST_PLACES, _MOST_CANDIDATES = 12, 8
 #: Parameters that moved by less than this share of a pixel's standard error did not matter.
 _IMMATERIAL = 0.2
+#: And by less than this did not move.
+_NOT_MOVED = 0.01
 
 #: Verdict to its level and its name.
 VERDICT_WORDS: dict[str, tuple[Level, str]] = {
@@ -288,13 +290,15 @@ def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]
     if size is None:
         return values[0], tuple(values[1:3])
     part = "" if size.samples >= RARE else f", in {percent(size.samples, 1.0)} of the samples"
-    share = f"{percent(size.of_read_noise, 1.0)} of the read noise, {short(size.electrons, 2)} e⁻ rms{part}"
+    share = (
+        f"{short(100.0 * size.of_read_noise, 2)} % of the read noise, {short(size.electrons, 2)} e⁻ rms{part}"
+    )
     return f"{short(size.dn, 2)} DN", (share, values[0])
 
 
 def _moved_fact(found: Verdict) -> list[KeyFact]:
     moved = _largest_move(found.steps)
-    if moved is None:
+    if moved is None or abs(moved[1].in_stderr) < _NOT_MOVED:
         return []
     name, largest = moved
     unit = unit_text(largest.unit)

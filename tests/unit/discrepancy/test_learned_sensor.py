@@ -117,3 +117,18 @@ def test_a_replicate_of_two_parts_has_the_statistics_of_both():
     assert found[0]["shape.C2.mean"] != pytest.approx(found[1]["shape.C2.mean"])
     [alone] = by_part(Replicate("x", maps, (), 1, Acquisition(np.arange(200), 400, 20, 12))())
     assert alone.keys() == found[0].keys()
+
+
+def test_read_noise_that_the_fit_takes_for_signal_is_given_back():
+    """Where peaks overlap every pixel's sigma_R comes out low; histograms drawn again tell by how much."""
+    truth, _, sensor = learnt(PlainCamera(0.4, 1.5, 8.0, (26, 26), 1500, SPREAD), 8)
+
+    def off(posterior):
+        drawn = to_theta(posterior.draw(np.random.default_rng(1)))[:, 3]
+        return drawn - truth[sensor.drawn][:, 3]
+
+    after = off(sensor.posterior)
+    # of the median, and of what was learnt again from 500 pixels
+    error = 1.25 * 1.48 * np.median(np.abs(after - np.median(after))) * np.hypot(1 / 26, 1 / np.sqrt(500))
+    assert np.median(off(sensor.posterior.raised(-sensor.lost))) < -3.0 * error
+    assert abs(np.median(after)) < 3.0 * error
