@@ -51,7 +51,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_pixel,
     make_scratch,
 )
-from pchem_pipeline.model.law.simd_numba import LANES, counting, fused, load_lanes, store_lanes
+from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a satellite
 N_FREQUENCIES = 48  # up to 4.8/sd, the satellite of H = 22
@@ -107,13 +107,13 @@ def ecf_power(
     weights, n_bins = histogram.weights, histogram.n_bins
     base = 2.0 * math.cos(_TWO_PI * step)
     before, present = 2.0, base
-    for m in range(n_frequencies + _SIDE_BY_SIDE * LANES):
+    for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
         work[1, m] = present
         before, present = present, base * present - before
     share = 1.0 / (histogram.n * histogram.n)
-    for m in range(0, n_frequencies, _SIDE_BY_SIDE * LANES):
-        turn1, turn2 = load_lanes(work, 1, m), load_lanes(work, 1, m + LANES)
-        turn3 = load_lanes(work, 1, m + 2 * LANES)
+    for m in range(0, n_frequencies, _SIDE_BY_SIDE * SIMD_WIDTH):
+        turn1, turn2 = simd_load(work, 1, m), simd_load(work, 1, m + SIMD_WIDTH)
+        turn3 = simd_load(work, 1, m + 2 * SIMD_WIDTH)
         odd1 = odd2 = odd3 = counting() * 0.0
         even1 = even2 = even3 = odd1 + (weights[n_bins - 1] if n_bins % 2 == 1 else 0.0)
         for i in range(n_bins // 2 * 2 - 1, 0, -2):
@@ -124,9 +124,9 @@ def ecf_power(
             even1 = fused(turn1, odd1, left - even1)
             even2 = fused(turn2, odd2, left - even2)
             even3 = fused(turn3, odd3, left - even3)
-        store_lanes(work, 0, m, share * (even1 * even1 + odd1 * odd1 - turn1 * even1 * odd1))
-        store_lanes(work, 0, m + LANES, share * (even2 * even2 + odd2 * odd2 - turn2 * even2 * odd2))
-        store_lanes(work, 0, m + 2 * LANES, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
+        simd_store(work, 0, m, share * (even1 * even1 + odd1 * odd1 - turn1 * even1 * odd1))
+        simd_store(work, 0, m + SIMD_WIDTH, share * (even2 * even2 + odd2 * odd2 - turn2 * even2 * odd2))
+        simd_store(work, 0, m + 2 * SIMD_WIDTH, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
 
 
 @kernel(borrows=True)

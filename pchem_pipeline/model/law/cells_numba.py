@@ -81,16 +81,16 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     Scratch,
 )
-from pchem_pipeline.model.law.simd_math_numba import lanes_log, lanes_tail
+from pchem_pipeline.model.law.simd_math_numba import simd_log, simd_tail
 from pchem_pipeline.model.law.simd_numba import (
-    LANES,
+    SIMD_WIDTH,
     counting,
     fused,
     least,
-    load_lanes,
     most,
-    store_lanes,
-    sum_lanes,
+    simd_load,
+    simd_store,
+    simd_sum,
 )
 
 # places in a sample's own parameters
@@ -269,7 +269,7 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
                 edges[i], bottom = -math.inf, i
             elif code + i > facts[CLIP_HIGH]:
                 edges[i], top = math.inf, min(top, i)
-        for i in range(n_bins + 1, n_bins + 1 + LANES):
+        for i in range(n_bins + 1, n_bins + 1 + SIMD_WIDTH):
             edges[i] = math.inf
         facts[BOTTOM], facts[TOP], facts[MARGIN] = float(bottom), float(top), margin
     set_peaks(law, index, amplitude, pixel)
@@ -380,7 +380,7 @@ def _list_numbers(
 @kernel(inline=True)
 def _place_for(part: Component, place: int) -> tuple[int, int]:
     """Return where the edges of a component are kept, and where those of the next one; where only for now."""
-    width = part.high - part.low + 1 + LANES
+    width = part.high - part.low + 1 + SIMD_WIDTH
     if place + width <= EDGES_KEPT:
         return place, place + width
     return EDGES_KEPT, EDGES_KEPT
@@ -391,12 +391,12 @@ def _fill_edges(bins: NDArray[np.float64], part: Component, edges: NDArray[np.fl
     """Fill tail, density and z times density at the edges within reach from column ``place`` on."""
     mean, inverse = part.mean, 1.0 / part.sd
     behind = place
-    for i in range(part.low, part.high + 1, LANES):
-        tail, density, by_z = lanes_tail((load_lanes(bins, EDGE, i) - mean) * inverse)
-        store_lanes(edges, TAIL, behind, tail)
-        store_lanes(edges, DENSITY, behind, density)
-        store_lanes(edges, Z_DENSITY, behind, by_z)
-        behind += LANES
+    for i in range(part.low, part.high + 1, SIMD_WIDTH):
+        tail, density, by_z = simd_tail((simd_load(bins, EDGE, i) - mean) * inverse)
+        simd_store(edges, TAIL, behind, tail)
+        simd_store(edges, DENSITY, behind, density)
+        simd_store(edges, Z_DENSITY, behind, by_z)
+        behind += SIMD_WIDTH
     for row in range(3):  # the last cell of the last lanes has no other edge
         edges[row, behind] = edges[row, behind - 1]
 
@@ -430,23 +430,23 @@ def _add_component(
     by_mean, by_variance = -w / part.sd, -0.5 * w / part.variance
     step1, step2 = by_mean * part.mean_step, by_variance * part.variance_step
     log1, log2 = by_mean * part.mean_log, by_variance * part.variance_log
-    for i in range(part.low, part.high, LANES):
+    for i in range(part.low, part.high, SIMD_WIDTH):
         c = place + i - part.low
-        d0 = load_lanes(edges, TAIL, c + 1) - load_lanes(edges, TAIL, c)
-        d1 = load_lanes(edges, DENSITY, c + 1) - load_lanes(edges, DENSITY, c)
-        d2 = load_lanes(edges, Z_DENSITY, c + 1) - load_lanes(edges, Z_DENSITY, c)
-        store_lanes(room, MASS, i, fused(d0, w, load_lanes(room, MASS, i)))
-        slope = fused(d0, w_exposure, load_lanes(room, SLOPES + _EXPOSURE, i))
-        store_lanes(room, SLOPES + _EXPOSURE, i, slope)
-        slope = fused(d1, step1, fused(d2, step2, load_lanes(room, SLOPES + _STEP, i)))
-        store_lanes(room, SLOPES + _STEP, i, slope)
-        slope = fused(d1, by_mean, load_lanes(room, SLOPES + _BIAS, i))
-        store_lanes(room, SLOPES + _BIAS, i, slope)
-        slope = fused(d1, log1, fused(d2, log2, load_lanes(room, SLOPES + _VARIANCE, i)))
-        store_lanes(room, SLOPES + _VARIANCE, i, slope)
+        d0 = simd_load(edges, TAIL, c + 1) - simd_load(edges, TAIL, c)
+        d1 = simd_load(edges, DENSITY, c + 1) - simd_load(edges, DENSITY, c)
+        d2 = simd_load(edges, Z_DENSITY, c + 1) - simd_load(edges, Z_DENSITY, c)
+        simd_store(room, MASS, i, fused(d0, w, simd_load(room, MASS, i)))
+        slope = fused(d0, w_exposure, simd_load(room, SLOPES + _EXPOSURE, i))
+        simd_store(room, SLOPES + _EXPOSURE, i, slope)
+        slope = fused(d1, step1, fused(d2, step2, simd_load(room, SLOPES + _STEP, i)))
+        simd_store(room, SLOPES + _STEP, i, slope)
+        slope = fused(d1, by_mean, simd_load(room, SLOPES + _BIAS, i))
+        simd_store(room, SLOPES + _BIAS, i, slope)
+        slope = fused(d1, log1, fused(d2, log2, simd_load(room, SLOPES + _VARIANCE, i)))
+        simd_store(room, SLOPES + _VARIANCE, i, slope)
         if w_satellite != 0.0:
-            slope = fused(d0, w_satellite, load_lanes(room, SLOPES + _SATELLITE, i))
-            store_lanes(room, SLOPES + _SATELLITE, i, slope)
+            slope = fused(d0, w_satellite, simd_load(room, SLOPES + _SATELLITE, i))
+            simd_store(room, SLOPES + _SATELLITE, i, slope)
     middle = _cell_of(part.mean, cells, part)
     if part.low <= middle < part.high:  # both tails are those beyond its edges
         room[MASS, middle] += w
@@ -475,8 +475,8 @@ def fill_masses(
     """
     reach, cut = _REACH[stage], _CUT[stage]
     for row in range(N_BLOCK + 1):
-        for i in range(0, cells.n_bins, LANES):
-            store_lanes(room, MASS if row == 0 else SLOPES + row - 1, i, 0.0)
+        for i in range(0, cells.n_bins, SIMD_WIDTH):
+            simd_store(room, MASS if row == 0 else SLOPES + row - 1, i, 0.0)
     count: int = _list_numbers(theta, cells, reach, cut, numbers)
     following = count - count
     for row in range(count):
@@ -531,30 +531,30 @@ def _sum_up(
     Given that a sample is in a code that is not set aside, its score is less by that of their whole mass.
     """
     total = counting() * 0.0
-    for i in range(0, cells.n_bins, LANES):
-        weight, own = load_lanes(cells.bins, WEIGHT, i), most(load_lanes(room, MASS, i), LEAST_MASS)
-        total = fused(weight, lanes_log(own), total)
+    for i in range(0, cells.n_bins, SIMD_WIDTH):
+        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), LEAST_MASS)
+        total = fused(weight, simd_log(own), total)
         # a mass that is hardly one has no slope
         per_mass = least((own - LEAST_MASS) * _TO_ONE, 1.0) / own
-        store_lanes(room, PER_MASS, i, per_mass)
-        store_lanes(room, RATIO, i, weight * per_mass)
-    store_lanes(room, RATIO, cells.n_bins, 0.0)
-    loglik = float(sum_lanes(total))
+        simd_store(room, PER_MASS, i, per_mass)
+        simd_store(room, RATIO, i, weight * per_mass)
+    simd_store(room, RATIO, cells.n_bins, 0.0)
+    loglik = float(simd_sum(total))
     for row in range(DAMPING + N_BLOCK):
         for column in range(N_BLOCK):
             out[row, column] = 0.0
     for row in range(N_BLOCK):
         score = counting() * 0.0
-        for i in range(0, cells.n_bins, LANES):
-            score = fused(load_lanes(room, RATIO, i), load_lanes(room, SLOPES + row, i), score)
-        out[SCORE, row] = sum_lanes(score)
+        for i in range(0, cells.n_bins, SIMD_WIDTH):
+            score = fused(simd_load(room, RATIO, i), simd_load(room, SLOPES + row, i), score)
+        out[SCORE, row] = simd_sum(score)
         for column in range(row + 1):
             square = counting() * 0.0
-            for i in range(0, cells.n_bins, LANES):
-                here = load_lanes(room, RATIO, i) * load_lanes(room, SLOPES + row, i)
-                other = load_lanes(room, PER_MASS, i) * load_lanes(room, SLOPES + column, i)
+            for i in range(0, cells.n_bins, SIMD_WIDTH):
+                here = simd_load(room, RATIO, i) * simd_load(room, SLOPES + row, i)
+                other = simd_load(room, PER_MASS, i) * simd_load(room, SLOPES + column, i)
                 square = fused(here, other, square)
-            out[DAMPING + row, column] = sum_lanes(square)
+            out[DAMPING + row, column] = simd_sum(square)
     if cells.outlier_share > 0.0:
         for i in range(cells.n_bins):
             room[RATIO, i] *= 1.0 - cells.outlier_share
@@ -609,23 +609,23 @@ def _hermite_sums(
     """Return the sums over cells of ratio times the difference of Phi, phi, z phi, He2 phi, He3 phi."""
     mean, inverse = part.mean, 1.0 / part.sd
     s0 = s1 = s2 = s3 = s4 = counting() * 0.0
-    for i in range(part.low, part.high, LANES):
-        c, ratio = place + i - part.low, load_lanes(room, RATIO, i)
-        s0 = fused(ratio, load_lanes(edges, TAIL, c + 1) - load_lanes(edges, TAIL, c), s0)
-        density0, density1 = load_lanes(edges, DENSITY, c), load_lanes(edges, DENSITY, c + 1)
-        by_z0, by_z1 = load_lanes(edges, Z_DENSITY, c), load_lanes(edges, Z_DENSITY, c + 1)
+    for i in range(part.low, part.high, SIMD_WIDTH):
+        c, ratio = place + i - part.low, simd_load(room, RATIO, i)
+        s0 = fused(ratio, simd_load(edges, TAIL, c + 1) - simd_load(edges, TAIL, c), s0)
+        density0, density1 = simd_load(edges, DENSITY, c), simd_load(edges, DENSITY, c + 1)
+        by_z0, by_z1 = simd_load(edges, Z_DENSITY, c), simd_load(edges, Z_DENSITY, c + 1)
         s1 = fused(ratio, density1 - density0, s1)
         s2 = fused(ratio, by_z1 - by_z0, s2)
         # where an edge is infinite, both are 0
-        z0 = most(least((load_lanes(cells.bins, EDGE, i) - mean) * inverse, FARTHEST), -FARTHEST)
-        z1 = most(least((load_lanes(cells.bins, EDGE, i + 1) - mean) * inverse, FARTHEST), -FARTHEST)
+        z0 = most(least((simd_load(cells.bins, EDGE, i) - mean) * inverse, FARTHEST), -FARTHEST)
+        z1 = most(least((simd_load(cells.bins, EDGE, i + 1) - mean) * inverse, FARTHEST), -FARTHEST)
         s3 = fused(ratio, z1 * by_z1 - density1 - (z0 * by_z0 - density0), s3)
         s4 = fused(ratio, (z1 * z1 - 3.0) * by_z1 - (z0 * z0 - 3.0) * by_z0, s4)
-    whole = float(sum_lanes(s0))
+    whole = float(simd_sum(s0))
     middle = _cell_of(part.mean, cells, part)
     if part.low <= middle < part.high:
         whole += room[RATIO, middle]
-    return whole, float(sum_lanes(s1)), float(sum_lanes(s2)), float(sum_lanes(s3)), float(sum_lanes(s4))
+    return whole, float(simd_sum(s1)), float(simd_sum(s2)), float(simd_sum(s3)), float(simd_sum(s4))
 
 
 @kernel(inline=True)

@@ -52,18 +52,18 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     Scratch,
 )
-from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, lanes_exp, lanes_log
+from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, simd_exp, simd_log
 from pchem_pipeline.model.law.simd_numba import (
-    LANES,
+    SIMD_WIDTH,
     counting,
     exponent_of,
     fused,
     least,
-    load_lanes,
     most,
     scaled,
-    store_lanes,
-    sum_lanes,
+    simd_load,
+    simd_store,
+    simd_sum,
 )
 
 _DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
@@ -103,32 +103,32 @@ def _table_kernel(width: int) -> Callable[..., Any]:
         half = float(terms // 2)
         loglik = sum_m1 = sum_m2 = sum_low_m1 = sum_d_m1 = sum_low_d = counting() * 0.0
         v11 = v11w = v11d = v11ww = v11dw = v11dd = v12 = v12w = v12d = v22 = loglik
-        for i in range(0, columns, LANES):
-            c, offset = load_lanes(table, _WEIGHT, i), load_lanes(table, _OFFSET, i)
-            place = load_lanes(table, _NEAREST, i)
+        for i in range(0, columns, SIMD_WIDTH):
+            c, offset = simd_load(table, _WEIGHT, i), simd_load(table, _OFFSET, i)
+            place = simd_load(table, _NEAREST, i)
             low = most(place - half, 0.0)
             d = fused(place - low, a, offset)
-            ratio = lanes_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+            ratio = simd_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
             power = ratio
-            term = load_lanes(table, _COEFFICIENT + 1, i) * power
-            s0 = load_lanes(table, _COEFFICIENT, i) + term
+            term = simd_load(table, _COEFFICIENT + 1, i) * power
+            s0 = simd_load(table, _COEFFICIENT, i) + term
             s1 = s2 = s3 = s4 = term
             for k in range(2, terms):
                 power = power * ratio
-                term = load_lanes(table, _COEFFICIENT + k, i) * power
+                term = simd_load(table, _COEFFICIENT + k, i) * power
                 number = float(k)
                 s0 = s0 + term
                 s1 = fused(term, number, s1)
                 s2 = fused(term, number * number, s2)
                 s3 = fused(term, number * number * number, s3)
                 s4 = fused(term, number * number * number * number, s4)
-            # log(s0) as in `lanes_log`, its division shared with 1 / s0
+            # log(s0) as in `simd_log`, its division shared with 1 / s0
             exponent = exponent_of(s0 * ROOT2)
             fraction = scaled(s0, 0.0 - exponent)
             above = fraction + 1.0
             shared = 1.0 / (s0 * above)
             each, q = shared * above, (fraction - 1.0) * (shared * s0)
-            logged = fused(q + q, artanh_series(q * q), load_lanes(table, _LEVEL, i))
+            logged = fused(q + q, artanh_series(q * q), simd_load(table, _LEVEL, i))
             logged = fused(offset * (0.0 - inverse), fused(offset, -0.5, d), fused(exponent, LN2, logged))
             loglik = fused(c, logged, loglik)
             m1, m2, share = s1 * each, s2 * each, c * each
@@ -142,13 +142,13 @@ def _table_kernel(width: int) -> Callable[..., Any]:
             v11w, v11d = v11w + c11w, v11d + c11d
             v11ww, v11dw, v11dd = fused(c11w, w, v11ww), fused(c11d, w, v11dw), fused(c11d, d, v11dd)
             v12w, v12d = fused(c12, w, v12w), fused(c12, d, v12d)
-        totals[_LOGLIK] += sum_lanes(loglik)
+        totals[_LOGLIK] += simd_sum(loglik)
         first = (sum_m1, sum_m2, sum_low_m1, sum_d_m1, sum_low_d)
         second = (v11, v11w, v11d, v11ww, v11dw, v11dd, v12, v12w, v12d, v22)
         for number_of, value in enumerate(first):
-            totals[_M1 + number_of] += sum_lanes(value)
+            totals[_M1 + number_of] += simd_sum(value)
         for number_of, value in enumerate(second):
-            totals[_V11 + number_of] += sum_lanes(value)
+            totals[_V11 + number_of] += simd_sum(value)
 
     compiled: Callable[..., Any] = table_sums
     return compiled
@@ -177,11 +177,11 @@ def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure:
     """Fill ``H / k`` of k from ``first`` on, its inverse and its logarithm, by the eight; 1 / k of k = 0."""
     exposure = math.exp(log_exposure)
     inverse = 1.0 / exposure
-    for i in range(0, count, LANES):
+    for i in range(0, count, SIMD_WIDTH):
         k = most(counting() + float(first + i), 1.0)
-        store_lanes(rows, _RISE, i, exposure / k)
-        store_lanes(rows, _FALL, i, k * inverse)
-        store_lanes(rows, _LOG_RISE, i, log_exposure - lanes_log(k))
+        simd_store(rows, _RISE, i, exposure / k)
+        simd_store(rows, _FALL, i, k * inverse)
+        simd_store(rows, _LOG_RISE, i, log_exposure - simd_log(k))
 
 
 @kernel(inline=True)
@@ -215,13 +215,13 @@ def _fill_coefficients(
     for step in range(width - place):
         if step > 0:
             coefficient *= powers[step] * rise[place_of + step]
-        for i in range(0, n, LANES):
-            store_lanes(table, _COEFFICIENT + place + step, filled + i, coefficient)
+        for i in range(0, n, SIMD_WIDTH):
+            simd_store(table, _COEFFICIENT + place + step, filled + i, coefficient)
     coefficient = 1.0
     for step in range(1, place + 1):
         coefficient *= powers[step] * fall[place_of - step + 1]
-        for i in range(0, n, LANES):
-            store_lanes(table, _COEFFICIENT + place - step, filled + i, coefficient)
+        for i in range(0, n, SIMD_WIDTH):
+            simd_store(table, _COEFFICIENT + place - step, filled + i, coefficient)
 
 
 @kernel(borrows=True)
@@ -241,7 +241,7 @@ def _sum_table(
     With ``frames``, also leave the counts expected of the columns, which end before DN ``end``.
     """
     for row in range(_COEFFICIENT + width):
-        store_lanes(table, row, filled, 1.0 if row == _COEFFICIENT else 0.0)
+        simd_store(table, row, filled, 1.0 if row == _COEFFICIENT else 0.0)
     if width == 3:
         table_sums_3(table, filled, 3, a, inverse, totals)
     elif width == 5:
@@ -269,18 +269,18 @@ def _expect(
 ) -> None:
     """Leave the counts expected of the DN in the table in ``out`` from ``start`` on."""
     half = float(width // 2)
-    for first in range(0, filled, LANES):
-        offset = load_lanes(table, _OFFSET, first)
-        ratio = lanes_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+    for first in range(0, filled, SIMD_WIDTH):
+        offset = simd_load(table, _OFFSET, first)
+        ratio = simd_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
         power = ratio
-        density = load_lanes(table, _COEFFICIENT, first)
+        density = simd_load(table, _COEFFICIENT, first)
         for k in range(1, width):
-            density = fused(load_lanes(table, _COEFFICIENT + k, first), power, density)
+            density = fused(simd_load(table, _COEFFICIENT + k, first), power, density)
             power = power * ratio
-        shift = least(load_lanes(table, _NEAREST, first), half) * a
-        level = fused(offset * (0.0 - inverse), fused(offset, 0.5, shift), load_lanes(table, _LEVEL, first))
-        level = lanes_exp(most(least(level, -_SMALLEST), _SMALLEST))
-        store_lanes(table, _WEIGHT, first, density * frames * level)
+        shift = least(simd_load(table, _NEAREST, first), half) * a
+        level = fused(offset * (0.0 - inverse), fused(offset, 0.5, shift), simd_load(table, _LEVEL, first))
+        level = simd_exp(most(least(level, -_SMALLEST), _SMALLEST))
+        simd_store(table, _WEIGHT, first, density * frames * level)
     for i in range(filled):
         out[start + i] = table[_WEIGHT, i]
 
@@ -370,10 +370,10 @@ def _fill(
     n = stop - start
     for i in range(n):
         table[_WEIGHT, filled + i] = weights[start + i]
-    for i in range(0, n, LANES):
-        store_lanes(table, _OFFSET, filled + i, counting() + (offset + i))
-        store_lanes(table, _NEAREST, filled + i, float(place))
-        store_lanes(table, _LEVEL, filled + i, level)
+    for i in range(0, n, SIMD_WIDTH):
+        simd_store(table, _OFFSET, filled + i, counting() + (offset + i))
+        simd_store(table, _NEAREST, filled + i, float(place))
+        simd_store(table, _LEVEL, filled + i, level)
 
 
 @kernel(inline=True)

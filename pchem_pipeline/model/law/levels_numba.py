@@ -30,8 +30,8 @@ from pchem_pipeline.model.law.pixel_numba import (
     SHARE_SLOPE,
     Pixel,
 )
-from pchem_pipeline.model.law.simd_math_numba import lanes_tail
-from pchem_pipeline.model.law.simd_numba import LANES, fused, load_lanes, store_lanes
+from pchem_pipeline.model.law.simd_math_numba import simd_tail
+from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
 
 __all__ = [
     "Codes",
@@ -102,7 +102,7 @@ def place_codes(
 @kernel
 def share_scratch(n_codes: int) -> FloatArray:
     """Return an array for what electron numbers give to so many codes, see `fill_level`."""
-    return np.zeros((2, n_codes + 2 * LANES))
+    return np.zeros((2, n_codes + 2 * SIMD_WIDTH))
 
 
 @kernel(borrows=True)
@@ -171,12 +171,12 @@ def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, l
 def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
     """Add the mass of whole codes to the first row of ``share``; the second gets the tails at their edges."""
     mean, inverse = part.mean, 1.0 / part.sd
-    for i in range(low, high + 1, LANES):
-        tail, _, _ = lanes_tail((load_lanes(cells.bins, EDGE, i) - mean) * inverse)
-        store_lanes(share, 1, i - low, tail)
-    for i in range(0, high - low, LANES):
-        inside = load_lanes(share, 1, i + 1) - load_lanes(share, 1, i)
-        store_lanes(share, 0, i, fused(inside, weight, load_lanes(share, 0, i)))
+    for i in range(low, high + 1, SIMD_WIDTH):
+        tail, _, _ = simd_tail((simd_load(cells.bins, EDGE, i) - mean) * inverse)
+        simd_store(share, 1, i - low, tail)
+    for i in range(0, high - low, SIMD_WIDTH):
+        inside = simd_load(share, 1, i + 1) - simd_load(share, 1, i)
+        simd_store(share, 0, i, fused(inside, weight, simd_load(share, 0, i)))
     for i in range(low, high):
         if cells.bins[EDGE, i] <= mean < cells.bins[EDGE, i + 1]:  # both tails are those beyond its edges
             share[0, i - low] += weight

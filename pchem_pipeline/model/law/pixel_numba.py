@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.simd_numba import LANES
+from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH
 
 FloatArray = NDArray[np.float64]
 
@@ -123,7 +123,8 @@ class Pixel(NamedTuple):
 
     Attributes:
         bins: by sample: counts, their sums before each DN, the counts expected (out of an evaluation), lower
-            edges of the cells, 1 for codes that are not set aside; shape (J, N_BIN_ROWS, bins + 1 + LANES).
+            edges of the cells, 1 for codes that are not set aside; shape (J, N_BIN_ROWS, bins + 1 +
+            SIMD_WIDTH).
         facts: numbers of each sample, shape (J, N_FACTS).
         peaks: satellite peaks of each sample, shape (J, N_PEAK_ROWS, enough); weight 0 where there are fewer.
         mixtures: of exposures, shape (J, N_MIXTURE_ROWS, enough); weight 0 where there are fewer.
@@ -146,9 +147,9 @@ class Scratch(NamedTuple):
         rows: of the density and of the starts, shape (N_DENSITY_ROWS, enough).
         table: a column for each DN, of the density.
         numbers: electron numbers in use with P(k) and its two derivatives, shape (enough, 4).
-        cells: of each sample, shape (J, N_CELL_ROWS, bins + 1 + LANES).
+        cells: of each sample, shape (J, N_CELL_ROWS, bins + 1 + SIMD_WIDTH).
         edges: of all components of a sample, one after another, as far as there is room; and then of one,
-            shape (3, EDGES_KEPT + bins + 1 + 2 LANES).
+            shape (3, EDGES_KEPT + bins + 1 + 2 SIMD_WIDTH).
         small: vectors and matrices, shape (N_SMALL, J + N_SHARED).
         flags: parameters that stay, shape (2, J + N_SHARED).
         evaluations: shape (3, J, N_ROWS, N_BLOCK).
@@ -167,13 +168,13 @@ class Scratch(NamedTuple):
 @kernel
 def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
     """Return room for so many samples of at most so many bins; ``cells``: also to integrate them."""
-    width = n_bins + 1 + LANES if cells else 0
+    width = n_bins + 1 + SIMD_WIDTH if cells else 0
     return Scratch(
         np.empty((N_DENSITY_ROWS, n_bins + _MIN_COLUMNS)),
-        np.empty((MAX_COMPONENTS + 5, CAPACITY + LANES)),
+        np.empty((MAX_COMPONENTS + 5, CAPACITY + SIMD_WIDTH)),
         np.empty((n_bins + 512 if cells else 0, 4)),
         np.zeros((n_samples, N_CELL_ROWS, width)),
-        np.zeros((3, EDGES_KEPT + width + LANES if cells else 0)),
+        np.zeros((3, EDGES_KEPT + width + SIMD_WIDTH if cells else 0)),
         np.zeros((N_SMALL, n_samples + N_SHARED)),
         np.zeros((2, n_samples + N_SHARED), np.bool_),
         np.zeros((3, n_samples, N_ROWS, N_BLOCK)),
@@ -195,7 +196,7 @@ def make_pixel(dark: NDArray[np.bool_], n_bins: int, n_peaks: int, n_exposures: 
     for j in range(n):
         facts[j, DARK] = 1.0 if dark[j] else 0.0
     return Pixel(
-        np.zeros((n, N_BIN_ROWS, n_bins + 1 + LANES)),
+        np.zeros((n, N_BIN_ROWS, n_bins + 1 + SIMD_WIDTH)),
         facts,
         np.zeros((n, N_PEAK_ROWS, n_peaks)),
         np.zeros((n, N_MIXTURE_ROWS, n_exposures)),
@@ -259,7 +260,7 @@ def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray,
         moment += c * i
         if c > 0.0:
             occupied += 1
-    for i in range(n_bins, n_bins + LANES):
+    for i in range(n_bins, n_bins + SIMD_WIDTH):
         weights[i] = kept[i] = 0.0
     n = cumulative[n_bins]
     facts[N_BINS], facts[N_FRAMES], facts[OCCUPIED] = float(n_bins), n, float(occupied)

@@ -6,7 +6,7 @@ import math
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.simd_numba import (
-    Lanes,
+    Simd,
     counting,
     exponent_of,
     fused,
@@ -53,7 +53,7 @@ _PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @kernel(borrows=True)
-def artanh_series(z: Lanes) -> Lanes:
+def artanh_series(z: Simd) -> Simd:
     """Return ``artanh(q) / q`` of ``z = q^2``."""
     top, rest = _ARTANH
     series = fused(z, fused(z, fused(z, top[0], top[1]), top[2]), top[3])
@@ -61,7 +61,7 @@ def artanh_series(z: Lanes) -> Lanes:
 
 
 @kernel(borrows=True)
-def lanes_log(x: Lanes) -> Lanes:
+def simd_log(x: Simd) -> Simd:
     """Return log(x) of positive normal numbers.
 
     From the exponent and ``2 artanh((f - 1)/(f + 1))`` of the fraction f in [sqrt(1/2), sqrt(2)).
@@ -73,7 +73,7 @@ def lanes_log(x: Lanes) -> Lanes:
 
 
 @kernel(borrows=True)
-def lanes_exp(x: Lanes) -> Lanes:
+def simd_exp(x: Simd) -> Simd:
     """Return exp(x) of numbers between -700 and 700: ``2^n`` and a polynomial for the rest."""
     top, middle, rest = _EXP
     power = nearest(x * _PER_LN2)
@@ -84,7 +84,7 @@ def lanes_exp(x: Lanes) -> Lanes:
 
 
 @kernel(borrows=True)
-def lanes_tail(z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+def simd_tail(z: Simd) -> tuple[Simd, Simd, Simd]:
     """Return the nearer tail of the normal law, negative above the middle, the density, and z times that.
 
     The difference of two such tails is the mass between two values on one side of the middle without
@@ -102,6 +102,6 @@ def lanes_tail(z: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     for power in range(len(_TAIL_ODD)):
         odd = fused(odd, square, _TAIL_ODD[power])
         even = fused(even, square, _TAIL_EVEN[power])
-    bell = lanes_exp(near * near * -0.5)
+    bell = simd_exp(near * near * -0.5)
     density = bell * _PER_ROOT_2PI
     return side * bell * fused(odd, t, even) * beside * both, density, near * density

@@ -4,11 +4,11 @@ A sum over the columns of a table runs in eight lanes, each with a partial sum o
 says itself whether it rounds once or twice. So the compiler needs no leave to reorder or to contract, and the
 bits do not depend on how, or how often, it optimises; the vector instructions are there all the same.
 
-In compiled functions a value of `Lanes` is an LLVM vector; in plain Python the same code runs on numpy arrays
+In compiled functions a value of `Simd` is an LLVM vector; in plain Python the same code runs on numpy arrays
 of eight. Operators are ``+ - * /`` of lanes with lanes or numbers; the functions are below.
 
 The compiler is taught the vector through parts of numba that may change. Where it cannot be taught, the same
-loops run on one number at a time: ``LANES`` is 1, sums are slower and other in the last bits.
+loops run on one number at a time: ``SIMD_WIDTH`` is 1, sums are slower and other in the last bits.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 from numpy.typing import NDArray
 
-Lanes: TypeAlias = NDArray[np.float64]
-Value: TypeAlias = Lanes | float
+Simd: TypeAlias = NDArray[np.float64]
+Value: TypeAlias = Simd | float
 
 _WIDTH = 8  # doubles in the widest vector register
 _DOUBLES = ir.VectorType(ir.DoubleType(), _WIDTH)
@@ -41,18 +41,18 @@ _MANTISSA_BITS = 52
 _EXPONENT_BIAS = 1023
 
 
-class _LanesType(types.Type):
-    """The compiler's type of `Lanes`; a number becomes one with the same value in each lane."""
+class _SimdType(types.Type):
+    """The compiler's type of `Simd`; a number becomes one with the same value in each lane."""
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
         """Allow numbers wherever lanes are expected."""
         return Conversion.safe if isinstance(other, types.Float | types.Integer) else None
 
 
-_LANES = _LanesType(name="Lanes")
+_SIMD = _SimdType(name="Simd")
 
 
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+class _SimdModel(models.PrimitiveModel):  # type: ignore[misc]
     """A vector of the machine."""
 
     def __init__(self, manager: Any, kind: Any) -> None:
@@ -75,20 +75,20 @@ def _from_number(context: Any, builder: Any, kind: Any, _target: Any, value: Any
 
 def _operator(function: Any, name: str) -> None:
     """Teach the compiler an operator of two lanes."""
-    cases = [signature(_LANES, _LANES, _LANES)]
+    cases = [signature(_SIMD, _SIMD, _SIMD)]
     infer_global(function)(type(f"_Lanes_{name}", (ConcreteTemplate,), {"cases": cases}))
 
     def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return getattr(builder, name)(*arguments)
 
-    lower_builtin(function, _LanesType, _LanesType)(emit)
+    lower_builtin(function, _SimdType, _SimdType)(emit)
 
 
 def _teach_compiler() -> None:
     """Teach the compiler the type, its operators, and that a number may stand for lanes of that number."""
-    register_model(_LanesType)(_LanesModel)
+    register_model(_SimdType)(_SimdModel)
     for kind in (types.Float, types.Integer):
-        lower_cast(kind, _LanesType)(_from_number)
+        lower_cast(kind, _SimdType)(_from_number)
     operators = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
     for function, name in operators.items():
         _operator(function, name)
@@ -103,7 +103,7 @@ def _call(builder: Any, name: str, *arguments: Any) -> Any:
 
 def _elementwise(name: str, arity: int) -> Callable[..., Any]:
     """Return a generator of code and its signature for an LLVM intrinsic of so many lanes."""
-    kind = signature(_LANES, *[_LANES] * arity)
+    kind = signature(_SIMD, *[_SIMD] * arity)
 
     def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return _call(builder, name, *arguments)
@@ -117,7 +117,7 @@ def _chosen(comparison: str) -> Callable[..., Any]:
     def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered(comparison, *arguments), *arguments)
 
-    return lambda: (signature(_LANES, _LANES, _LANES), emit)
+    return lambda: (signature(_SIMD, _SIMD, _SIMD), emit)
 
 
 _FMA, _ROUND, _LEAST, _MOST = _elementwise("fma", 3), _elementwise("rint", 1), _chosen("<"), _chosen(">")
@@ -150,7 +150,7 @@ def _exponent_of(_typing: Any, _x: Any) -> Any:
         exponent = builder.lshr(words, _constant(_WORDS, _MANTISSA_BITS))
         return builder.sitofp(builder.sub(exponent, _constant(_WORDS, _EXPONENT_BIAS)), _DOUBLES)
 
-    return signature(_LANES, _LANES), emit
+    return signature(_SIMD, _SIMD), emit
 
 
 @intrinsic
@@ -159,7 +159,7 @@ def _fraction_of(_typing: Any, _x: Any) -> Any:
         words = builder.and_(builder.bitcast(arguments[0], _WORDS), _constant(_WORDS, _MANTISSA))
         return builder.bitcast(builder.or_(words, _constant(_WORDS, _ONE)), _DOUBLES)
 
-    return signature(_LANES, _LANES), emit
+    return signature(_SIMD, _SIMD), emit
 
 
 @intrinsic
@@ -168,7 +168,7 @@ def _scaled(_typing: Any, _x: Any, _power: Any) -> Any:
         power = builder.shl(builder.fptosi(arguments[1], _WORDS), _constant(_WORDS, _MANTISSA_BITS))
         return builder.bitcast(builder.add(builder.bitcast(arguments[0], _WORDS), power), _DOUBLES)
 
-    return signature(_LANES, _LANES, _LANES), emit
+    return signature(_SIMD, _SIMD, _SIMD), emit
 
 
 @intrinsic
@@ -176,7 +176,7 @@ def _counting(_typing: Any) -> Any:
     def emit(_context: Any, _builder: Any, _signature: Any, _arguments: Any) -> Any:
         return ir.Constant(_DOUBLES, [ir.Constant(ir.DoubleType(), float(i)) for i in range(_WIDTH)])
 
-    return signature(_LANES), emit
+    return signature(_SIMD), emit
 
 
 def _place(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -192,7 +192,7 @@ def _load(_typing: Any, table: Any, _row: Any, _column: Any) -> Any:
     def emit(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         return builder.load(_place(context, builder, sig, arguments), align=8, typ=_DOUBLES)
 
-    return signature(_LANES, table, types.intp, types.intp), emit
+    return signature(_SIMD, table, types.intp, types.intp), emit
 
 
 @intrinsic
@@ -201,7 +201,7 @@ def _store(_typing: Any, table: Any, _row: Any, _column: Any, _x: Any) -> Any:
         builder.store(arguments[3], _place(context, builder, sig, arguments), align=8)
         return context.get_dummy_value()
 
-    return signature(types.void, table, types.intp, types.intp, _LANES), emit
+    return signature(types.void, table, types.intp, types.intp, _SIMD), emit
 
 
 def _part(builder: Any, vector: Any, first: int, size: int) -> Any:
@@ -221,60 +221,60 @@ def _sum(_typing: Any, _x: Any) -> Any:
             part = builder.fadd(low, high)
         return builder.extract_element(part, ir.Constant(ir.IntType(32), 0))
 
-    return signature(types.float64, _LANES), emit
+    return signature(types.float64, _SIMD), emit
 
 
-def fused(x: Value, y: Value, z: Value) -> Lanes:
+def fused(x: Value, y: Value, z: Value) -> Simd:
     """Return ``x y + z``, compiled: rounded once."""
     return np.asarray(x * y + z)
 
 
-def nearest(x: Lanes) -> Lanes:
+def nearest(x: Simd) -> Simd:
     """Return the nearest whole numbers."""
     return np.asarray(np.rint(x))
 
 
-def least(x: Value, y: Value) -> Lanes:
+def least(x: Value, y: Value) -> Simd:
     """Return the smaller of each two."""
     return np.asarray(np.minimum(x, y))
 
 
-def most(x: Value, y: Value) -> Lanes:
+def most(x: Value, y: Value) -> Simd:
     """Return the larger of each two."""
     return np.asarray(np.maximum(x, y))
 
 
-def exponent_of(x: Lanes) -> Lanes:
+def exponent_of(x: Simd) -> Simd:
     """Return floor(log2 x) of positive normal numbers."""
     return np.asarray(np.frexp(x)[1] - 1.0)
 
 
-def fraction_of(x: Lanes) -> Lanes:
+def fraction_of(x: Simd) -> Simd:
     """Return x over its largest power of two, in [1, 2), of positive normal numbers."""
     return np.asarray(2.0 * np.frexp(x)[0])
 
 
-def scaled(x: Lanes, power: Lanes) -> Lanes:
+def scaled(x: Simd, power: Simd) -> Simd:
     """Return ``x 2^power`` for whole powers that leave it a normal number."""
     return np.asarray(np.ldexp(x, np.asarray(power).astype(int)))
 
 
-def counting() -> Lanes:
+def counting() -> Simd:
     """Return 0 ... 7."""
-    return np.arange(float(LANES))
+    return np.arange(float(SIMD_WIDTH))
 
 
-def load_lanes(table: NDArray[np.float64], row: int, column: int) -> Lanes:
+def simd_load(table: NDArray[np.float64], row: int, column: int) -> Simd:
     """Return eight successive elements of a row of a table."""
-    return table[row, column : column + LANES].copy()
+    return table[row, column : column + SIMD_WIDTH].copy()
 
 
-def store_lanes(table: NDArray[np.float64], row: int, column: int, x: Value) -> None:
+def simd_store(table: NDArray[np.float64], row: int, column: int, x: Value) -> None:
     """Write eight successive elements of a row of a table."""
-    table[row, column : column + LANES] = x
+    table[row, column : column + SIMD_WIDTH] = x
 
 
-def sum_lanes(x: Lanes) -> float:
+def simd_sum(x: Simd) -> float:
     """Return the sum, in a fixed order."""
     parts = list(x)
     while len(parts) > 1:
@@ -294,9 +294,9 @@ _VECTOR: dict[Callable[..., Any], _Choice] = {
     fraction_of: lambda x: lambda x: _fraction_of(x),
     scaled: lambda x, power: lambda x, power: _scaled(x, power),
     counting: lambda: lambda: _counting(),
-    load_lanes: lambda table, row, column: lambda table, row, column: _load(table, row, column),
-    store_lanes: lambda table, row, column, x: lambda table, row, column, x: _store(table, row, column, x),
-    sum_lanes: lambda x: lambda x: _sum(x),
+    simd_load: lambda table, row, column: lambda table, row, column: _load(table, row, column),
+    simd_store: lambda table, row, column, x: lambda table, row, column, x: _store(table, row, column, x),
+    simd_sum: lambda x: lambda x: _sum(x),
 }
 
 
@@ -309,11 +309,11 @@ _SCALAR: dict[Callable[..., Any], _Choice] = {
     fraction_of: lambda x: lambda x: 2.0 * math.frexp(x)[0],
     scaled: lambda x, power: lambda x, power: math.ldexp(x, int(power)),
     counting: lambda: lambda: 0.0,
-    load_lanes: lambda table, row, column: lambda table, row, column: table[row, column],
-    store_lanes: lambda table, row, column, x: (
+    simd_load: lambda table, row, column: lambda table, row, column: table[row, column],
+    simd_store: lambda table, row, column, x: (
         lambda table, row, column, x: operator.setitem(table, (row, column), x)
     ),
-    sum_lanes: lambda x: lambda x: x,
+    simd_sum: lambda x: lambda x: x,
 }
 
 
@@ -332,7 +332,7 @@ def _named(function: Callable[..., Any], choose: _Choice) -> _Choice:
     return chosen
 
 
-def _lanes() -> int:
+def _simd_width() -> int:
     """Teach the compiler the functions above; return how many numbers lie side by side."""
     try:
         _teach_compiler()
@@ -350,4 +350,4 @@ def _lanes() -> int:
 
 
 #: Numbers side by side: 8, or 1 where the compiler cannot be taught vectors.
-LANES = _lanes()
+SIMD_WIDTH = _simd_width()

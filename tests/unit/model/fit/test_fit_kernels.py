@@ -34,7 +34,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     Scratch,
     histogram_of,
 )
-from pchem_pipeline.model.law.simd_numba import counting, least, load_lanes, most, store_lanes
+from pchem_pipeline.model.law.simd_numba import counting, least, most, simd_load, simd_store
 
 # (H, 1/g, s_e) from needles to unresolved peaks, and a hot pixel
 CASES = [
@@ -166,9 +166,9 @@ def test_compiled_evaluation_equals_plain() -> None:
     np.testing.assert_allclose(sample.at, compiled, rtol=1e-9, atol=1e-7)
 
 
-def take_plain_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+def take_plain_simd(monkeypatch: pytest.MonkeyPatch) -> None:
     """From here on loops in plain Python take their lanes from numpy; nothing can be compiled."""
-    for name in ("artanh_series", "lanes_exp", "lanes_log"):
+    for name in ("artanh_series", "simd_exp", "simd_log"):
         plain = getattr(simd_math_numba, name).py_func
         for module in (simd_math_numba, density_numba):
             monkeypatch.setattr(module, name, plain)
@@ -194,7 +194,7 @@ def test_compiled_table_equals_plain_at_every_width(monkeypatch: pytest.MonkeyPa
         for function in (kernel, density_numba.table_sums_any, kernel.py_func):
             totals = np.zeros(18)
             if function is kernel.py_func:
-                take_plain_lanes(monkeypatch)
+                take_plain_simd(monkeypatch)
             function(table, columns, width, a, inverse, totals)
             answers.append(totals)
         monkeypatch.undo()
@@ -216,21 +216,21 @@ def test_compiled_table_equals_plain_at_every_width(monkeypatch: pytest.MonkeyPa
         assert answers[0][17] == pytest.approx(c @ fourth, rel=1e-9)
 
 
-def test_lanes_are_the_functions_that_they_are_named_after(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simd_are_the_functions_that_they_are_named_after(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     table, plain = np.zeros((4, 2000)), np.zeros((4, 2000))
 
     def fill(table: NDArray[np.float64]) -> None:
         for i in range(0, table.shape[1], 8):
-            x = load_lanes(table, 0, i)
-            store_lanes(table, 1, i, simd_math_numba.lanes_exp(x))
-            store_lanes(table, 2, i, simd_math_numba.lanes_log(load_lanes(table, 1, i)))
-            store_lanes(table, 3, i, most(least(x, 1.0), -2.0) - counting())
+            x = simd_load(table, 0, i)
+            simd_store(table, 1, i, simd_math_numba.simd_exp(x))
+            simd_store(table, 2, i, simd_math_numba.simd_log(simd_load(table, 1, i)))
+            simd_store(table, 3, i, most(least(x, 1.0), -2.0) - counting())
 
     table[0] = rng.uniform(-690, 690, 2000)
     plain[0] = table[0]
     nb.njit(fill)(table)
-    take_plain_lanes(monkeypatch)
+    take_plain_simd(monkeypatch)
     fill(plain)
     np.testing.assert_allclose(table[1], np.exp(table[0]), rtol=3e-15)
     np.testing.assert_allclose(table[2], np.log(table[1]), rtol=1e-15, atol=1e-15)

@@ -26,34 +26,34 @@ import pchem_pipeline.model.law.simd_numba
 hooks.register_model = register
 from pchem_pipeline.model.law import simd_math_numba as functions, simd_numba as simd
 from pchem_pipeline.model.law.simd_numba import (
-    counting, exponent_of, fraction_of, fused, least, load_lanes, most, nearest, scaled, store_lanes,
-    sum_lanes
+    counting, exponent_of, fraction_of, fused, least, simd_load, most, nearest, scaled, simd_store,
+    simd_sum
 )
-LANES = simd.LANES
-exp, log = functions.lanes_exp, functions.lanes_log
+SIMD_WIDTH = simd.SIMD_WIDTH
+exp, log = functions.simd_exp, functions.simd_log
 @kernel
 def fill(table):
     total = counting() * 0.0
-    for i in range(0, table.shape[1], LANES):
-        x = load_lanes(table, 0, i)
-        store_lanes(table, 1, i, exp(x))
-        store_lanes(table, 2, i, log(exp(x)))
-        store_lanes(table, 3, i, most(least(x, 1.0), -2.0))
-        store_lanes(table, 4, i, fused(x, 2.0, 1.0) / 2 - nearest(x))
+    for i in range(0, table.shape[1], SIMD_WIDTH):
+        x = simd_load(table, 0, i)
+        simd_store(table, 1, i, exp(x))
+        simd_store(table, 2, i, log(exp(x)))
+        simd_store(table, 3, i, most(least(x, 1.0), -2.0))
+        simd_store(table, 4, i, fused(x, 2.0, 1.0) / 2 - nearest(x))
         y = exp(x)
-        store_lanes(table, 5, i, scaled(fraction_of(y), exponent_of(y)) - y)
-        store_lanes(table, 6, i, counting() + float(i))
-        tail, density, by_z = functions.lanes_tail(load_lanes(table, 7, i))
-        store_lanes(table, 8, i, tail)
-        store_lanes(table, 9, i, density)
-        store_lanes(table, 10, i, by_z)
+        simd_store(table, 5, i, scaled(fraction_of(y), exponent_of(y)) - y)
+        simd_store(table, 6, i, counting() + float(i))
+        tail, density, by_z = functions.simd_tail(simd_load(table, 7, i))
+        simd_store(table, 8, i, tail)
+        simd_store(table, 9, i, density)
+        simd_store(table, 10, i, by_z)
         total = total + x
-    return sum_lanes(total)
+    return simd_sum(total)
 table = np.zeros((11, 1600))
 table[0] = np.random.default_rng(1).uniform(-100, 100, 1600)
 table[7] = np.linspace(-37, 37, 1600)
 table[7, :8] = -np.inf, np.inf, 0.0, -1e-250, 1e-250, -300.0, 300.0, 8.5
-np.savez(sys.argv[2], table=table, total=fill(table), lanes=LANES)
+np.savez(sys.argv[2], table=table, total=fill(table), lanes=SIMD_WIDTH)
 """
 
 
