@@ -22,7 +22,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     run_position,
     with_offsets,
 )
-from pchem_pipeline.effects.estimators.time_profiles import SETTLING, settling
+from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -87,10 +87,7 @@ class BiasDrift(Effect):
 
     @model_validator(mode="after")
     def _path_where_it_belongs(self) -> Self:
-        if self.shape == "path" and len(self.path) < 2:
-            raise ValueError("bias_drift: shape path needs `path` with 2 values or more")
-        if self.shape != "path" and self.path:
-            raise ValueError(f"bias_drift: `path` is for shape path, not {self.shape}; leave one of them out")
+        check_path(self.tag, self.shape, self.path)
         return self
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
@@ -105,9 +102,7 @@ class BiasDrift(Effect):
         """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
-        nodes = np.array(self.path or (-0.5, 0.5))
-        mean = (nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1)
-        return np.asarray(np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes) - mean)
+        return along_path(position, self.path or (-0.5, 0.5))
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.time_profiles import SETTLING, settling
+from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -79,10 +79,7 @@ class GainDrift(Effect):
 
     @model_validator(mode="after")
     def _path_where_it_belongs(self) -> Self:
-        if self.shape == "path" and len(self.path) < 2:
-            raise ValueError("gain_drift: shape path needs `path` with 2 values or more")
-        if self.shape != "path" and self.path:
-            raise ValueError(f"gain_drift: `path` is for shape path, not {self.shape}; leave one of them out")
+        check_path(self.tag, self.shape, self.path)
         if abs(self.drift) * float(np.abs(self._profile(np.linspace(0.0, 1.0, 4097))).max()) >= 1:
             raise ValueError("gain_drift: drift times path takes the gain to zero; make one of them smaller")
         return self
@@ -137,20 +134,13 @@ class GainDrift(Effect):
         """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
-        nodes = np.array(self.path or (-0.5, 0.5))
-        profile: NDArray[np.float64] = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
-        return profile - _path_mean(nodes)
+        return along_path(position, self.path or (-0.5, 0.5))
 
 
 def _improvement(nodes: int) -> float:
     """Return by how much chi squared falls by chance, plus three standard deviations of that."""
     free = nodes - 1
     return free + 3.0 * float(np.sqrt(2.0 * free))
-
-
-def _path_mean(nodes: NDArray[np.float64]) -> float:
-    """Return the mean of the piecewise linear path through equally spaced nodes."""
-    return float((nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1))
 
 
 def _chi_square(

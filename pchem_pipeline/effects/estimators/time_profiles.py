@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SETTLING", "settling"]
+__all__ = ["SETTLING", "along_path", "check_path", "settling"]
 
 #: time constants that estimators try, in lengths of the run
 SETTLING = (0.05, 0.1, 0.2, 0.4)
@@ -22,3 +24,24 @@ def settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float
     mean = (1.0 - fraction * whole) / whole
     profile: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
     return profile
+
+
+def along_path(position: NDArray[np.float64], path: Sequence[float]) -> NDArray[np.float64]:
+    """Return a broken line through nodes at equal distances along the run, of mean 0 over the run.
+
+    Args:
+        position: times from 0 (first frame) to 1 (last frame).
+        path: the nodes, at least two.
+    """
+    nodes = np.array(path)
+    # the mean of a broken line counts its ends by half
+    mean = (nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1)
+    return np.asarray(np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes) - mean)
+
+
+def check_path(tag: str, shape: str, path: Sequence[float]) -> None:
+    """Raise ValueError unless an effect has a path where, and only where, its shape is one."""
+    if shape == "path" and len(path) < 2:
+        raise ValueError(f"{tag}: shape path needs `path` with 2 values or more")
+    if shape != "path" and path:
+        raise ValueError(f"{tag}: `path` is for shape path, not {shape}; leave one of them out")

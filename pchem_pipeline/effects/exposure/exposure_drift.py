@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
-from pchem_pipeline.effects.estimators.time_profiles import SETTLING, settling
+from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, settling
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -94,12 +94,7 @@ class ExposureDrift(Effect):
     def profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the profile s, of mean 0 and range 1 over the run, at times 0..1 (first to last frame)."""
         if self.path:
-            nodes = np.asarray(self.path)
-            # the mean of a broken line counts its ends by half
-            mean = np.mean(0.5 * (nodes[1:] + nodes[:-1]))
-            values = np.interp(position, np.linspace(0.0, 1.0, nodes.size), nodes)
-            profile: NDArray[np.float64] = (values - mean) / np.ptp(nodes)
-            return profile
+            return along_path(position, self.path) / float(np.ptp(self.path))
         if self.settling_fraction is not None:
             return settling(position, self.settling_fraction)
         return position - 0.5
