@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence
 
 __all__ = ["ChargeLag"]
 
@@ -64,8 +63,3 @@ class ChargeLag(Effect):
     def typical(cls) -> Sequence[Self]:
         """Return it at a fifth."""
         return (cls(fraction=0.2),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return nothing: no statistic of such frames depends on it."""
-        return ()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.evidence import PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["SpuriousCharge"]
@@ -63,8 +63,3 @@ class SpuriousCharge(Effect):
     def typical(cls) -> Sequence[Self]:
         """Return it at 0.3 e-."""
         return (cls(mean_e=0.3),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return nothing: no statistic of such frames depends on it."""
-        return ()

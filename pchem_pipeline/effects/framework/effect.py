@@ -135,9 +135,11 @@ class Effect(Section):
 
         A hypothesis is only a guess: its strength is refined and its fingerprint compared with the evidence
         afterwards, so a false one costs time and nothing else. The default is :meth:`typical` where the
-        leading statistics of the signature stand out.
+        leading statistics of the signature stand out; none where no statistic depends on the effect.
         """
-        return cls.typical() if evidence.strongest(*cls.signature[:2]) > 3.0 else ()
+        if cls.untestable or not evidence.strongest(*cls.signature[:2]) > 3.0:
+            return ()
+        return cls.typical()
 
     def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
         """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
