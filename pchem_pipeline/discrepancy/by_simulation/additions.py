@@ -196,7 +196,7 @@ class AddedRounds:
             left = this.null.shifted(other.mean - this.null.mean).pulls(self.z.both, 2)[worst]
             why = f"leaves {STATISTICS[this.null.names[worst]].sentence} ({left:+.1f} sd)"
         else:
-            why = "leaves no single statistic far off, but all of them together fit worse"
+            why = f"fits all statistics together worse, by {-other.behind:.1f} nats of likelihood"
         return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)
 
 

@@ -53,7 +53,10 @@ def effect_class(tag: str) -> type[Effect]:
     """
     found = _discover()
     if tag not in found.classes:
-        message = f"effect {tag!r} is unknown; known are {', '.join(found.classes)}"
+        message = (
+            f"effect {tag!r} is unknown; known are {', '.join(found.classes)}; for one of another package, "
+            "install that package"
+        )
         if tag in found.broken:
             message = f"effect {tag!r} comes from a plug-in that was left out: {found.broken[tag]}"
         raise ConfigError(message)

@@ -173,7 +173,7 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`."""
 
-    def _set_layout(self, path: Path, layout: Layout, size: int) -> None:
+    def set_layout(self, path: Path, layout: Layout, size: int) -> None:
         """Take the layout; ``size`` is the size of the file.
 
         Raises:

@@ -96,7 +96,7 @@ class FitsReader(ContiguousReader):
             check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=start)
-        self._set_layout(path, Layout(offsets, rows, columns, stored, biased=biased, signed=signed), size)
+        self.set_layout(path, Layout(offsets, rows, columns, stored, biased=biased, signed=signed), size)
 
     def _read_facts(self, *headers: Any) -> None:
         """Take integration time and bit depth from the first header that has them."""

@@ -86,7 +86,7 @@ class Hdf5Reader(ContiguousReader):
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
             layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
-            self._set_layout(path, layout, size)
+            self.set_layout(path, layout, size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         self._read_facts(dataset)

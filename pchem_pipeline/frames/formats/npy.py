@@ -59,7 +59,7 @@ class NpyReader(ContiguousReader):
             )
         offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
         reader = cls()
-        reader._set_layout(path, Layout(offsets, rows, columns, dtype, signed=signed), size)
+        reader.set_layout(path, Layout(offsets, rows, columns, dtype, signed=signed), size)
         behind = size - max(start, reader._layout.end)
         if behind:
             reader.notes = (

@@ -136,7 +136,7 @@ class RawReader(ContiguousReader):
         if n < whole:
             self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
         offsets = even_offsets(path, n, frame, size, start=header, step=step)
-        self._set_layout(path, Layout(offsets, rows, columns, stored), size)
+        self.set_layout(path, Layout(offsets, rows, columns, stored), size)
 
 
 def _size(path: Path) -> int:

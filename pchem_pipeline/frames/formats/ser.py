@@ -62,7 +62,7 @@ class SerReader(ContiguousReader):
         stored = np.dtype("u1" if depth <= 8 else (">u2" if order == "big" else "<u2"))
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
         reader = cls()
-        reader._set_layout(path, Layout(offsets, rows, columns, stored), size)
+        reader.set_layout(path, Layout(offsets, rows, columns, stored), size)
         reader.bit_depth = depth
         reader._read_times()
         taken = _seconds(ticks) if reader.timestamps is None else float(reader.timestamps[0])

@@ -121,7 +121,7 @@ class TiffReader(ContiguousReader):
         offsets = _contiguous_offsets(path, file, pages, size)
         rows, columns = first.shape[-2:]
         if offsets is not None:
-            self._set_layout(path, Layout(offsets, rows, columns, stored, signed=signed), size)
+            self.set_layout(path, Layout(offsets, rows, columns, stored, signed=signed), size)
         else:
             self._set_segments(path, pages, size, signed)
         self.bit_depth = stated_bit_depth(file, first)

@@ -25,7 +25,8 @@ def verdict_text(found: Verdict) -> str:
         Lines of at most 100 characters, without one at the end.
     """
     lines = [*_wrapped(f"{found.word.upper()}: {found.sentence}", "  ")]
-    lines += _places("where: ", found.where, _MOST_PLACES)
+    agrees = found.verdict in ("consistent", "cannot_tell")
+    lines += _places("largest: " if agrees else "where: ", found.where, _MOST_PLACES)
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
