@@ -430,7 +430,7 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
                 "1",
                 limit=(_SURE + 0.2) * error,
                 effects=("interpixel_capacitance", "optical_crosstalk", "cosmic_rays"),
-                advice="if charge or signal couples to neighbours, the gain reads low by about twice the correlation",
+                advice="if neighbours couple, the gain reads low by about twice the correlation",
             )
         )
     return found
