@@ -8,18 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
-from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
+
+if TYPE_CHECKING:
+    from pchem_pipeline.discrepancy.quick.sums import StackSums
 
 __all__ = [
     "CHANNELS",

@@ -11,6 +11,7 @@ from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands import figures
 from pchem_pipeline.commands.compare import compare
+from pchem_pipeline.commands.compare.history import HistorySettings
 from pchem_pipeline.commands.figures import Wanted, figures_of_run
 
 
@@ -64,5 +65,6 @@ def test_runs_are_compared_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
         "compare", "a.zarr", "b.zarr", "c.zarr", "-o", "out", "--tolerance", "1e-9", "--workers", "1"
     )
     assert shown == "out/compare.html\n"
-    options = {"tolerance": 1e-9, "labels": (), "rate": 0.01, "workers": 1, "progress": "auto"}
+    history = HistorySettings()
+    options = {"tolerance": 1e-9, "history": history, "workers": 1, "progress": "auto"}
     assert seen == [(([Path("a.zarr"), Path("b.zarr"), Path("c.zarr")], Path("out")), options)]
