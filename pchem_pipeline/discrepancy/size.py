@@ -57,12 +57,22 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         return None
     change = np.concatenate(seen)
     share = float(np.mean(np.abs(change) > _CHANGED))
-    # rare events are as large as they are where they are
-    spread = np.sqrt(np.mean((change - change.mean(axis=0)) ** 2) / (share if 0.0 < share < RARE else 1.0))
-    gain = float(np.median(maps.conversion_gain[maps.usable]))
+    gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))
     noise = float(np.median(maps.read_noise_dn[maps.usable]))
-    dn = float(spread) if effect.plane in _IN_DN else float(spread) / gain
-    return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise, samples=share)
+    in_dn = effect.plane in _IN_DN
+    dn = _spread(change if in_dn else change / gain, share)
+    return Size(
+        electrons=_spread(change * gain if in_dn else change, share),
+        dn=dn,
+        of_read_noise=dn / noise,
+        samples=share,
+    )
+
+
+def _spread(change: NDArray[np.float64], share: float) -> float:
+    """Return by how much samples change from frame to frame, where they change if that is rare."""
+    mean_square = np.mean((change - change.mean(axis=0)) ** 2)
+    return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))
 
 
 _FIELDS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "usable")
