@@ -327,7 +327,8 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
         return f"The model was missing {_and(titles)}; on the final {data} alone its gap is below {limit}."
     if state == "named_in_part":
         words = (
-            f"{_closed(found)}{_rest(found)}{_nearest(found)}{_left(added)}{_compared(added)}{_gaps(found)}"
+            f"{_closed(found)}{_rest(found)}{_limits(found)}{_nearest(found)}{_left(added)}"
+            f"{_compared(added)}{_gaps(found)}"
         )
         return f"A part of what the model was missing is {_and(titles)}: {words}."
     them = "them" if len(titles) > 1 else "it"
@@ -390,6 +391,16 @@ def _rest(found: Findings) -> str:
     if after.at_floor or found.before.value <= 0.0:
         return ""
     return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
+
+
+def _limits(found: Findings) -> str:
+    """Return in words which parameters of the named effects can go no further: another may hide there."""
+    stuck = [
+        f"{name} of {effect.tag} stands at its limit, {value:g}"
+        for effect in found.named
+        for name, value in effect.at_limits().items()
+    ]
+    return f"; {_and(stuck)}, as where an effect that is not known is taken for it" if stuck else ""
 
 
 def _compared(added: Added) -> str:

@@ -163,6 +163,19 @@ class Effect(Section):
         values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
         return type(self).model_validate(values)
 
+    def at_limits(self) -> dict[str, float]:
+        """Return the parameters that stand at a limit of their field, by name; those at their default not."""
+        found = {}
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if not isinstance(value, float) or value == field.default:
+                continue
+            if any(
+                value in (getattr(limit, "ge", None), getattr(limit, "le", None)) for limit in field.metadata
+            ):
+                found[name] = value
+        return found
+
     def words(self) -> str:
         """Return what is known of it, for people."""
         return self.title or self.tag

@@ -168,3 +168,12 @@ def test_effects_can_be_given_by_tag_alone_only_if_they_need_nothing():
     with pytest.raises(ValidationError, match="row_noise_dn"):
         SimulateSettings(effects=["row_noise"])
     assert np.size(SimulateSettings().effects) == 0
+
+
+def test_parameters_at_a_limit_are_told_and_defaults_are_not() -> None:
+    """A search that drives a parameter to its limit may have taken one effect for another."""
+    kind = registry.effect_class("interpixel_capacitance")
+    stuck = kind.model_validate({"coupling": 0.008, "anisotropy": -1.0})
+    assert stuck.at_limits() == {"anisotropy": -1.0}
+    assert stuck.model_copy(update={"anisotropy": -0.99}).at_limits() == {}
+    assert kind.model_validate({"coupling": 0.0}).at_limits() == {"coupling": 0.0}  # its strength, gone
