@@ -9,15 +9,25 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-__all__ = ["CameraFacts", "camera_from_names", "celsius", "seconds_of", "shared_facts", "text_of"]
+__all__ = [
+    "CAMERA_NAMES",
+    "CameraFacts",
+    "camera_from_names",
+    "celsius",
+    "seconds_of",
+    "shared_facts",
+    "text_of",
+]
 
 _LONGEST = 80
 _ZERO_CELSIUS = 273.15
 #: names that programs give to the facts in attributes, sidecars and JSON records, the usual one first
-_NAMES = ("camera", "camera_model", "camera_name", "model", "description")
+_NAMES = ("camera", "camera_model", "camera_name")
 _SERIALS = ("serial_number", "camera_serial", "serial")
 _TEMPERATURES = ("sensor_temperature", "detector_temperature", "temperature")
 _TIMES = ("start_time", "acquisition_date", "date")
+#: All of them.
+CAMERA_NAMES = (*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES)
 
 
 @dataclass(frozen=True)

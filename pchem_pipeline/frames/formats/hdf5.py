@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.camera import camera_from_names
+from pchem_pipeline.frames.camera import CAMERA_NAMES, camera_from_names, text_of
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
@@ -113,8 +113,12 @@ class Hdf5Reader(ContiguousReader):
     def _read_camera(self, dataset: Any) -> None:
         """Take what the attributes of the dataset and the values beside it say of the camera."""
         values, units = {}, {}
-        for name, beside in dataset.parent.items():
-            if getattr(beside, "size", 0) == 1 and name != dataset.name:
+        names = {name: name for name in CAMERA_NAMES}
+        if text_of(dataset.parent.attrs.get("NX_class")) == "NXdetector":
+            names["description"] = "camera"  # so NeXus calls make and model
+        for stored, name in names.items():
+            beside = dataset.parent.get(stored)
+            if getattr(beside, "size", 0) == 1:
                 values[name] = np.ravel(beside[()])[0]
                 units[name] = beside.attrs.get("units")
         self.camera = camera_from_names({**values, **dataset.attrs}, units)

@@ -77,6 +77,8 @@ def test_hdf5_and_zarr(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         group = file.create_group("entry/detector")
         group["frames"] = STACK
+        group.attrs["NX_class"] = "NXdetector"
+        group["broken"] = h5py.ExternalLink("gone.h5", "/elsewhere")
         group["description"], group["serial_number"] = "Detector Y", "77"
         group["sensor_temperature"] = 250.0
         group["sensor_temperature"].attrs["units"] = "K"
@@ -84,6 +86,14 @@ def test_hdf5_and_zarr(tmp_path: Path) -> None:
     attributes = {"camera": "Z", "sensor_temperature": 12.5, "start_time": "2026-01-31T13:00:00+01:00"}
     zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
     assert facts(tmp_path / "a.zarr") == CameraFacts("Z", None, 12.5, TAKEN)
+
+
+def test_a_free_text_is_no_camera(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = STACK
+        file["frames"].attrs["description"] = "dark frames of Monday"
+        file["description"] = "our set-up"
+    assert facts(tmp_path / "a.h5") == CameraFacts()
 
 
 def test_ser_and_raw(tmp_path: Path) -> None:
