@@ -181,12 +181,19 @@ def _best(values: FloatArray, some: BoolArray, single: bool) -> _Found | None:
         _disc(contrast),
         _single(values, some) if single else None,
     ]
-    there = [each for each in families if each is not None]
+    there = [each for each in families if each is not None and _parts(each.mask, some)]
+    if not there:
+        return None
     best = there[0]
     for each in there[1:]:
         if each.log_p < best.log_p - _BETTER:
             best = each
     return _Found(best.family, best.mask, best.z, best.log_p + math.log(len(families)))
+
+
+def _parts(mask: BoolArray, some: BoolArray) -> bool:
+    """Return whether a place divides the pixels: a sensor of one row has no band of rows."""
+    return bool((some & mask).any() and (some & ~mask).any())
 
 
 def _odd_side(found: _Found, values: FloatArray, some: BoolArray) -> _Found:

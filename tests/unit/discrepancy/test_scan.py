@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -119,3 +120,16 @@ def test_a_series_that_scatters_more_for_a_while_has_no_mean_that_is_off() -> No
         values = rng.standard_normal(1500)
         values[300:400] *= 3.0
         assert [each for each in scan_series(values, np.arange(1500)) if each.family == "range"] == []
+
+
+@pytest.mark.parametrize("shape", [(1, 320), (320, 1), (2, 160), (1, 100)])
+def test_channels_side_by_side_are_a_sensor_of_one_row(shape: tuple[int, int]) -> None:
+    """No band of rows divides them; a band of columns does."""
+    rng = np.random.default_rng(7)
+    values = rng.standard_normal(shape)
+    assert scan_map(values, np.ones(shape, bool)) == []
+    long = values.reshape(-1)
+    long[20:40] += 2.0
+    [found] = scan_map(values, np.ones(shape, bool), single=False)
+    assert found.log_p < math.log(1e-3)
+    assert found.region.mask(shape).sum() <= 30
