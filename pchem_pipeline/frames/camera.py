@@ -1,19 +1,24 @@
-"""What camera files say of the camera itself: its name, its serial number, its temperature, the date."""
+"""What camera files say beside their frames: camera, temperature, date, integration time, bits of the ADC."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from numbers import Integral
 from typing import Any
 
 __all__ = [
-    "CAMERA_NAMES",
+    "FACT_NAMES",
     "CameraFacts",
-    "camera_from_names",
+    "StatedFacts",
+    "bits_of",
     "celsius",
+    "duration_of",
+    "facts_from_names",
+    "first_of",
     "seconds_of",
     "shared_facts",
     "text_of",
@@ -26,8 +31,11 @@ _NAMES = ("camera", "camera_model", "camera_name")
 _SERIALS = ("serial_number", "camera_serial", "serial")
 _TEMPERATURES = ("sensor_temperature", "detector_temperature", "temperature")
 _TIMES = ("start_time", "acquisition_date", "date")
+_DURATIONS = ("integration_time", "exposure_time", "count_time")
+_DEPTHS = ("bit_depth", "bit_depth_readout")
 #: All of them.
-CAMERA_NAMES = (*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES)
+FACT_NAMES = (*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS)
+_SECONDS = {"": 1.0, "s": 1.0, "min": 60.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9}
 
 
 @dataclass(frozen=True)
@@ -51,6 +59,21 @@ class CameraFacts:
         parts = [self.name, f"serial number {self.serial}" if self.serial else None]
         parts.append(None if self.temperature is None else f"sensor at {self.temperature:.4g} °C")
         return ", ".join(part for part in parts if part)
+
+
+@dataclass(frozen=True)
+class StatedFacts:
+    """What a file says beside its frames; None where it does not.
+
+    Attributes:
+        camera: that took the frames.
+        integration_time: s.
+        bit_depth: bits of the ADC.
+    """
+
+    camera: CameraFacts = CameraFacts()
+    integration_time: float | None = None
+    bit_depth: int | None = None
 
 
 def text_of(value: Any) -> str | None:
@@ -91,7 +114,30 @@ def seconds_of(value: Any) -> float | None:
     return seconds if seconds > 0 else None
 
 
-def camera_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None = None) -> CameraFacts:
+def duration_of(value: Any, unit: Any = "s") -> float | None:
+    """Return a duration in s; None where it is no positive number, or its unit is not known.
+
+    Args:
+        value: the number.
+        unit: s, ms, us, ns or min; s where there is none.
+    """
+    scale = _SECONDS.get(text_of(unit) or "")
+    if scale is None or isinstance(value, bool):
+        return None
+    try:
+        seconds = float(value) * scale
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return seconds if math.isfinite(seconds) and seconds > 0 else None
+
+
+def bits_of(value: Any) -> int | None:
+    """Return the bits of an ADC; None where it is no whole number from 1 to 32."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    return int(value) if whole and 1 <= int(value) <= 32 else None
+
+
+def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None = None) -> StatedFacts:
     """Return the facts from values under the names that most programs use (HDF5, zarr, sidecars, JSON).
 
     Args:
@@ -99,18 +145,20 @@ def camera_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None
         units: of them, by name.
     """
     stated = {**{f"{name}_units": unit for name, unit in (units or {}).items()}, **values}
-    temperatures = {name: celsius(values.get(name), stated.get(f"{name}_units")) for name in _TEMPERATURES}
-    return CameraFacts(
-        _first(values, _NAMES, text_of),
-        _first(values, _SERIALS, text_of),
-        _first(temperatures, _TEMPERATURES, lambda degrees: degrees),
-        _first(values, _TIMES, seconds_of),
+    temperatures = (celsius(values.get(name), stated.get(f"{name}_units")) for name in _TEMPERATURES)
+    durations = (duration_of(values.get(name), stated.get(f"{name}_units")) for name in _DURATIONS)
+    camera = CameraFacts(
+        first_of(text_of(values.get(name)) for name in _NAMES),
+        first_of(text_of(values.get(name)) for name in _SERIALS),
+        first_of(temperatures),
+        first_of(seconds_of(values.get(name)) for name in _TIMES),
     )
+    return StatedFacts(camera, first_of(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS))
 
 
-def _first(values: Mapping[str, Any], names: Iterable[str], read: Callable[[Any], Any]) -> Any:
-    """Return the first value that can be read under one of the names."""
-    return next((found for name in names if (found := read(values.get(name))) is not None), None)
+def first_of(found: Iterable[Any]) -> Any:
+    """Return the first that there is."""
+    return next((each for each in found if each is not None), None)
 
 
 def shared_facts(each: Iterable[CameraFacts]) -> tuple[CameraFacts, str]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -92,6 +92,14 @@ class FrameReader(ABC):
         buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
         self.read_into(buffer, t0, t1, y0, y1)
         return buffer
+
+    def take_facts(self, facts: StatedFacts) -> None:
+        """Take what the file says beside its frames."""
+        self.camera, self.integration_time, self.bit_depth = (
+            facts.camera,
+            facts.integration_time,
+            facts.bit_depth,
+        )
 
     def identity(self) -> dict[str, Any]:
         """Return name, size and xxh3_128 content hash of every file, and one digest over all; for JSON."""

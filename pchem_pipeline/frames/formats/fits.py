@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, MissingDependencyError
-from pchem_pipeline.frames.camera import CameraFacts, celsius, seconds_of, text_of
+from pchem_pipeline.frames.camera import (
+    CameraFacts,
+    StatedFacts,
+    bits_of,
+    celsius,
+    duration_of,
+    seconds_of,
+    text_of,
+)
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
@@ -31,6 +39,7 @@ from pchem_pipeline.store.files import whole_file
 __all__ = ["FitsReader", "write_frames"]
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "TELAPSE", "INTTIME", "ITIME", "XPOSURE")
+_DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
 _TEMPERATURE_KEYWORDS = ("CCD-TEMP", "DET-TEMP", "DETTEMP", "CCDTEMP", "SENSTEMP", "SET-TEMP")
@@ -99,16 +108,10 @@ class FitsReader(ContiguousReader):
         self.set_layout(path, Layout(offsets, rows, columns, stored, biased=biased, signed=signed), size)
 
     def _read_facts(self, *headers: Any) -> None:
-        """Take integration time and bit depth from the first header that has them."""
-        for header in reversed(headers):
-            for keyword in _TIME_KEYWORDS:
-                value = header.get(keyword)
-                if self.integration_time is None and isinstance(value, int | float) and 0 < value < np.inf:
-                    self.integration_time = float(value)
-            value = header.get("BITDEPTH", header.get("ADCBITS"))
-            if self.bit_depth is None and isinstance(value, int) and 1 <= value <= 32:
-                self.bit_depth = value
-        self.camera = _camera([*reversed(headers)])
+        """Take each fact from the last header that has it."""
+        last = [*reversed(headers)]
+        times, depths = _stated(last, _TIME_KEYWORDS, duration_of), _stated(last, _DEPTH_KEYWORDS, bits_of)
+        self.take_facts(StatedFacts(_camera(last), next(times, None), next(depths, None)))
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -184,6 +187,12 @@ def _camera(headers: Sequence[Any]) -> CameraFacts:
         celsius(hot, "K" if kelvin else "C"),
         seconds_of(taken),
     )
+
+
+def _stated(headers: Sequence[Any], names: Sequence[str], read: Callable[[Any], Any]) -> Iterator[Any]:
+    """Yield the values that can be read, header by header."""
+    values = (read(header.get(name)) for header in headers for name in names)
+    return (value for value in values if value is not None)
 
 
 def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:

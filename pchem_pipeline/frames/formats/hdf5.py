@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.camera import CAMERA_NAMES, camera_from_names, text_of
+from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
@@ -31,8 +31,6 @@ from pchem_pipeline.store.files import whole_file
 
 __all__ = ["Hdf5Reader", "write_frames"]
 
-_TIME_NAMES = ("integration_time", "exposure_time", "count_time")
-_TIME_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _LOCK = threading.Lock()
 
 
@@ -89,39 +87,7 @@ class Hdf5Reader(ContiguousReader):
             self.set_layout(path, layout, size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
-        self._read_facts(dataset)
-        self._read_camera(dataset)
-
-    def _read_facts(self, dataset: Any) -> None:
-        """Take integration time (count_time in NeXus) and bit depth from attributes or the group."""
-        for name in _TIME_NAMES:
-            value, unit = dataset.attrs.get(name), dataset.attrs.get(f"{name}_units", "s")
-            beside = dataset.parent.get(name)
-            if value is None and beside is not None and getattr(beside, "size", 0) == 1:
-                value, unit = np.ravel(beside[()])[0], beside.attrs.get("units", "s")
-            scale = _TIME_UNITS.get(unit.decode() if isinstance(unit, bytes) else str(unit))
-            if value is not None and scale is not None and np.isreal(value) and 0 < float(value) < np.inf:
-                self.integration_time = float(value) * scale
-                break
-        for name in ("bit_depth", "bit_depth_readout"):
-            value = dataset.attrs.get(name)
-            if value is None and name in dataset.parent:
-                value = np.ravel(dataset.parent[name][()])[0]
-            if self.bit_depth is None and isinstance(value, int | np.integer) and 1 <= value <= 32:
-                self.bit_depth = int(value)
-
-    def _read_camera(self, dataset: Any) -> None:
-        """Take what the attributes of the dataset and the values beside it say of the camera."""
-        values, units = {}, {}
-        names = {name: name for name in CAMERA_NAMES}
-        if text_of(dataset.parent.attrs.get("NX_class")) == "NXdetector":
-            names["description"] = "camera"  # so NeXus calls make and model
-        for stored, name in names.items():
-            beside = dataset.parent.get(stored)
-            if getattr(beside, "size", 0) == 1:
-                values[name] = np.ravel(beside[()])[0]
-                units[name] = beside.attrs.get("units")
-        self.camera = camera_from_names({**values, **dataset.attrs}, units)
+        self.take_facts(_stated_facts(dataset))
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -237,3 +203,18 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
         if bit_depth is not None:
             dataset.attrs["bit_depth"] = bit_depth
     return [path]
+
+
+def _stated_facts(dataset: Any) -> StatedFacts:
+    """Return what the attributes of the dataset and the values beside it say (count_time in NeXus)."""
+    values = {name: np.ravel(value)[0] for name, value in dataset.attrs.items() if np.size(value) == 1}
+    beside, units = {}, {}
+    names = {name: name for name in FACT_NAMES}
+    if text_of(dataset.parent.attrs.get("NX_class")) == "NXdetector":
+        names["description"] = "camera"  # so NeXus calls make and model
+    for stored, name in names.items():
+        other = dataset.parent.get(stored)
+        if getattr(other, "size", 0) == 1:
+            beside[name] = np.ravel(other[()])[0]
+            units[name] = other.attrs.get("units")
+    return facts_from_names({**beside, **values}, units)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.camera import camera_from_names
+from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
@@ -77,12 +77,7 @@ class ZarrReader(FrameReader):
         self._array = array
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
-        time, depth = attributes.get("integration_time"), attributes.get("bit_depth")
-        if isinstance(time, int | float) and 0 < time < np.inf:
-            self.integration_time = float(time)
-        if isinstance(depth, int) and 1 <= depth <= 32:
-            self.bit_depth = depth
-        self.camera = camera_from_names(attributes)
+        self.take_facts(facts_from_names(attributes))
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.camera import camera_from_names
+from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -103,9 +103,7 @@ class RawReader(ContiguousReader):
             )
         reader = cls()
         reader.bit_shift = facts["bit_shift"] or 0
-        reader.bit_depth = facts["bit_depth"]
-        reader.integration_time = facts["integration_time"]
-        reader.camera = camera_from_names(side.model_dump())
+        reader.take_facts(facts_from_names({**side.model_dump(), **facts}))
         reader._lay_out(path, facts)
         return reader
 

@@ -32,10 +32,8 @@ from pchem_pipeline.frames.formats.kinds import check_coded, check_samples
 from pchem_pipeline.frames.formats.tiff_facts import (
     check_chain,
     images_behind_one_page,
-    stated_bit_depth,
-    stated_camera,
     stated_channels,
-    stated_time,
+    stated_facts,
 )
 from pchem_pipeline.frames.reader import check_window
 from pchem_pipeline.frames.settings import InputSettings
@@ -124,9 +122,7 @@ class TiffReader(ContiguousReader):
             self.set_layout(path, Layout(offsets, rows, columns, stored, signed=signed), size)
         else:
             self._set_segments(path, pages, size, signed)
-        self.bit_depth = stated_bit_depth(file, first)
-        self.integration_time = stated_time(file, first)
-        self.camera = stated_camera(file, first)
+        self.take_facts(stated_facts(file, first))
 
     def _set_segments(self, path: Path, pages: Sequence[Any], size: int, signed: bool) -> None:
         """Remember where the coded strips or tiles of each page are."""

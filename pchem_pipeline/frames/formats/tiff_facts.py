@@ -6,21 +6,28 @@ import html
 import json
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.camera import CameraFacts, camera_from_names, celsius, seconds_of, text_of
+from pchem_pipeline.frames.camera import (
+    CameraFacts,
+    StatedFacts,
+    bits_of,
+    celsius,
+    duration_of,
+    facts_from_names,
+    first_of,
+    seconds_of,
+    text_of,
+)
 
 __all__ = [
     "check_chain",
     "images_behind_one_page",
-    "stated_bit_depth",
-    "stated_camera",
     "stated_channels",
-    "stated_time",
+    "stated_facts",
 ]
 
 
@@ -39,7 +46,6 @@ _MOST_TAGS = 4096
 _EXPOSURE_TAG = 33434
 _MICRO_MANAGER_TAG = 51123
 _MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
-_TIME_UNITS = {"s": 1.0, "ms": 1e-3, "\u00b5s": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
 def check_chain(path: Path, size: int) -> None:
@@ -119,52 +125,49 @@ def stated_channels(file: Any) -> int:
     return int(match[1]) if match else 1
 
 
-def stated_bit_depth(file: Any, page: Any) -> int | None:
-    """Return the bits of a sample where the file says more than the size of its samples."""
-    match = re.search(r'SignificantBits="(\d+)"', _ome(file))
-    if match:
-        return int(match[1])
-    own = _shaped(file).get("bit_depth")
-    if isinstance(own, int):
-        return own
-    bits = page.bitspersample
-    return int(bits) if isinstance(bits, int) and bits not in (8, 16, 32) else None
-
-
-def stated_time(file: Any, page: Any) -> float | None:
-    """Return the exposure time in s from JSON, OME-XML, EXIF tag, or Micro-Manager; else None."""
-    own = _shaped(file).get("integration_time")
-    if isinstance(own, int | float):
-        return _positive(float(own))
-    match = re.search(r'<[^<>]*ExposureTime="([\d.eE+-]+)"[^<>]*>', _ome(file))
-    if match:
-        unit = re.search(r'ExposureTimeUnit="([^"]+)"', match[0])
-        scale = _TIME_UNITS.get(unit[1] if unit else "s")
-        return _positive(float(match[1]) * scale) if scale else None
-    if _EXPOSURE_TAG in page.tags:
-        value = page.tags[_EXPOSURE_TAG].value
-        return _positive(value[0] / value[1]) if isinstance(value, tuple) and value[1] else None
-    if _MICRO_MANAGER_TAG in page.tags:
-        record = page.tags[_MICRO_MANAGER_TAG].value
-        exposure = record.get("Exposure-ms") if isinstance(record, dict) else None
-        return _positive(1e-3 * float(exposure)) if exposure is not None else None
-    return None
-
-
-def stated_camera(file: Any, page: Any) -> CameraFacts:
-    """Return what JSON, OME-XML, Micro-Manager, or the tags Make, Model and DateTime say of the camera."""
-    record = page.tags[_MICRO_MANAGER_TAG].value if _MICRO_MANAGER_TAG in page.tags else None
+def stated_facts(file: Any, page: Any) -> StatedFacts:
+    """Return what our own JSON, OME-XML, Micro-Manager, or the tags of a page say beside the frames."""
+    own = facts_from_names(_shaped(file))
+    record = _tag(page, _MICRO_MANAGER_TAG)
     record = record if isinstance(record, dict) else {}
     hot = next((value for name, value in record.items() if name.endswith("Temperature")), None)
-    found = (
-        camera_from_names(_shaped(file)),
+    cameras = (
+        own.camera,
         _ome_camera(_ome(file)),
         CameraFacts(
             text_of(record.get("Camera")), temperature=celsius(hot), taken=seconds_of(record.get("Time"))
         ),
         CameraFacts(_make_and_model(page), taken=seconds_of(_tag(page, _DATE_TAG))),
     )
-    return CameraFacts(*(_first(found, each.name) for each in fields(CameraFacts)))
+    times = (
+        own.integration_time,
+        _ome_time(_ome(file)),
+        _ratio(_tag(page, _EXPOSURE_TAG)),
+        duration_of(record.get("Exposure-ms"), "ms"),
+    )
+    depths = (_ome_depth(_ome(file)), own.bit_depth, _odd_depth(page.bitspersample))
+    names = [each.name for each in fields(CameraFacts)]
+    camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
+    return StatedFacts(camera, first_of(times), first_of(depths))
+
+
+def _ome_time(text: str) -> float | None:
+    plane = re.search(r'<[^<>]*\sExposureTime="[^<>]*>', text)
+    return duration_of(_attribute(plane, "ExposureTime"), _attribute(plane, "ExposureTimeUnit"))
+
+
+def _ome_depth(text: str) -> int | None:
+    match = re.search(r'SignificantBits="(\d+)"', text)
+    return bits_of(int(match[1])) if match else None
+
+
+def _odd_depth(bits: Any) -> int | None:
+    """Return the bits of a stored sample where they are not those of a whole type."""
+    return None if bits in (8, 16, 32) else bits_of(bits)
+
+
+def _ratio(value: Any) -> float | None:
+    return duration_of(value[0] / value[1]) if isinstance(value, tuple) and value[1] else None
 
 
 def _ome_camera(text: str) -> CameraFacts:
@@ -194,11 +197,3 @@ def _make_and_model(page: Any) -> str | None:
 
 def _tag(page: Any, number: int) -> Any:
     return page.tags[number].value if number in page.tags else None
-
-
-def _first(found: Iterable[CameraFacts], name: str) -> Any:
-    return next((getattr(each, name) for each in found if getattr(each, name) is not None), None)
-
-
-def _positive(value: float) -> float | None:
-    return value if math.isfinite(value) and value > 0 else None

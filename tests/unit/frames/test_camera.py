@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -13,7 +14,15 @@ import tifffile
 import zarr
 from astropy.io import fits
 
-from pchem_pipeline.frames.camera import CameraFacts, celsius, seconds_of, shared_facts, text_of
+from pchem_pipeline.frames.camera import (
+    CameraFacts,
+    bits_of,
+    celsius,
+    duration_of,
+    seconds_of,
+    shared_facts,
+    text_of,
+)
 from pchem_pipeline.frames.formats import ser
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
@@ -148,3 +157,45 @@ def test_hostile_texts_become_one_short_line() -> None:
     assert text_of("x" * 1_000_000) == "x" * 80
     assert (text_of(b"\0\0"), text_of(None), text_of(True)) == (None, None, None)
     assert (seconds_of("yesterday"), seconds_of("1800-01-01"), seconds_of(5)) == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "seconds"),
+    [
+        (20, "ms", 0.02),
+        ("250", "us", 2.5e-4),
+        (np.float32(2), None, 2.0),
+        (1.5, b"min", 90.0),
+        (3.0, "fortnights", None),
+        (0.0, "s", None),
+        (np.nan, "s", None),
+        (True, "s", None),
+        ([1.0, 2.0], "s", None),
+        (None, "s", None),
+    ],
+)
+def test_durations(value: Any, unit: Any, seconds: float | None) -> None:
+    assert duration_of(value, unit) == (None if seconds is None else pytest.approx(seconds))
+
+
+@pytest.mark.parametrize(
+    ("value", "bits"),
+    [(12, 12), (np.int16(16), 16), (0, None), (33, None), (12.0, None), ("12", None), (True, None)],
+)
+def test_bits(value: Any, bits: int | None) -> None:
+    assert bits_of(value) == bits
+
+
+def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> None:
+    """HDF5 as a program that stores each number as an array of one; zarr with the unit beside."""
+    frames = np.zeros((2, 3, 4), np.uint16)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        attributes = file.create_dataset("frames", data=frames).attrs
+        attributes["exposure_time"], attributes["exposure_time_units"] = np.array([20.0]), "ms"
+        attributes["bit_depth_readout"] = np.array([12])
+    array = zarr.create_array(str(tmp_path / "a.zarr"), shape=frames.shape, dtype=frames.dtype)
+    array[:] = frames
+    array.attrs.update(exposure_time=20, exposure_time_units="ms", bit_depth_readout=12)
+    for name in ("a.h5", "a.zarr"):
+        with open_frames(InputSettings(files=(name,)), tmp_path) as stack:
+            assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)
