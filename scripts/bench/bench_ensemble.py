@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.residuals import central_window, noise_floor, rmse
-from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
+from pchem_pipeline.model.electrons.electrons import Outcomes
+from pchem_pipeline.model.electrons.thresholds import numbers_by_thresholds
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
@@ -32,7 +33,6 @@ from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import pcd_mass
-from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 
@@ -134,15 +134,14 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
     sums = ensemble_sums(pixels, dn, axis)
     clock.lap("exact EPCD and NUCed EPCD", began)
     raw, raw_all, nuced = (np.zeros(m, dtype=np.int64) for m in (dn.size, dn.size, axis.size))
-    numbers = np.zeros(60, dtype=np.int64)
+    numbers, errors = np.zeros(60, dtype=np.int64), []
     for chunk in chunks:
         part, use = UsablePixels.from_maps(chunk.fitted)
         began = time.process_time()
         data = tally(chunk.chosen[use], chunk.origin[use], part, dn, axis)
-        known = KnownPixels(part, SampleLaw())
-        codes = known.codes(chunk.chosen[use], chunk.origin[use])
-        tables = number_tables(*codes, known.exposure, known)
-        numbers += tables.tally(chunk.chosen[use], chunk.origin[use], numbers.size)[0]
+        found = numbers_by_thresholds(chunk.chosen[use], chunk.origin[use], part, numbers.size)
+        numbers += found[0]
+        errors.append(found[2])
         clock.lap("tally data and electron numbers", began)
         raw += data.raw
         nuced += data.nuced
@@ -180,21 +179,17 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
     verdict("raw, exact: RMSE below 1.9e-4", found["epcd_exact"] < 1.9e-4)
     verdict("NUCed, exact: RMSE within 1.3 of the floor", found["nuced_exact"] <= 1.3 * nuced_floor)
     verdict("NUCed, dependent: RMSE below 2.3e-4", found["nuced_dependent"] < 2.3e-4)
-    electrons(pixels, numbers, total, clock)
+    electrons(errors, numbers, total)
 
 
-def electrons(pixels: UsablePixels, numbers: NDArray[np.int64], total: int, clock: Clock) -> None:
+def electrons(expected: list[Outcomes], numbers: NDArray[np.int64], total: int) -> None:
     """Print how well the histogram of electron numbers is predicted."""
-    began = time.process_time()
-    known = KnownPixels(pixels, SampleLaw())
-    expected = number_tables(*known.codes(), known.exposure, known, detailed=True)
-    expected = expected.outcomes(numbers.size)
-    clock.lap("expected electron numbers", began)
-    mass = expected.estimated / len(pixels)
+    error = np.concatenate([each.error for each in expected])
+    mass = np.sum([each.estimated for each in expected], axis=0) / error.size
     floor = noise_floor(mass * (1 - mass) / total)
-    error = rmse(numbers / total, mass)
-    print(f"\nelectron numbers: RMSE {error:.3e}, at most {floor:.3e} from counting noise")
-    print(f"expected error rate of the electron numbers {expected.error.mean():.4f}")
+    off = rmse(numbers / total, mass)
+    print(f"\nelectron numbers: RMSE {off:.3e}, at most {floor:.3e} from counting noise")
+    print(f"expected error rate of the electron numbers {error.mean():.4f}")
 
 
 def verdict(words: str, holds: bool) -> None:

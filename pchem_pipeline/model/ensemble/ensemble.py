@@ -218,13 +218,14 @@ def curve_errors(
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
     plain = pixels.columns
     ensemble_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
-    ones, zeros = np.ones(len(pixels)), np.zeros(len(pixels))
-    corrected = np.stack([pixels.quanta_exposure, ones, zeros, pixels.read_noise_e], axis=1)
-    slope = np.zeros((len(pixels), 4, 4))
-    slope[:, 0, 0] = 1.0
-    slope[:, 3, 1], slope[:, 3, 3] = pixels.read_noise_dn, pixels.conversion_gain
+    n, (_, gain, _, noise) = len(pixels), pixels.maps
+    corrected = np.stack([pixels.quanta_exposure, np.ones(n), np.zeros(n), pixels.read_noise_e], axis=1)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
-    moved = slope @ known @ np.swapaxes(slope, 1, 2)
+    moved = np.zeros((n, 4, 4))  # sigma_e- = g sigma
+    moved[:, 0, 0] = known[:, 0, 0]
+    moved[:, 0, 3] = moved[:, 3, 0] = noise * known[:, 0, 1] + gain * known[:, 0, 3]
+    moved[:, 3, 3] = noise * noise * known[:, 1, 1] + gain * gain * known[:, 3, 3]
+    moved[:, 3, 3] += 2.0 * noise * gain * known[:, 1, 3]
     ensemble_numba.curve_variance(corrected, moved, nuced.start * nuced.width, nuced.width, bins)
     return raw, bins
 

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.normal_numba import REACH, add_component, add_mass
+from pchem_pipeline.model.law.normal_numba import NARROW, REACH, add_component, add_mass
+from pchem_pipeline.model.law.simd_math_numba import simd_exp
+from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, counting, fused, most, simd_load, simd_store
 
 __all__ = [
+    "capacity",
     "curve_variance",
     "poisson_weights",
     "sort_masses",
@@ -31,6 +34,11 @@ IntArray = NDArray[np.int64]
 
 #: Poisson weights below this part of the largest are left out.
 SMALLEST = 1e-18
+
+_ERROR_SHARE = 1e-10  # of a pixel's highest component: less is not seen in an error
+_ROOM = 2 * SIMD_WIDTH  # after the last place, for loops that write some places at a time
+_PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
+_LEAST_EXPONENT = -700.0
 
 
 @kernel
@@ -59,7 +67,8 @@ def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
 
 
 @kernel
-def _capacity(exposure: FloatArray) -> int:
+def capacity(exposure: FloatArray) -> int:
+    """Return room for the electron numbers that matter at the largest of some exposures."""
     largest = 0.0
     for p in range(exposure.size):
         largest = max(largest, exposure[p])
@@ -85,8 +94,8 @@ def sum_pcd_pixels(
     The NUCed value of DN ``x`` is ``(x - mu) g``, so each DN falls into one bin as a whole, exactly as the
     data do. ``width <= 0`` leaves the NUCed sums out.
     """
-    weights = np.zeros(_capacity(exposure))
-    row = np.zeros(total.size)
+    weights = np.zeros(capacity(exposure))
+    row = np.zeros((1, total.size + _ROOM))
     for p in range(exposure.size):
         low, high = poisson_weights(exposure[p], weights)
         step = 1.0 / gain[p]
@@ -95,16 +104,34 @@ def sum_pcd_pixels(
         last = min(total.size - 1, math.ceil(bias[p] + high * step + reach) - dn_start)
         if first > last:
             continue
-        part = row[first : last + 1]
+        part = row[0, first : last + 1]
         part[:] = 0.0
         base = float(dn_start + first)
         for k in range(low, high + 1):
-            add_component(part, base, weights[k], bias[p] + k * step, sigma[p])
+            centre = bias[p] + k * step
+            if sigma[p] >= NARROW:
+                _add_bell(row, centre - dn_start, sigma[p], weights[k], total.size)
+            else:
+                add_component(part, base, weights[k], centre, sigma[p])
         for i in range(part.size):
             total[first + i] += part[i]
             total_square[first + i] += part[i] * part[i]
         if width > 0.0:
             _add_nuced(part, base, gain[p], bias[p], width, nuced_start, nuced, nuced_square)
+
+
+@kernel(borrows=True)
+def _add_bell(row: FloatArray, centre: float, sigma: float, weight: float, n: int) -> None:
+    """Add a component of the PCD at the places 0 ... n - 1 of a row; a few after these are written, too."""
+    if weight <= 0.0:
+        return
+    reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(weight), 0.0)) * sigma
+    inverse = 1.0 / sigma
+    peak = weight * _PER_ROOT_2PI * inverse
+    for i in range(max(0, math.ceil(centre - reach)), min(n, math.floor(centre + reach) + 1), SIMD_WIDTH):
+        z = (counting() + (i - centre)) * inverse
+        value = peak * simd_exp(most(z * z * -0.5, _LEAST_EXPONENT))
+        simd_store(row, 0, i, value + simd_load(row, 0, i))
 
 
 @kernel
@@ -197,8 +224,8 @@ def curve_variance(
         pitch: between places.
         out: in and out, shape (m,).
     """
-    weights = np.zeros(_capacity(parameters[:, 0]))
-    slopes = np.zeros((out.size, 4))
+    weights = np.zeros(capacity(parameters[:, 0]))
+    slopes, total = np.zeros((4, out.size + _ROOM)), np.zeros((1, out.size + _ROOM))
     known = np.zeros((4, 4))
     for p in range(parameters.shape[0]):
         exposure, step = parameters[p, 0], 1.0 / parameters[p, 1]
@@ -208,66 +235,68 @@ def curve_variance(
                 entry = covariance[p, i, j]
                 known[i, j] = entry if math.isfinite(entry) else 0.0
         low, high = poisson_weights(exposure, weights)
-        reach = REACH * sigma
-        first = max(0, math.ceil((bias + low * step - reach - x0) / pitch))
-        last = min(out.size - 1, math.floor((bias + high * step + reach - x0) / pitch))
+        least = _ERROR_SHARE * np.max(weights[low : high + 1])
+        first, last = out.size, -1
         for k in range(low, high + 1):
-            rise = k / exposure - 1.0 if exposure > 0.0 else 0.0
-            _add_slopes(slopes, x0, pitch, weights[k], rise, k * step * step, bias + k * step, sigma)
-        for i in range(first, last + 1):
-            for row in range(4):
-                for column in range(4):
-                    out[i] += slopes[i, row] * known[row, column] * slopes[i, column]
-            slopes[i] = 0.0
+            if weights[k] <= least:
+                continue
+            centre = bias + k * step
+            reach = math.sqrt(2.0 * math.log(weights[k] / least)) * sigma
+            begin = max(0, math.ceil((centre - reach - x0) / pitch))
+            end = min(out.size, math.floor((centre + reach - x0) / pitch) + 1)
+            if begin < end:
+                rise = k / exposure - 1.0 if exposure > 0.0 else 0.0
+                part = weights[k], rise, k * step * step, sigma
+                _add_slopes(slopes, begin, end, (x0 - centre) / sigma, pitch / sigma, part)
+                first, last = min(first, begin), max(last, end)
+        _add_variance(slopes, known, first, last, total)
+    for i in range(out.size):
+        out[i] += total[0, i]
 
 
-@kernel
+@kernel(borrows=True)
 def _add_slopes(
-    slopes: NDArray[np.float64],
-    x0: float,
-    pitch: float,
-    weight: float,
-    rise: float,
-    shift: float,
-    centre: float,
-    sigma: float,
+    slopes: FloatArray, begin: int, end: int, z0: float, pitch: float, part: tuple[float, float, float, float]
 ) -> None:
-    """Add a component's slopes in (H, g, mu, sigma) at ``x0 + i pitch``.
+    """Add a component's slopes in (H, g, mu, sigma) at some places.
 
     Args:
-        slopes: in and out, shape (m, 4).
-        x0: first place.
-        pitch: between places.
-        weight: of the component.
-        rise: of the logarithm of the weight with H.
-        shift: by which the centre falls as g rises by one.
-        centre: of the component.
-        sigma: of the component.
+        slopes: in and out, shape (4, m).
+        begin: first place; a few after the last are written, too.
+        end: place after the last.
+        z0: place 0 from the centre of the component, standard deviations.
+        pitch: between places, likewise.
+        part: weight of the component, rise of its logarithm with H, by how much the centre falls as g rises
+            by one, standard deviation.
     """
-    reach = REACH * sigma
-    first = max(0, math.ceil((centre - reach - x0) / pitch))
-    last = min(slopes.shape[0] - 1, math.floor((centre + reach - x0) / pitch))
-    if first > last:
-        return
-    nearest = min(max(math.floor((centre - x0) / pitch + 0.5), first), last)
-    precision = 1.0 / (sigma * sigma)
-    distance = x0 + nearest * pitch - centre
-    peak = weight * 0.3989422804014327 / sigma * math.exp(-0.5 * distance * distance * precision)
-    shrink = math.exp(-precision * pitch * pitch)
-    for side in (1, -1):
-        value, ratio = peak, math.exp(-(side * distance + 0.5 * pitch) * pitch * precision)
-        i = nearest
-        while first <= i <= last:
-            if side > 0 or i < nearest:
-                e = x0 + i * pitch - centre
-                pull = value * e * precision
-                slopes[i, 0] += value * rise
-                slopes[i, 1] -= pull * shift
-                slopes[i, 2] += pull
-                slopes[i, 3] += (pull * e - value) / sigma
-            value *= ratio
-            ratio *= shrink
-            i += side
+    weight, rise, shift, sigma = part
+    inverse = 1.0 / sigma
+    peak = weight * _PER_ROOT_2PI * inverse
+    for i in range(begin, end, SIMD_WIDTH):
+        z = fused(counting() + float(i), pitch, z0)
+        square = z * z
+        value = peak * simd_exp(most(square * -0.5, _LEAST_EXPONENT))
+        pull = value * z * inverse
+        simd_store(slopes, 0, i, fused(value, rise, simd_load(slopes, 0, i)))
+        simd_store(slopes, 1, i, fused(pull, -shift, simd_load(slopes, 1, i)))
+        simd_store(slopes, 2, i, pull + simd_load(slopes, 2, i))
+        simd_store(slopes, 3, i, fused(value * inverse, square - 1.0, simd_load(slopes, 3, i)))
+
+
+@kernel(borrows=True)
+def _add_variance(slopes: FloatArray, known: FloatArray, begin: int, end: int, total: FloatArray) -> None:
+    """Add ``D' C D`` between two places, and set the slopes back to 0."""
+    for i in range(begin, end, SIMD_WIDTH):
+        variance = simd_load(total, 0, i)
+        for row in range(4):
+            product = counting() * 0.0
+            for column in range(4):
+                product = fused(simd_load(slopes, column, i), known[row, column], product)
+            variance = fused(simd_load(slopes, row, i), product, variance)
+        simd_store(total, 0, i, variance)
+    for i in range(begin, end + SIMD_WIDTH, SIMD_WIDTH):
+        for row in range(4):
+            simd_store(slopes, row, i, counting() * 0.0)
 
 
 @kernel
@@ -281,7 +310,7 @@ def sum_pcd_cells(
     out: FloatArray,
 ) -> None:
     """Add ``share`` times the PCD of each cell of a 4-D histogram at the integers."""
-    weights = np.zeros(_capacity(exposure))
+    weights = np.zeros(capacity(exposure))
     for c in range(exposure.size):
         low, high = poisson_weights(exposure[c], weights)
         for k in range(low, high + 1):
@@ -298,7 +327,7 @@ def sum_nuced_cells(
     out: FloatArray,
 ) -> None:
     """Add the mass of ``share`` PCD(H, 1, 0, sigma_e^2) in each bin of the NUCed axis."""
-    weights = np.zeros(_capacity(exposure))
+    weights = np.zeros(capacity(exposure))
     for c in range(exposure.size):
         low, high = poisson_weights(exposure[c], weights)
         for k in range(low, high + 1):
@@ -325,7 +354,7 @@ def sum_nuced_product(
 @kernel
 def sum_poisson(share: FloatArray, exposure: FloatArray, out: FloatArray) -> None:
     """Add ``share`` times the Poisson mass of each exposure at k = 0, 1, ... up to the end of ``out``."""
-    weights = np.zeros(max(out.size, _capacity(exposure)))
+    weights = np.zeros(max(out.size, capacity(exposure)))
     for c in range(exposure.size):
         low, high = poisson_weights(exposure[c], weights)
         for k in range(low, min(high, out.size - 1) + 1):

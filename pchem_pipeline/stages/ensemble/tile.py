@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, number_tables
+from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
+from pchem_pipeline.model.electrons.thresholds import numbers_by_thresholds
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, mass_sums, tally
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
@@ -35,7 +36,7 @@ class PixelHistograms:
 
     def of(self, mask: NDArray[np.bool_]) -> PixelHistograms:
         """Return those of the chosen pixels."""
-        return PixelHistograms(self.counts[mask], self.outside[mask])
+        return self if mask.all() else PixelHistograms(self.counts[mask], self.outside[mask])
 
     @property
     def samples(self) -> NDArray[np.int64]:
@@ -75,20 +76,22 @@ def ensemble_tile(
     satellites = None if satellites is None else (satellites[0][mask], satellites[1][mask])
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
-    chosen, everything, origin = chosen.of(mask), everything.of(mask), origin[mask]
+    same, origin = chosen is everything, origin[mask]
+    chosen = chosen.of(mask)
+    everything = chosen if same else everything.of(mask)
     if covariance is not None and not axes.extended:
         errors = curve_errors(pixels, covariance[mask], axes.dn, axes.nuced)
         for name, variance in zip(MODEL_ERRORS, errors, strict=True):
             floats[axes.floats[name]] = variance
     samples, samples_all = chosen.samples, everything.samples
-    pairs = np.stack([samples, samples_all], axis=1)
-    for n, n_all in np.unique(pairs, axis=0):
+    for n, n_all in sorted({*zip(samples.tolist(), samples_all.tolist(), strict=True)}):
         if n == 0:
             continue
         group = (samples == n) & (samples_all == n_all)
         part = pixels.of(group)
         own = None if satellites is None else (satellites[0][group], satellites[1][group])
-        sets = (chosen.of(group), int(n)), (everything.of(group), int(n_all))
+        of_group = chosen.of(group)
+        sets = (of_group, n), (of_group if same else everything.of(group), n_all)
         tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, origin[group], *sets, axes)
         for name, tallied in tallies.items():
             integers[axes.integers[name]] += tallied
@@ -97,10 +100,29 @@ def ensemble_tile(
     return integers, floats
 
 
-def _predicted(tables: NumberTables, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
+def _numbers(
+    known: KnownPixels,
+    pixels: UsablePixels,
+    histograms: PixelHistograms,
+    origin: NDArray[np.integer[Any]],
+    axes: EnsembleAxes,
+) -> tuple[NDArray[np.int64], int, Outcomes, NumberTables | None]:
+    """Return the samples of each electron number, those beyond, what is expected, and the tables, if any."""
+    if not axes.extended:
+        return (*numbers_by_thresholds(histograms.counts, origin, pixels, axes.n_k), None)
+    low, high = known.codes(histograms.counts, origin)
+    if np.any(known.law.outlier_share):  # may be anything, on the whole axis
+        low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
+    tables = number_tables(low, high, known.exposure, known, detailed=True)
+    return (*tables.tally(histograms.counts, origin, axes.n_k), tables.outcomes(axes.n_k), tables)
+
+
+def _predicted(
+    tables: NumberTables | None, pixels: UsablePixels, n: int, axes: EnsembleAxes
+) -> dict[str, Any]:
     """Return what the law predicts of pixels that have n samples each."""
     parts: dict[str, Any] = {}
-    if axes.extended:
+    if tables is not None:
         sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
         parts["nuced_predicted_sum"], parts["nuced_predicted_sum_square"] = moments
     else:
@@ -124,13 +146,12 @@ def _group_sums(
     """Return the tallies and sums of pixels that have the same number of samples."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
     data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
-    data_all = tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
-    low, high = known.codes(histograms.counts, origin)
-    if np.any(known.law.outlier_share):  # may be anything, on the whole axis
-        low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
-    tables = number_tables(low, high, known.exposure, known, detailed=True)
-    numbers, beyond = tables.tally(histograms.counts, origin, axes.n_k)
-    expected = tables.outcomes(axes.n_k)
+    data_all = (
+        data
+        if histograms_all is histograms
+        else tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
+    )
+    numbers, beyond, expected, tables = _numbers(known, pixels, histograms, origin, axes)
     outside = int(histograms.outside.sum())
     tallies: dict[str, NDArray[np.int64] | int] = {
         "counts": data.raw,

@@ -1,0 +1,161 @@
+"""Loops of :mod:`pchem_pipeline.model.electrons.thresholds`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.ensemble.ensemble_numba import capacity, poisson_weights
+from pchem_pipeline.model.law.normal_numba import NARROW, REACH, normal_mass
+from pchem_pipeline.model.law.simd_math_numba import simd_tail
+from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, simd_load, simd_store
+
+__all__ = ["sum_by_thresholds"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_LEAST_VARIANCE = 1e-6  # DN^2
+_LEAST_LIKELY = 1e-17  # of an electron number
+_SURE = 0.02  # of a code: thresholds of densities and of masses are nearer to each other
+_INFINITE = 1e300
+_EDGE, _TAIL = 0, 1
+
+
+@kernel
+def sum_by_thresholds(
+    counts: NDArray[Any],
+    origin: IntArray,
+    parameters: FloatArray,
+    largest: int,
+    observed: IntArray,
+    expected: FloatArray,
+    errors: FloatArray,
+) -> np.int64:
+    """Add the electron numbers of histograms, and what is expected of them; return how many lie beyond.
+
+    Args:
+        counts: samples per bin, shape (n, n_bins).
+        origin: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4); all known.
+        largest: electron numbers above are cut to this.
+        observed: in and out, samples of each number.
+        expected: in and out, sum over pixels of the probability that the estimated number is k.
+        errors: out, probability that it is wrong, shape (n,).
+    """
+    weights = np.zeros(capacity(parameters[:, 0]))
+    rows = np.empty((2, weights.size + 1 + 2 * SIMD_WIDTH))
+    beyond = np.int64(0)
+    for p in range(origin.size):
+        exposure, step, bias = parameters[p, 0], 1.0 / parameters[p, 1], parameters[p, 2]
+        variance = max(parameters[p, 3] * parameters[p, 3] - QUANTISATION_VARIANCE, _LEAST_VARIANCE)
+        low, high = poisson_weights(exposure, weights)
+        while low < high and weights[low] < _LEAST_LIKELY:
+            low += 1
+        while high > low and weights[high] < _LEAST_LIKELY:
+            high -= 1
+        rows[_EDGE, 0] = -_INFINITE
+        for k in range(low, high):
+            rows[_EDGE, k + 1 - low] = max(
+                _last_code(k, exposure, step, bias, variance, weights) + 0.5, rows[_EDGE, k - low]
+            )
+        n, sd, right = high + 1 - low, math.sqrt(variance), 0.0
+        rows[_EDGE, n : n + 1 + SIMD_WIDTH] = _INFINITE
+        for j in range(n):
+            right += _spread(rows, j, n, bias + (low + j) * step, sd, weights[low + j], low, expected)
+        errors[p] = 1.0 - right
+        # farther from all levels than any sample of the law: the nearest
+        ends = bias + low * step, bias + high * step
+        farthest = max(_reach(weights[low]) * sd, step), max(_reach(weights[high]) * sd, step)
+        bottom, top = ends[0] - farthest[0] - 0.5, ends[1] + farthest[1] + 0.5
+        j = 0
+        for b in range(counts.shape[1]):
+            c = np.int64(counts[p, b])
+            if c == 0:
+                continue
+            dn = float(origin[p] + b)
+            while dn > rows[_EDGE, j + 1]:
+                j += 1
+            k = low + j
+            if exposure > 0.0 and not bottom <= dn <= top:
+                k = max(math.floor((dn - bias) / step + 0.5), 0)
+            k = min(k, largest)
+            if k < observed.size:
+                observed[k] += c
+            else:
+                beyond += c
+    return beyond
+
+
+@kernel
+def _reach(likely: float) -> float:
+    """Return the standard deviations within which an electron number of this probability is seen."""
+    return math.sqrt(max(REACH * REACH + 2.0 * math.log(max(likely, _LEAST_LIKELY)), 0.0))
+
+
+@kernel(borrows=True)
+def _last_code(
+    k: int, exposure: float, step: float, bias: float, variance: float, weights: FloatArray
+) -> float:
+    """Return the last code at which k is more probable than k + 1.
+
+    Where the densities are equal (Hendrickson et al. 2023, eq. demarg_K_eqn); the masses of the code decide
+    where that is too near to a whole code.
+    """
+    middle = bias + (k + 0.5) * step
+    spread = variance + (QUANTISATION_VARIANCE if variance > NARROW else 0.0)
+    shift = spread / step * math.log((k + 1.0) / exposure) if exposure > 0.0 else _INFINITE
+    code = math.floor(min(middle + shift, _INFINITE))
+    part = middle + shift - code
+    near = _SURE * (1.0 + abs(shift))
+    if shift >= _INFINITE or (variance > NARROW and near < part < 1.0 - near):
+        return float(code)
+    sd = math.sqrt(variance)
+    for _ in range(4):  # codes that the masses may lie off
+        at = code if part < 0.5 else code + 1
+        below = (at - 0.5 - bias - k * step) / sd
+        width, apart = 1.0 / sd, step / sd
+        lower = weights[k] * normal_mass(below, below + width)
+        upper = weights[k + 1] * normal_mass(below - apart, below - apart + width)
+        if upper > lower:
+            if at > code:
+                break
+            code -= 1
+        elif lower > 0.0:
+            if at == code:
+                break
+            code += 1
+        else:
+            break
+    return float(code)
+
+
+@kernel(borrows=True)
+def _spread(
+    rows: FloatArray, j: int, n: int, mean: float, sd: float, weight: float, low: int, out: FloatArray
+) -> float:
+    """Add the mass that a level gives to the codes of each number; return that of its own number."""
+    reach = _reach(weight) * sd
+    first, end = j, j + 1
+    while first > 0 and rows[_EDGE, first] > mean - reach:
+        first -= 1
+    while end < n and rows[_EDGE, end] < mean + reach:
+        end += 1
+    for i in range(first, end + 1, SIMD_WIDTH):
+        tail, _, _ = simd_tail((simd_load(rows, _EDGE, i) - mean) * (1.0 / sd))
+        simd_store(rows, _TAIL, i, tail)
+    right = 0.0
+    for i in range(first, end):
+        mass = rows[_TAIL, i + 1] - rows[_TAIL, i]
+        if rows[_EDGE, i] <= mean < rows[_EDGE, i + 1]:  # both tails are those beyond its edges
+            mass += 1.0
+        if low + i < out.size:
+            out[low + i] += weight * mass
+        if i == j:
+            right = weight * mass
+    return right
