@@ -168,6 +168,10 @@ def discrepancy(
     roi: Annotated[
         str | None, typer.Option(help="look at the pixels y0:y1,x0:x1 only [default: all, or a window]")
     ] = None,
+    effort: Annotated[
+        float | None,
+        typer.Option(help="times the usual limit of the search's work [default: discrepancy.effort]"),
+    ] = None,
     *,
     command: Command,
 ) -> None:
@@ -179,7 +183,7 @@ def discrepancy(
     from pchem_pipeline.run.target import find_run
 
     command = replace(command, options=replace(command.options, roi=region_of(roi)))
-    text = find_and_add(find_run(target), command, refit=refit)
+    text = find_and_add(find_run(target), command, refit=refit, effort=effort)
     if text:
         typer.echo(text)
 

@@ -21,7 +21,7 @@ _BEFORE = ("ingest", "histogram")
 _AFTERWARDS = ("fit", "maps", "ensemble", "report")
 
 
-def find_and_add(target: Target, command: Command, *, refit: bool) -> str:
+def find_and_add(target: Target, command: Command, *, refit: bool, effort: float | None = None) -> str:
     """Search for effects, add those named to the model, and fit with it; return the verdict as text.
 
     Args:
@@ -29,10 +29,13 @@ def find_and_add(target: Target, command: Command, *, refit: bool) -> str:
         command: from the command line.
         refit: make the verdict's model a version, unless ``discrepancy.add`` is off, and bring fit, maps,
             ensemble and report up to date where they were done before; else model and YAML stay.
+        effort: in place of the configuration's ``discrepancy.effort``; None: as that has it.
 
     Raises:
         PchEmError: a stage cannot be done.
     """
+    if effort is not None:
+        target = target.changed("discrepancy", effort=effort)
     add = refit and target.config.discrepancy.add
     path = yaml_of(target) if add else None
     if path is not None:

@@ -168,6 +168,7 @@ class Findings:
         still: whether they disagree with the final model.
         added: effects, and what is left.
         doubt: why the pixels are not identified, and what would help; empty where they are.
+        limit: where the search ended at its limit, and what was not tried; empty where it did not.
     """
 
     samples: str
@@ -179,6 +180,7 @@ class Findings:
     still: bool
     added: Added
     doubt: str = ""
+    limit: str = ""
 
     @property
     def state(self) -> State:
@@ -194,7 +196,8 @@ class Findings:
             return "named_in_part" if self.named else "unexplained"
         if any(not each.named for each in additions):
             return "ambiguous"
-        return "named" if self.added.after.at_floor else "named_in_part"
+        # what was not tried may be missing as well
+        return "named" if self.added.after.at_floor and not self.limit else "named_in_part"
 
     @property
     def named(self) -> tuple[Effect, ...]:
@@ -245,8 +248,10 @@ def build_verdict(
     return Discrepancy(
         verdict=Verdict(
             verdict=found.state,
-            sentence=_sentence(found, sizes),
+            sentence=_sentence(found, sizes).removesuffix(".")
+            + (f"; {found.limit}." if found.limit else "."),
             doubt=found.doubt,
+            limit=found.limit,
             effects=tuple(effect.tag for effect in found.named),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
             steps=tuple(each.step(sizes[each.effect.tag]) for each in found.added.additions),
@@ -313,7 +318,8 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
         )
     if state == "unexplained":
         lead = f" (largest in {found.places[0].statistic})" if found.places else ""
-        words = f"{lead}, and no known effect explains it{_nearest(found)}{_left(added)}"
+        none = "no known effect explains it" if not found.limit else "none that was tried explains it"
+        words = f"{lead}, and {none}{_nearest(found)}{_left(added)}"
         return f"The {data} disagree with the model{words}."
     if state == "described":
         return _described(found, titles)
@@ -346,8 +352,9 @@ def _described(found: Findings, titles: Sequence[str]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
     words = _and([each.effect.words() for each in found.added.additions if each.described])
     besides = f" besides {_and(titles)}" if titles else ""
+    none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (
-        f"No known effect explains the {found.samples}{besides}, but what they hold is measured: {words}; "
+        f"{none} the {found.samples}{besides}, but what they hold is measured: {words}; "
         f"with it {_closed(found)}{_rest(found)}; {_alike(found)}{_gaps(found)}."
     )
 

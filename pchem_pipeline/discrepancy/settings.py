@@ -33,6 +33,11 @@ class DiscrepancySettings(Section):
         description="frames x pixels compared with simulations; of a larger stack, a window where it stands "
         "out most, else its middle, and blocks of frames spread over the run",
     )
+    max_pixels: int = Field(
+        default=1 << 13,
+        ge=256,
+        description="pixels compared with simulations, at most: each is fitted anew in every simulated stack",
+    )
     significance: float = Field(
         default=0.005,
         gt=0,
@@ -55,6 +60,13 @@ class DiscrepancySettings(Section):
     )
     max_rounds: int = Field(
         default=3, ge=1, le=10, description="rounds of naming and adding; each round may add several effects"
+    )
+    effort: float | None = Field(
+        default=1.0,
+        gt=0,
+        description="limit of the search, in counted work, so that the same search ends at the same place "
+        "on any machine: 1 is twice the work of the null distribution, and at least some 100 CPU seconds; "
+        "null: none",
     )
     candidates: tuple[str, ...] | None = Field(
         default=None, description="effects (tags) to consider; null: all that are known, plug-ins included"

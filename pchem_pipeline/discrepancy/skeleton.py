@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
+from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -119,24 +120,28 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     doubt = by.doubt()
     still = disagrees(null, z, significance)
     wanted = still or (not doubt and by.suspects(null, z))
+    limit = ""
     while wanted and rounds < by.most_rounds:
-        tell("comparing candidates")
-        explanation = by.explain(null, z, still)
-        if explanation is not None:
-            tell("fitting the pixels with the likeliest effects")
-        extended = None if explanation is None else by.add(explanation, null, z)
+        try:
+            extended = _round(by, null, z, still, tell)
+        except EffortSpentError as spent:
+            limit = spent.words()
+            break
         if extended is None:
             break
         null, rounds = extended, rounds + 1
         wanted = still = disagrees(null, z, significance, by.tolerance())
     if still:
         tell("measuring what no effect explains")
-    described = by.describe(before, null, z) if still else None
-    if described is not None:
-        null, still = described, disagrees(described, z, significance, by.tolerance())
+        try:
+            described = by.describe(before, null, z)
+        except EffortSpentError as spent:
+            described, limit = None, limit or spent.words()
+        if described is not None:
+            null, still = described, disagrees(described, z, significance, by.tolerance())
     tell("measuring the gap that is left, with effects and with rivals")
     added = by.close(before, null, z, still)
-    found = Findings(by.samples, z, first, null, before, places, still, added, doubt)
+    found = Findings(by.samples, z, first, null, before, places, still, added, doubt, limit)
     model = found.model(present, by.model)
     return build_verdict(
         found,
@@ -147,3 +152,19 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         defects=by.defects,
         n_replicates=by.n_replicates,
     )
+
+
+def _round(
+    by: Explainer[Explanation], null: NullModel, z: Measured, still: bool, tell: Callable[[str], None]
+) -> NullModel | None:
+    """Compare candidates and add the best; return the null of the new model, None where none is established.
+
+    Raises:
+        EffortSpentError: the work is at its limit; nothing was added.
+    """
+    tell("comparing candidates")
+    explanation = by.explain(null, z, still)
+    if explanation is None:
+        return None
+    tell("fitting the pixels with the likeliest effects")
+    return by.add(explanation, null, z)

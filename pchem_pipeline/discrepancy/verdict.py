@@ -384,6 +384,7 @@ class Verdict(_Part):
             closed), ambiguous, described (measured, not understood), unexplained, consistent, or cannot_tell:
             nothing is found that does not rest on the pixels' parameters, and those are not identified.
         doubt: why the pixels are not identified, and what would help; empty where they are.
+        limit: where the search ended at its limit of work, and what was not tried; empty where it did not.
         sentence: the same for people.
         effects: tags of the named effects.
         model_effects: all effects that the model has afterwards, as the YAML holds them.
@@ -405,6 +406,7 @@ class Verdict(_Part):
     verdict: State
     sentence: str
     doubt: str = ""
+    limit: str = ""
     effects: tuple[str, ...]
     model_effects: tuple[dict[str, Any], ...]
     steps: tuple[Step, ...]

@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
+from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere, two_sided
 from pchem_pipeline.effects.framework.effect import Effect
 
@@ -38,6 +39,7 @@ _MOST_DEAR = 2  # sets whose refit takes long
 _LOOSE = 0.1  # relative error of a fingerprint before its refit
 # nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
 _FAR, _FAR_SHARE = 40.0, 0.25
+_FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
 _LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
 _SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
 _MOVED = 3.0  # by which that effect must move it
@@ -79,7 +81,11 @@ class Comparison:
 
 
 def compare(
-    refitter: Refitter, held: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis], choice: Choice
+    refitter: Refitter,
+    held: Sequence[Hypothesis],
+    hypotheses: Sequence[Hypothesis],
+    choice: Choice,
+    before: Refitted | None = None,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
@@ -88,6 +94,10 @@ def compare(
         held: effects that the model was given in earlier rounds; they are fitted anew with the others.
         hypotheses: all new ones, the likeliest first.
         choice: how their sets compare by fingerprints.
+        before: the effects held, at their best fit; None: not known.
+
+    Raises:
+        EffortSpentError: the work is at its limit.
     """
     tried: list[Refitted] = []
     failed: dict[str, str] = {}
@@ -99,6 +109,8 @@ def compare(
         best = max((one.score for one in tried), default=-np.inf)
         try:
             tried.append(refitter.refined((*held, *members), best))
+        except EffortSpentError:
+            raise
         # whatever a stranger's effect raises must not stop the others
         except Exception as error:
             failed[members[-1].tag] = error_words(error)
@@ -114,7 +126,8 @@ def compare(
         for members in _sets(choice, tried):
             refit(members)
     tried.sort(key=_worth, reverse=True)
-    chosen = next((one for one in tried if _all_seen(refitter, one, tried)), None)
+    known_sets = {one.tags: one for one in ([] if before is None else [before]) + tried[::-1]}
+    chosen = next((one for one in tried if _all_seen(refitter, one, known_sets)), None)
     if chosen is None:
         return None
     known = {h.tag for h in held}
@@ -158,7 +171,8 @@ def _placebo(
         return []
     best = pool[max(closing)[1]]
     try:
-        return [replace(refitter, steps=_PLACEBO_STEPS).refined((*others, best))]
+        # what a name is worth is always told
+        return [replace(refitter, steps=_PLACEBO_STEPS, allow=lambda _: None).refined((*others, best))]
     except Exception:  # its defect is told where it is asked for its guesses
         return []
 
@@ -170,16 +184,16 @@ def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
 
 
 def _beaten(refitter: Refitter, hypothesis: Hypothesis, best: Refitted) -> bool:
-    """Tell whether a refit of a hypothesis is in vain: far behind a set that leaves nothing.
+    """Tell whether a refit of a hypothesis is in vain: far behind the best set.
 
-    By its fingerprint at the best strength; how far that is trusted goes with what there is to explain.
+    By its fingerprint at the best strength; how far that is trusted goes with what there is to explain, and
+    is less where the best set leaves something.
     """
-    if not leaves_nothing(refitter, best):
-        return False
+    trust = _FAR_SHARE if leaves_nothing(refitter, best) else _FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
     score = fit_set([hypothesis], shift, noise).log_score(shift, noise)
-    return score < best.score - _FAR - _FAR_SHARE * (best.score - refitter.nothing)
+    return score < best.score - _FAR - trust * (best.score - refitter.nothing)
 
 
 def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: FloatArray) -> bool:
@@ -233,21 +247,41 @@ def _kind(member: Hypothesis, best: Hypothesis) -> Hypothesis:
     return member if same else best
 
 
-def _all_seen(refitter: Refitter, one: Refitted, tried: Sequence[Refitted]) -> bool:
-    """Tell whether each effect of a set has a signature of its own beside the best fit of the others."""
+def _all_seen(refitter: Refitter, one: Refitted, known: dict[frozenset[str], Refitted]) -> bool:
+    """Tell whether each effect of a set has a signature of its own beside the best fit of the others.
+
+    Args:
+        refitter: fits sets.
+        one: the set.
+        known: sets at their best fit, by their tags; those that are fitted here come to them.
+    """
     if len(one.hypotheses) == 1:
         return True
     noise = np.sqrt(np.diag(refitter.noise(one.covariance, len(one.vectors)).covariance))
+    if not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
+        return False
     for place, hypothesis in enumerate(one.hypotheses):
-        others = next((t for t in tried if t.tags == one.tags - {hypothesis.tag}), None)
+        tags = one.tags - {hypothesis.tag}
+        others = known.get(tags)
         if others is None and is_dear(h.effect for h in one.hypotheses):
             return False
         if others is None:
             others = refitter.refined([h for h in one.hypotheses if h.tag != hypothesis.tag], one.score)
+            known[tags] = others
         part = one.hypotheses[place].fingerprint
         if not own_signature(part, others.parts, others.rest, noise):
             return False
     return True
+
+
+def _untouched(one: Refitted, place: int, noise: FloatArray) -> bool:
+    """Tell whether an effect of a set moves any statistic that the others leave alone where they stand.
+
+    Without it they would be fitted stronger, not weaker: where there is none, a refit need not be tried.
+    """
+    own = np.abs(one.parts[place])
+    touched = np.abs(np.delete(one.parts, place, axis=0)).max(axis=0, initial=0.0)
+    return bool(np.any((own > _MOVED * noise) & (touched < _UNTOUCHED * own)))
 
 
 def _apart(first: Refitted, second: Refitted) -> float:

@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     placebo_for,
     serial,
 )
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, leaves_nothing
 from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
@@ -45,6 +45,7 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate, by_part
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT
@@ -259,7 +260,9 @@ class FrameExplainer:
         self.classes = candidate_classes(self.settings)
         self.untestable = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         self.most_rounds = self.settings.max_rounds
+        self.effort = Effort(self.settings.effort)
         self.lost: float | None = None
+        self.held: Refitted | None = None
 
     def split(self) -> tuple[Evidence, Examined]:
         """Observe train and test frames together, then each part near their fit."""
@@ -290,6 +293,7 @@ class FrameExplainer:
             # where the pixels are not identified only what does not rest on their parameters counts
             names = tuple(np.array(names)[free_of_parameters(names)].tolist())
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
+        self.effort.begin()
         n_samples = self.frames.splits.final.size * int(self.evidence[0].maps.usable.sum())
         self.gaps = StatisticsGap(self.first, n_samples)
         return self.first, Measured(*as_matrix(names, own))
@@ -321,6 +325,8 @@ class FrameExplainer:
 
     def explain(self, null: NullModel, z: Measured, disagrees: bool) -> _Explanation | None:
         """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
+        self.effort.check("the candidates were compared" if not self.rounds else "another round of effects")
+        self.effort.tried.clear()
         number = len(self.rounds)
         simulator = ReplicateSimulator(
             self.sensor.usual(self._seed("sensor", number)),
@@ -349,10 +355,17 @@ class FrameExplainer:
 
         Asked twice: of the strengths as the data give them, and of the final frames. Effects of earlier
         rounds are fitted anew with the new ones.
+
+        Raises:
+            EffortSpentError: the work is at its limit; nothing was added.
         """
         held = tuple(h for this in self.rounds for h in this.added.hypotheses)
         refitter = self._refitter(z, held)
-        found = compare(refitter, held, explanation.hypotheses, explanation.choice)
+        try:
+            found = compare(refitter, held, explanation.hypotheses, explanation.choice, self.held)
+        except EffortSpentError as spent:
+            tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
+            raise EffortSpentError(spent.doing, (t for t in tags if t not in self.effort.tried)) from spent
         self.defects |= {} if found is None else found.failed
         added = None if found is None else refitter.sharpened(found.chosen, self.settings.extended_replicates)
         while found is not None and added is not None:
@@ -370,15 +383,24 @@ class FrameExplainer:
         Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
         First without the effects that were added, since one that merely mimics has no place beside it; with
         them where that does not close the gap. None where it closes less than half of what is left.
+
+        Raises:
+            EffortSpentError: the work is at its limit; nothing was added.
         """
         left = self.gaps.gap(z.final, null.mean, null.replicates)
         if left.at_floor:
             return None
+        self.effort.release()
         rounds, model = self.rounds, self.model
         held = tuple(h for this in rounds for h in this.added.hypotheses)
         for kept in [(), held] if held else [()]:
-            each = [self._described(z, kept, part) for part in (Part(), *self.frames.parts)]
-            found = max((one for one in each if one is not None), key=lambda one: one.score, default=None)
+            found: Refitted | None = None
+            for part in (Part(), *self.frames.parts):
+                one = self._described(z, kept, part)
+                if one is not None and (found is None or one.score > found.score):
+                    found = one
+                if found is not None and leaves_nothing(self._refitter(z, held), found):
+                    break
             if found is None:
                 continue
             gap = self.gaps.gap(z.final, found.mean, found.vectors)
@@ -438,16 +460,21 @@ class FrameExplainer:
 
     # -- pieces ---------------------------------------------------------------------------------
 
+    def _refit(self, model: tuple[Effect, ...]) -> Refit:
+        """Return the fit of the seen frames under a model."""
+        plain = self.plain
+        assert plain.covariance is not None
+        if not model:
+            return Refit(plain.maps, {}, plain.covariance)
+        self.effort.refit(plain.maps.usable.size, (effect.tag for effect in model))
+        frames, numbers = self.frames.stack[self.frames.seen], self.frames.numbers[self.frames.seen]
+        return refit_maps(frames, plain.maps, self.frames.effects(model), plain.covariance, numbers=numbers)
+
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
         """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
-        plain, fit = self.plain, None
-        assert plain.covariance is not None
         frames, numbers = self.frames.stack[self.frames.seen], self.frames.numbers[self.frames.seen]
-        own = self.frames.effects(model)
-        if model:
-            fit = refit_maps(frames, plain.maps, own, plain.covariance, numbers=numbers)
-        fit = fit or Refit(plain.maps, {}, plain.covariance)
-        sensor = learn_sensor(frames, numbers, fit, own, plain.ambiguous, self.lost)
+        own, fit = self.frames.effects(model), self._refit(model)
+        sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
         self.lost = sensor.lost
         return fit, sensor
 
@@ -476,6 +503,8 @@ class FrameExplainer:
 
     def _counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         self.n_replicates += len(replicates)
+        for each in replicates:
+            self.effort.simulate(each.samples, each.maps.usable.size, each.fits)
         return self.mapper(replicates)
 
     def _seed(self, purpose: str, index: int = 0) -> int:
@@ -494,21 +523,19 @@ class FrameExplainer:
         effects, window = tuple(h.effect for h in kept), self.frames.window
         inside = (window or SensorWindow.whole(self.frames.stack.shape)).mask(part.region)
         seen = self.frames.stack[self.frames.seen][part.frames(self.frames.numbers[self.frames.seen])]
-        found: Refitted | None = None
+        measured: Effect | None = None
         for _ in range(_MEASUREMENTS):
-            present = refitter.model(found.effects if found else effects)
-            maps = self._mapped(present)[0].maps
+            maps = self._refit(refitter.model(effects if measured is None else (*effects, measured))).maps
             own = replace(maps, usable=maps.usable & inside)
-            measured = measured_shifts(seen, own, refitter.model(effects)) if own.usable.any() else None
-            if measured is None:
+            shifts = measured_shifts(seen, own, refitter.model(effects)) if own.usable.any() else None
+            if shifts is None:
                 return None
-            measured = measured.at_place(part.region, part.when)
-            _, vectors = refitter.draw((*effects, measured), self.settings.extended_replicates)
-            shift = vectors.mean(axis=0) - self.first.mean - sum(h.fingerprint for h in kept)
-            found = refitter.refined((*kept, Hypothesis(measured, shift)))
-            kept = found.hypotheses[:-1]
-            effects = found.effects[:-1]
-        assert found is not None
+            measured = shifts.at_place(part.region, part.when)
+        assert measured is not None
+        refitter.allow(measured.tag)
+        _, vectors = refitter.draw((*effects, measured), self.settings.extended_replicates)
+        shift = vectors.mean(axis=0) - self.first.mean - sum(h.fingerprint for h in kept)
+        found = refitter.refined((*kept, Hypothesis(measured, shift)))
         found = refitter.sharpened(found, self.settings.extended_replicates)
         proven = {h.tag for h in self._established(found, z)}
         return found if proven == found.tags else None
@@ -530,7 +557,11 @@ class FrameExplainer:
             return fit, as_matrix(self.first.names, vectors[:count])
 
         events = np.asarray(self._noise(self.first, 2).events)
-        return Refitter(draw, self.first, z.both, events, present)
+
+        def allow(words: str) -> None:
+            self.effort.check(f"{words} was fitted")
+
+        return Refitter(draw, self.first, z.both, events, present, allow=allow)
 
     def _established(self, added: Refitted, z: Measured) -> tuple[Hypothesis, ...]:
         """Return the effects of which the data have certainly some, the final frames too.
@@ -561,6 +592,7 @@ class FrameExplainer:
         present = tuple(e for e in self.model if e.tag not in tags)
         self.model = (*present, *(h.effect for h in corrected))
         self.fit, self.sensor = self._mapped(self.model)
+        self.held = added
         extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
         extended = extended.shifted(np.sum(added.parts * change[:, None], axis=0))
         errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))

@@ -36,6 +36,7 @@ _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its
 _MOVED = 4.0  # errors of its mean by which a statistic must move to count as moved
 # nats by which a set must promise to come near the best one, beside a tenth of what that explains
 _REACH, _REACH_SHARE = 30.0, 0.1
+_LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the next ones bring less
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Refitter:
         present: effects that the model has besides.
         splits: number of parts.
         steps: corrections of the strengths, at most.
+        allow: hears which effects are simulated next, and raises an error where the work is at its limit.
     """
 
     draw: Callable[[tuple[Effect, ...], int], tuple[Refit, FloatArray]]
@@ -113,6 +115,7 @@ class Refitter:
     present: tuple[Effect, ...] = ()
     splits: int = 2
     steps: int = _MOST_STEPS
+    allow: Callable[[str], None] = lambda _: None
 
     def refined(
         self, hypotheses: Sequence[Hypothesis], rival: float = -np.inf, replicates: int = _FEW
@@ -124,11 +127,13 @@ class Refitter:
             rival: score of another set: where there is no hope to come near it, this one is given up.
             replicates: at each strength.
         """
+        words = " + ".join(h.tag for h in hypotheses)
+        self.allow(words)
         best = now = self._simulated(tuple(hypotheses), None, replicates)
-        nothing, shortened = self.nothing, 0
+        shortened, gained = 0, np.inf
         dear = is_dear(h.effect for h in hypotheses)
         for step_number in range(self.steps):
-            if best.settled or best.promise < rival - _REACH - _REACH_SHARE * (rival - nothing):
+            if best.settled or gained < _LEAST_GAIN or self._hopeless(best, gained, rival):
                 break
             if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
                 break
@@ -136,14 +141,23 @@ class Refitter:
             moved = _moved(best.hypotheses, step)
             if moved is None:
                 break
+            self.allow(words)
             now = self._simulated(moved, best, replicates)
             if now.score > best.score:
-                best, shortened = now, 0
+                gained, best, shortened = now.score - best.score, now, 0
             elif shortened < 2:
                 shortened += 1
             else:
                 break
         return best
+
+    def _hopeless(self, one: Refitted, gained: float, rival: float) -> bool:
+        """Tell whether a set will not come near another one: it promises less, or its steps gain too little.
+
+        Steps towards a maximum gain less and less.
+        """
+        near = rival - _REACH
+        return one.promise < near - _REACH_SHARE * (rival - self.nothing) or one.score + gained < near
 
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
         """Return the model with effects."""

@@ -76,6 +76,18 @@ class Replicate:
     seed: int
     acquisition: Acquisition
 
+    @property
+    def samples(self) -> int:
+        """Number of samples that are simulated."""
+        other = self.acquisition.other
+        n_frames = self.acquisition.numbers.size + (0 if other is None else other.size)
+        return int(n_frames * self.maps.usable.size)
+
+    @property
+    def fits(self) -> int:
+        """How often its pixels are fitted."""
+        return 1 if self.acquisition.other is None else 3
+
     def evidence(self) -> tuple[Evidence, ...]:
         """Simulate, and observe each part."""
         return tuple(evidence for _, _, evidence in self._observed())

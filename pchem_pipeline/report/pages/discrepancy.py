@@ -332,7 +332,7 @@ def _chance_fact(found: Verdict) -> list[KeyFact]:
 def remarks(data: DiscrepancyData) -> list[Flag]:
     """Return what speaks for and against the verdict, the gravest first."""
     found = data.found
-    flags: list[Flag] = []
+    flags = [Flag("caution", f"{found.limit[0].upper()}{found.limit[1:]}.")] if found.limit else []
     extended = [step for step in found.steps if step.effect]
     if extended:
         flags += _closing(found)

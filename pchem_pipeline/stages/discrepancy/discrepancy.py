@@ -70,8 +70,8 @@ def _run_frames(
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
     tell("looking at every pixel and every frame")
-    seen = survey(context, source, settings.max_samples)
-    window = choose_window(source.shape, settings.max_samples, settings.block_frames, roi, seen.places)
+    seen = survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
+    window = choose_window(source.shape, settings, roi, seen.places)
     found = find_discrepancies(
         read_window(source, window),
         window.numbers,

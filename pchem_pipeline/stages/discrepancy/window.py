@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.quick.places import SensorPlace
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 
@@ -46,8 +47,7 @@ class Window:
 
 def choose_window(
     shape: tuple[int, int, int],
-    max_samples: int,
-    block_frames: int | None,
+    settings: DiscrepancySettings,
     roi: Sequence[int] | None = None,
     places: Mapping[str, SensorPlace] | None = None,
 ) -> Window:
@@ -58,23 +58,23 @@ def choose_window(
 
     Args:
         shape: frames, rows, columns of the stack.
-        max_samples: frames x pixels to look at.
-        block_frames: frames in a block, or None to choose.
+        settings: frames x pixels and pixels to look at, and frames in a block.
         roi: rows and columns that the user asked for: y0, y1, x0, x1.
         places: where the survey found that the sensor stands out.
     """
     n_frames, ny, nx = shape
     y0, y1, x0, x1 = roi or (0, ny, 0, nx)
-    frames = min(n_frames, max(_FRAMES_WANTED, max_samples // max((y1 - y0) * (x1 - x0), 1)))
-    side = max(max_samples // frames, 1)
-    if (y1 - y0) * (x1 - x0) > side:
-        height = min(y1 - y0, max(int(np.sqrt(side)), side // (x1 - x0)))
-        width = min(x1 - x0, side // height)
+    within = (y1 - y0) * (x1 - x0)
+    frames = min(n_frames, max(_FRAMES_WANTED, settings.max_samples // max(within, 1)))
+    pixels = max(min(settings.max_samples // frames, settings.max_pixels), 1)
+    if within > pixels:
+        height = min(y1 - y0, max(int(np.sqrt(pixels)), pixels // (x1 - x0)))
+        width = min(x1 - x0, pixels // height)
         y0, x0 = _corner(_worst(places or {}, shape[1:]), (y0, y1, x0, x1), (height, width))
         y1, x1 = y0 + height, x0 + width
     numbers = np.arange(n_frames, dtype=np.int64)
     if frames < n_frames:
-        length = block_length(frames, block_frames)
+        length = block_length(frames, settings.block_frames)
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
         numbers = (starts[:, None] + np.arange(length)).ravel()
     return Window(numbers, (y0, y1), (x0, x1))

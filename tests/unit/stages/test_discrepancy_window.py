@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.discrepancy.quick.places import SensorPlace
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
+
+WHOLE = DiscrepancySettings(max_pixels=1 << 25)
 
 
 class Frames:
@@ -21,14 +24,14 @@ class Frames:
 
 
 def test_a_small_stack_is_looked_at_whole():
-    window = choose_window((4000, 64, 64), 1 << 25, None)
+    window = choose_window((4000, 64, 64), WHOLE)
     assert window.numbers.size == 4000
     assert (window.rows, window.columns) == ((0, 64), (0, 64))
 
 
 @pytest.mark.parametrize("shape", [(17750, 512, 512), (1000, 2048, 2048), (100_000, 8, 8), (7000, 3, 4000)])
 def test_of_a_large_stack_no_more_than_allowed(shape):
-    window = choose_window(shape, 1 << 25, None)
+    window = choose_window(shape, WHOLE)
     rows, columns = np.ptp(window.rows), np.ptp(window.columns)
     assert window.numbers.size * rows * columns <= 1 << 25
     assert window.numbers.size * rows * columns > 0.8 * min(1 << 25, np.prod(shape))
@@ -38,14 +41,25 @@ def test_of_a_large_stack_no_more_than_allowed(shape):
     assert np.all(np.diff(window.numbers) > 0)
 
 
+def test_of_a_large_sensor_no_more_pixels_than_allowed():
+    window = choose_window((1000, 512, 512), DiscrepancySettings())
+    pixels = np.ptp(window.rows) * np.ptp(window.columns)
+    assert 0.95 * 8192 < pixels <= 8192
+    assert window.numbers.size == 1000
+    smaller = choose_window((1000, 512, 512), DiscrepancySettings(max_pixels=400))
+    assert np.ptp(smaller.rows) * np.ptp(smaller.columns) <= 400
+
+
 def test_the_region_asked_for_is_looked_at():
-    window = choose_window((1000, 64, 64), 1 << 25, None, (8, 24, 16, 48))
+    window = choose_window((1000, 64, 64), WHOLE, (8, 24, 16, 48))
     assert (window.rows, window.columns) == ((8, 24), (16, 48))
 
 
 def test_frames_of_the_window_are_those_of_the_stack():
     source = Frames((300, 9, 11))
-    window = choose_window((300, 9, 11), 1 << 20, 20, (2, 6, 3, 8))
+    window = choose_window(
+        (300, 9, 11), DiscrepancySettings(max_samples=1 << 20, block_frames=20), (2, 6, 3, 8)
+    )
     window = type(window)(np.r_[0:40, 100:160], window.rows, window.columns)
     stack = read_window(source, window)
     assert np.array_equal(stack, source.values[window.numbers][:, 2:6, 3:8])
@@ -57,19 +71,19 @@ def place(p=1e-9, **region):
 
 def test_the_window_lies_where_the_sensor_disagrees_half_of_it_outside():
     tap = {"next_x": place(columns=[448, 512])}
-    window = choose_window((17750, 512, 512), 1 << 25, None, None, tap)
+    window = choose_window((17750, 512, 512), WHOLE, None, tap)
     x0, x1 = window.columns
     assert 0.4 < (x1 - 448) / (x1 - x0) < 0.6
     blob = {"lag": place(1e-5, columns=[0, 9]), "spread": place(1e-20, rows=[20, 40], columns=[30, 50])}
-    window = choose_window((17750, 512, 512), 1 << 25, None, None, blob)
+    window = choose_window((17750, 512, 512), WHOLE, None, blob)
     (y0, y1), (x0, x1) = window.rows, window.columns
     assert y0 <= 20 < 40 <= y1
     assert x0 <= 30 < 50 <= x1
 
 
 def test_without_a_place_or_outside_of_the_region_asked_for_the_middle_is_looked_at():
-    middle = choose_window((17750, 512, 512), 1 << 25, None)
-    assert choose_window((17750, 512, 512), 1 << 25, None, None, {}).rows == middle.rows
+    middle = choose_window((17750, 512, 512), WHOLE)
+    assert choose_window((17750, 512, 512), WHOLE, None, {}).rows == middle.rows
     elsewhere = {"lag": place(rows=[500, 512])}
-    asked = choose_window((17750, 512, 512), 1 << 25, None, (0, 256, 0, 256), elsewhere)
-    assert asked.rows == choose_window((17750, 512, 512), 1 << 25, None, (0, 256, 0, 256)).rows
+    asked = choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256), elsewhere)
+    assert asked.rows == choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256)).rows

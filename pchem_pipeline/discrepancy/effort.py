@@ -1,0 +1,81 @@
+"""What a search for missing effects may cost, in work that is counted and not timed.
+
+The same search ends at the same place on any machine, whatever else that does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+__all__ = ["Effort", "EffortSpentError"]
+
+# CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
+# pixel, and of its fit with effects and what is learnt of its true parameters
+_SAMPLE, _FIT, _REFIT = 1.0e-7, 1.0e-4, 1.0e-3
+#: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
+_LEAST, _OF_NULL = 100.0, 2.0
+#: Share of that which is kept for measuring what no effect explains.
+_KEPT = 0.25
+
+
+class EffortSpentError(Exception):
+    """The search has reached its limit.
+
+    Attributes:
+        doing: what would have been next.
+        untried: effects that were to be fitted and were not.
+    """
+
+    def __init__(self, doing: str, untried: Iterable[str] = ()) -> None:
+        """Keep what was not done."""
+        super().__init__(doing)
+        self.doing, self.untried = doing, tuple(untried)
+
+    def words(self) -> str:
+        """Return where the search ended, what was not tried, and how to go on."""
+        rest = f"; not tried: {', '.join(self.untried)}" if self.untried else ""
+        return f"the search ended at its limit before {self.doing}{rest}; --effort raises it"
+
+
+@dataclass
+class Effort:
+    """Work of a search.
+
+    Attributes:
+        share: times what a search may cost by default; None: no limit.
+        spent: CPU seconds by count.
+        most: the same at which nothing more is begun; infinite until the null distribution is there.
+        kept: of that, for the end.
+        tried: tags of all effects with which the pixels were fitted.
+    """
+
+    share: float | None
+    spent: float = 0.0
+    most: float = math.inf
+    kept: float = 0.0
+    tried: set[str] = field(default_factory=set)
+
+    def begin(self) -> None:
+        """Set the limit, now that the null distribution has been paid."""
+        limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
+        self.most, self.kept = self.spent + (1.0 - _KEPT) * limit, _KEPT * limit
+
+    def release(self) -> None:
+        """Let what was kept be spent."""
+        self.most, self.kept = self.most + self.kept, 0.0
+
+    def simulate(self, samples: int, pixels: int, fits: int) -> None:
+        """Count a simulated stack, whose pixels are fitted so many times."""
+        self.spent += _SAMPLE * samples + _FIT * pixels * fits
+
+    def refit(self, pixels: int, tags: Iterable[str]) -> None:
+        """Count a fit of all pixels with effects."""
+        self.spent += _REFIT * pixels
+        self.tried |= set(tags)
+
+    def check(self, doing: str) -> None:
+        """Raise an error if there is nothing left for what comes next."""
+        if self.spent >= self.most:
+            raise EffortSpentError(doing)

@@ -1,0 +1,68 @@
+"""A search has a limit, in work that is counted: it ends well there, and says so."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers.plain_camera import PlainCamera
+
+from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
+
+CAMERA = PlainCamera(0.3, 1.5, 9.0, (16, 16), 600)
+QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
+
+
+def test_work_is_counted_and_refused_once_the_limit_is_reached():
+    effort = Effort(1.0)
+    effort.simulate(10**9, 10**4, 3)
+    effort.check("nothing")  # before the null distribution is there, there is no limit
+    effort.begin()
+    null = effort.spent
+    effort.check("a")
+    effort.refit(10**9, ["row_noise"])
+    with pytest.raises(EffortSpentError, match="b"):
+        effort.check("b")
+    assert effort.tried == {"row_noise"}
+    # a quarter is kept for the end
+    effort.spent = null + 0.8 * 2.0 * null
+    with pytest.raises(EffortSpentError):
+        effort.check("c")
+    effort.release()
+    effort.check("d")
+
+
+def test_a_small_search_has_its_least_and_one_without_a_limit_none():
+    small, double, free = Effort(1.0), Effort(2.0), Effort(None)
+    for effort in (small, double, free):
+        effort.begin()
+        effort.release()
+    assert double.most == 2.0 * small.most > 0.0
+    assert math.isinf(free.most)
+
+
+@pytest.fixture(scope="module")
+def noisy_rows():
+    rng = np.random.default_rng(3)
+    frames = CAMERA.frames(3).astype(np.int64)
+    frames += np.rint(1.5 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
+    return np.maximum(frames, 0).astype(np.uint16)
+
+
+def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows):
+    free = find_discrepancies(noisy_rows, settings=QUICK).verdict
+    assert free.effects == ("row_noise",)
+    assert free.limit == ""
+    told = []
+    short = QUICK.model_copy(update={"effort": 0.002})
+    found = find_discrepancies(noisy_rows, settings=short, tell=told.append).verdict
+    assert found.verdict == "unexplained"
+    assert found.effects == ()
+    assert "ended at its limit" in found.limit
+    assert "row_noise" in found.limit
+    assert found.limit in found.sentence
+    assert "none that was tried explains it" in found.sentence
+    assert "--effort" in verdict_text(found)
+    assert find_discrepancies(noisy_rows, settings=short).verdict == found
