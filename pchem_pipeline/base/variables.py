@@ -212,6 +212,14 @@ def _applied() -> list[Variable]:
         ("sums", ("segment", "sum", *_MAP), "float64", "1", "sums over a segment of the frames"),
         ("range", ("end", *_MAP), "int64", "1", "smallest and largest code"),
         ("prior", _MAP, "float64", "e-", "exposure that the electron numbers are expected to have"),
+        ("covariance", (*_MAP, "row", "column"), "float64", "1", "of (g, mu, sigma), by their likelihood"),
+        (
+            "rivals",
+            (*_MAP, "side", "quantity"),
+            "float64",
+            "1",
+            "probability that the bias is an electron lower or higher, and g, mu, sigma if so",
+        ),
     ]
     return [
         Variable(f"{group}/{name}", dims, dtype, unit, words)

@@ -33,12 +33,15 @@ class Calibration(PixelParameters):
         fit_status: word of each pixel.
         law: of the samples of all pixels in C order.
         satellites: amplitude (e-) and weight of what free satellites the fit found, shape (y * x, 2).
+        rivals: probability that the bias is an electron lower or higher, and (g, mu, sigma) if so, shape
+            (y, x, 2, 4); None: the covariance is all that is known.
     """
 
     covariance: FloatArray
     fit_status: NDArray[np.uint16]
     law: SampleLaw = field(default_factory=SampleLaw)
     satellites: FloatArray | None = None
+    rivals: FloatArray | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -74,6 +77,21 @@ class Calibration(PixelParameters):
         """The pixels as electron numbers are made of."""
         amplitude, weight = self.own_satellites.T
         return KnownPixels(list(self.columns.T), self.law, (amplitude, weight))
+
+    @property
+    def right_bias(self) -> FloatArray:
+        """Probability that the bias is right within half an electron, shape (y, x)."""
+        return np.ones(self.shape) if self.rivals is None else 1.0 - self.rivals[..., 0].sum(axis=-1)
+
+    @property
+    def whole_covariance(self) -> FloatArray:
+        """Mean square deviations of (g, mu, sigma), a bias that is an electron off included."""
+        if self.rivals is None:
+            return self.covariance
+        weight = self.rivals[..., 0]
+        own = np.stack([self.conversion_gain, self.bias, self.read_noise_dn], axis=-1)
+        off = self.rivals[..., 1:] - own[..., None, :]
+        return np.asarray(self.covariance + np.einsum("yxs,yxsi,yxsj->yxij", weight, off, off))
 
     @property
     def noise_variance_dn2(self) -> FloatArray:

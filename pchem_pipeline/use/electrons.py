@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use import electrons_numba
 from pchem_pipeline.use.calibration import Calibration
 
-__all__ = ["calibration_variance", "electrons", "read_stderr", "stderr_at"]
+__all__ = ["calibration_variance", "electrons", "read_stderr", "stderr_at", "with_its_errors"]
 
 
 def electrons(
@@ -54,7 +55,11 @@ def calibration_variance(calibration: Calibration) -> FloatArray:
     Returns:
         e-^2, e- and 1, shape (3, y, x); NaN for pixels without a calibration.
     """
-    gain, covariance = calibration.conversion_gain, calibration.covariance
+    return _variance(calibration, calibration.whole_covariance)
+
+
+def _variance(calibration: Calibration, covariance: FloatArray) -> FloatArray:
+    gain = calibration.conversion_gain
     found = np.stack(
         [
             gain**2 * covariance[..., 1, 1],
@@ -63,6 +68,22 @@ def calibration_variance(calibration: Calibration) -> FloatArray:
         ]
     )
     return np.where(calibration.usable, found, np.nan)
+
+
+def with_its_errors(calibration: Calibration, signal: FloatArray) -> Calibration:
+    """Return a calibration whose law holds what is not known of g and mu, at a signal.
+
+    Electron numbers are then given all calibrations that are possible, not given that this one is right; a
+    bias that is an electron off is not in it.
+
+    Args:
+        calibration: of these pixels.
+        signal: e-, shape (y, x).
+    """
+    variance = stderr_at(_variance(calibration, calibration.covariance), signal) ** 2
+    variance /= calibration.conversion_gain**2
+    law = calibration.law.with_variance(dn2=np.nan_to_num(variance).ravel())
+    return replace(calibration, law=law)
 
 
 def stderr_at(variance: FloatArray, signal: FloatArray) -> FloatArray:

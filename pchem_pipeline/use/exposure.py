@@ -56,6 +56,8 @@ def estimate_exposure(
     """
     n = origin.size
     out = np.full((n, 3), np.nan)
+    given = np.zeros((n, 2, 4)) if calibration.rivals is None else calibration.rivals
+    rivals = np.ascontiguousarray(given.reshape(n, 2, 4))
     columns = calibration.columns
     exposure_numba.estimate_exposures(
         kernel_counts(counts.reshape(n, -1)),
@@ -63,6 +65,7 @@ def estimate_exposure(
         parts,
         columns,
         np.ascontiguousarray(calibration.covariance.reshape(n, 3, 3)),
+        rivals,
         calibration.own_satellites,
         pack([calibration.law], n),
         out,

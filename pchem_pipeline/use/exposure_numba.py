@@ -22,6 +22,7 @@ IntArray = NDArray[np.int64]
 
 _LEAST_EXPOSURE = 1e-7  # e-; less is none
 _LEAST_MASS = 1e-300
+_LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
 _OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
@@ -123,6 +124,7 @@ def estimate_exposures(
     parts: int,
     parameters: FloatArray,
     covariance: FloatArray,
+    rivals: FloatArray,
     satellites: FloatArray,
     law: Law,
     out: FloatArray,
@@ -135,6 +137,7 @@ def estimate_exposures(
         parts: codes in a DN.
         parameters: (H, g, mu, sigma), shape (n, 4); NaN where there are none.
         covariance: of (g, mu, sigma), shape (n, 3, 3).
+        rivals: probability of other (g, mu, sigma) far away, and these, shape (n, 2, 4).
         satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
         law: of the samples.
         out: out, H, its standard error by counting, and that from the calibration, shape (n, 3); comes as
@@ -176,6 +179,13 @@ def estimate_exposures(
             near, score / near, curvature, parameters[index], covariance[index], satellites[index, 1],
             codes, pixel, theta, moved, seen, sums,
         )  # fmt: skip
+        for rival in rivals[index]:
+            if rival[0] > _LEAST_WEIGHT:
+                moved[1:] = rival[1:]
+                known_theta(moved, pixel.centre, satellites[index, 1], theta)
+                cells = cells_of(pixel, np.int64(0))
+                there = _climb(near, cells, list_levels(theta, cells, codes), seen, sums)
+                out[index, 2] = math.sqrt(out[index, 2] ** 2 + rival[0] * (there - exposure) ** 2)
 
 
 @kernel

@@ -15,12 +15,23 @@ import numpy as np
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, StoreError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
+from pchem_pipeline.commands.apply.characterisation import (
+    check_run,
+    doubtful_pixels,
+    read_calibration,
+    with_moments,
+)
 from pchem_pipeline.commands.apply.files import write_files
 from pchem_pipeline.commands.apply.finish import finish_maps
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
 from pchem_pipeline.commands.apply.source import check_camera, check_level, open_like_run, top_code
-from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece, offsets_piece
+from pchem_pipeline.commands.apply.tasks import (
+    N_SUMS,
+    convert_piece,
+    count_piece,
+    moments_piece,
+    offsets_piece,
+)
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.formats.map_files import read_image
@@ -47,7 +58,7 @@ __all__ = ["apply_to_frames"]
 
 #: Name of the work in the records of the output.
 STAGE = "apply"
-_VERSION = 1
+_VERSION = 2
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
@@ -326,7 +337,8 @@ def _do(context: StageContext, job: Job, made: _Made, wanted: ApplySettings) -> 
     if record is not None and record.finished and not context.fresh:
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
-    if job.removed:
+    job, made = _with_moments(context, job, made)
+    if job.removed and not context.failed:
         job = _with_offsets(context, job, made)
     if job.counts and not context.failed:
         job = _counted(context, job, made)
@@ -356,6 +368,26 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
 
 def _bands(ny: int, step: int) -> list[tuple[int, int]]:
     return [(y, min(y + step, ny)) for y in range(0, ny, step)]
+
+
+def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _Made]:
+    """Find the errors of the calibration where the curvature of its likelihood does not tell them."""
+    run = RunStore.open(job.run)
+    if not doubtful_pixels(run, made.calibration).any():
+        return job, made
+    _, ny, nx = job.source.shape
+    rows = _chunks(job.source.shape)[1]
+    for name, rest in (("covariance", (3, 3)), ("rivals", (2, 4))):
+        context.create(f"applied_parts/{name}", (ny, nx, *rest), chunks=(rows, nx, *rest))
+    ends = None if job.top is None else (0, job.top)
+    task = functools.partial(moments_piece, job=job, settings=context.config.fit, adc_limits=ends)
+    pieces = [Piece("errors", *band, 0, 1) for band in _bands(ny, rows)]
+    context.run_units(pieces, task, unit_name="band", by_tiles=False)
+    if context.failed:
+        return job, made
+    return replace(job, moments=True), replace(
+        made, calibration=with_moments(made.calibration, context.store)
+    )
 
 
 def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:

@@ -93,6 +93,7 @@ class Job:
         modes: offsets that are taken from the frames; none: the frames as they come.
         scene: exposure to expect while the offsets are found (y, x), e-.
         offset_variance: variance of the offsets' estimates, DN^2, (y, x); None without offsets.
+        moments: whether the errors of the calibration are in the output, by `write_moments`.
         parts: codes in a DN.
         lift: DN by which codes are raised so that none is negative.
         bins: of the histograms.
@@ -112,6 +113,7 @@ class Job:
     modes: CommonModes = field(default_factory=CommonModes)
     scene: Any = None
     offset_variance: Any = None
+    moments: bool = False
     parts: int = 1
     lift: int = 0
     bins: int = 0

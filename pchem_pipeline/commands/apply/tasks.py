@@ -8,20 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.commands.apply.characterisation import read_calibration
+from pchem_pipeline.commands.apply.characterisation import read_calibration, with_moments, write_moments
 from pchem_pipeline.commands.apply.settings import Job, Piece
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import NumberTables, number_tables
+from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.common_modes import estimate_offsets, offsets_of_samples
-from pchem_pipeline.use.electrons import electrons
+from pchem_pipeline.use.electrons import electrons, with_its_errors
 from pchem_pipeline.use.electrons_numba import add_up, whole_parts
 from pchem_pipeline.use.exposure import estimate_exposure
 
-__all__ = ["N_SUMS", "convert_piece", "count_piece", "offsets_of", "offsets_piece"]
+__all__ = ["N_SUMS", "convert_piece", "count_piece", "moments_piece", "offsets_of", "offsets_piece"]
 
 #: Sums of a pixel over frames: x, x^2, the same without offsets, smallest and largest x.
 N_SUMS = 6
@@ -44,7 +45,8 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> NDA
 def _calibration(job: Job, rows: slice) -> Calibration:
     run = RunStore.open(job.run)
     extra = None if job.offset_variance is None else job.offset_variance[rows]
-    return read_calibration(run, rows, removed=job.removed, extra_variance=extra, top=job.top)
+    found = read_calibration(run, rows, removed=job.removed, extra_variance=extra, top=job.top)
+    return with_moments(found, open_store(job.output), rows) if job.moments else found
 
 
 def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDArray[Any]:
@@ -54,6 +56,18 @@ def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDAr
     out = np.empty(frames.shape, np.uint32)
     whole_parts(frames, offsets, job.parts, job.lift, out)
     return out
+
+
+# -- errors of the calibration ---------------------------------------------------------------------
+
+
+def moments_piece(
+    piece: Piece, *, job: Job, settings: FitSettings, adc_limits: tuple[int, int] | None
+) -> dict[str, Any]:
+    """Write the errors of the calibration of some rows."""
+    rows = slice(piece.y0, piece.y1)
+    write_moments(RunStore.open(job.run), open_store(job.output), rows, settings, adc_limits)
+    return {}
 
 
 # -- offsets of frames, rows and columns -----------------------------------------------------------
@@ -155,9 +169,13 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
         prior = output.read(place, (rows, _WHOLE))
     elif job.prior == "run":
         prior = calibration.quanta_exposure
-    return number_tables(
-        ends[0], ends[1], prior, calibration.known, dtype=job.number_type, parts=job.parts, detailed=True
+    known = with_its_errors(calibration, calibration.quanta_exposure if prior is None else prior).known
+    found = number_tables(
+        ends[0], ends[1], prior, known, dtype=job.number_type, parts=job.parts, detailed=True
     )
+    # a bias that is an electron off makes nearly all numbers wrong
+    share = np.repeat(calibration.right_bias.ravel(), np.diff(found.start))
+    return replace(found, right=found.right * share)
 
 
 def _write_numbers(

@@ -11,7 +11,7 @@ from scipy.special import chdtrc, chdtri
 
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import observed_covariance
-from pchem_pipeline.model.fit import engine, guard_numba, profile_numba, search_numba, tile_numba
+from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 from pchem_pipeline.model.fit.guard import fit_guarded
@@ -25,7 +25,7 @@ from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likeli
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["fit_histograms", "satellite_threshold"]
+__all__ = ["fit_histograms", "likelihood_moments", "satellite_threshold"]
 
 FloatArray = NDArray[np.float64]
 Counts = NDArray[np.integer]
@@ -38,6 +38,8 @@ _CLEAR_GAP = search_numba.CLEAR_GAP
 # what the parameters know: it is half a degree of freedom or so.
 _FEW_FRAMES, _FEW_GROUPS = 5000, 40
 _FEWEST_CODES = 5
+#: Nats below which a rival an electron away counts in the moments, and the distance that holds it, e-.
+_RIVAL_GAP, _RIVAL_REACH = 10.0, 1.5
 _LOOSE = 0.1  # relative standard error of the gain beyond which several samples do not determine it
 #: Bits about the data, whatever the fit, and those for which a fit with the cells may still find an answer.
 _OF_DATA = FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW
@@ -124,6 +126,49 @@ def fit_histograms(
     return found if several else _shaped(found)
 
 
+def likelihood_moments(
+    counts: Counts,
+    origin: Counts,
+    known: FloatArray,
+    outlier_share: FloatArray,
+    *,
+    law: SampleLaw | None = None,
+    satellites: FloatArray | None = None,
+    settings: FitSettings | None = None,
+    adc_limits: tuple[int, int] | None = None,
+) -> profile.Moments:
+    """Return mean square deviations of (H, g, mu, sigma) from their estimates, of pixels that are fitted.
+
+    The inverse information is the covariance of a likelihood that falls as a normal law does. Where the read
+    noise is high, or frames are few, the likelihood falls more slowly, to one side, or has a second maximum
+    an electron away. So the moments are taken over the likelihood itself, as the posterior under a flat
+    prior: exactly along the bias, whose profile is followed, and by Laplace's approximation across it
+    (Tierney and Kadane 1986). They are about the estimate, not the mean: it is the estimate that is used.
+
+    Args:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        known: (H, g, mu, sigma, likelihood gap) of the fit of these histograms, shape (n, 5).
+        outlier_share: share of the samples that the tail guard left out, shape (n,).
+        law: of the samples; the PCD if None.
+        satellites: amplitude (e-) and weight of free satellites, shape (n, 2); none if None.
+        settings: of that fit.
+        adc_limits: first and last code of the ADC, DN.
+    """
+    settings = settings or FitSettings()
+    batch = _Batch([counts], [origin], [False], settings, adc_limits, None, None)
+    cells = law is not None or settings.likelihood == "exact"
+    laws = ([law] if law is not None else batch.neutral()) if cells else [SampleLaw()]
+    limits = batch.limits(laws if cells else None)
+    evaluate = cells_likelihood() if cells else density_likelihood()
+    columns = np.ascontiguousarray(known[:, :4])
+    batch.leave_out_again(columns, outlier_share, laws, limits)
+    gap = known[:, 4]
+    reach = np.where(gap < _RIVAL_GAP, _RIVAL_REACH, 0.0)
+    own = np.zeros((batch.n, 2)) if satellites is None else np.nan_to_num(satellites)
+    return profile.moments_along_bias(batch.given, pack(laws, batch.n), limits, evaluate, columns, own, reach)
+
+
 def satellite_threshold(law: SampleLaw) -> float:
     """Return the rise of the log-likelihood, nats, that free satellite peaks must bring to be kept.
 
@@ -198,21 +243,29 @@ class _Batch:
         known = np.empty((0, size)) if near is None else np.ascontiguousarray(near[:, :size], np.float64)
         starts = Starts(known, gaps, np.empty(0), np.ones(1, np.bool_))
         laws = [SampleLaw()] * self.n_samples
-        return self._result(self._fit(self.given, laws, starts, self._limits(None)), cells=False, adjust=True)
+        return self._result(self._fit(self.given, laws, starts, self.limits(None)), cells=False, adjust=True)
 
     def resume(self, plain: FitResult) -> FitResult:
         """Leave out the samples that a fit with the density left out; return it."""
-        pixels = np.flatnonzero(plain.outlier_share > 0)
+        self.leave_out_again(
+            plain.columns, plain.outlier_share, [SampleLaw()] * self.n_samples, self.limits(None)
+        )
+        return plain
+
+    def leave_out_again(
+        self, columns: FloatArray, outlier_share: FloatArray, laws: Sequence[SampleLaw], limits: Limits
+    ) -> None:
+        """Leave out the samples that a fit under these laws left out."""
+        pixels = np.flatnonzero(outlier_share > 0)
         if self.settings.tail_guard > 0 and pixels.size:
-            laws, limits = [SampleLaw()] * self.n_samples, self._limits(None)
             answers = self._answers(self.n)
-            answers.parameters[:] = plain.columns
-            gone = plain.outlier_share * self.given.counts.sum(axis=1, dtype=np.float64)
+            answers.parameters[:] = columns
+            gone = outlier_share * self.given.counts.sum(axis=1, dtype=np.float64)
+            evaluate = cells_likelihood() if limits.cells else density_likelihood()
             guard_numba.leave_out_tile(
-                *(self.given, pixels, pack(laws, self.n), limits, density_likelihood(), answers),
+                *(self.given, pixels, pack(laws, self.n), limits, evaluate, answers),
                 *(gone, np.zeros(self.n, np.bool_)),
             )
-        return plain
 
     def set_aside(self, plain: FitResult, intervals: Sequence[Interval]) -> None:
         """Set codes aside, but for pixels of which too few would be left."""
@@ -233,7 +286,7 @@ class _Batch:
         """Fit again with the cells what the law or the settings ask for, from a fit with the density."""
         fitted = (plain.fit_status & int(FAILED)) == 0
         if laws is not None or (self.given.mask == SET_ASIDE).any():
-            laws = laws or self._neutral()
+            laws = laws or self.neutral()
             pixels = np.flatnonzero(
                 fitted | (self._at_limits(laws) & ((plain.fit_status & int(_NO_FIT)) == 0))
             )
@@ -247,7 +300,7 @@ class _Batch:
         if pixels.size == 0:
             return plain
         self.by_cells[pixels] = True
-        chosen = laws or self._neutral()
+        chosen = laws or self.neutral()
         near, gaps = plain.columns, plain.likelihood_gap
         part = self.fit_cells(chosen, near, gaps=gaps, pixels=pixels, scan=laws is None)
         part = replace(
@@ -288,7 +341,7 @@ class _Batch:
             np.array(own[0].free_satellites, np.float64),
             np.ascontiguousarray(own[0].may_have_satellites),
         )
-        limits = self._limits(own, warm=warm, scan=scan)
+        limits = self.limits(own, warm=warm, scan=scan)
         adjust = all(each.neutral for each in own)
         if not adjust:
             _count_near(given)
@@ -342,7 +395,7 @@ class _Batch:
 
     # -- what they are told
 
-    def _limits(self, laws: Sequence[SampleLaw] | None, *, warm: bool = False, scan: bool = False) -> Limits:
+    def limits(self, laws: Sequence[SampleLaw] | None, *, warm: bool = False, scan: bool = False) -> Limits:
         settings = self.settings
         em = settings.algorithm == "em" and laws is None
         return Limits(
@@ -363,7 +416,7 @@ class _Batch:
             sandwich=settings.errors == "sandwich",
         )
 
-    def _neutral(self) -> list[SampleLaw]:
+    def neutral(self) -> list[SampleLaw]:
         """Return the law of the PCD between the limits of the ADC."""
         low, high = self.adc_limits or (None, None)
         return [SampleLaw(clip_low=low, clip_high=high)] * self.n_samples
@@ -494,7 +547,7 @@ class _Batch:
             some = np.flatnonzero(fitted & (self.by_cells == cells))
             if some.size == 0:
                 continue
-            chosen = (laws or self._neutral()) if cells else [SampleLaw()] * self.n_samples
+            chosen = (laws or self.neutral()) if cells else [SampleLaw()] * self.n_samples
             part = np.full((some.size, *ends.shape[1:]), np.nan)
             satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
             profile_numba.profile_tile(
@@ -502,7 +555,7 @@ class _Batch:
                     counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
                 ),
                 pack([each.of(some) for each in chosen], some.size),
-                self._limits(chosen if cells else None),
+                self.limits(chosen if cells else None),
                 cells_likelihood() if cells else density_likelihood(),
                 engine.climb(),
                 found.columns[some],

@@ -1,4 +1,4 @@
-"""Ends of profile-likelihood intervals: a fixed parameter where the best likelihood has fallen by a drop."""
+"""Profiles of the likelihood: ends of intervals, where it has fallen by a drop, and a walk along the bias."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.errors.algebra_numba import invert_arrow
+from pchem_pipeline.model.errors.algebra_numba import invert_arrow, to_natural
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, Limits, min_log_variance
 from pchem_pipeline.model.fit.search_numba import Tools, climb_on
 from pchem_pipeline.model.fit.tile_numba import Histograms, load_pixel, make_room, theta_of
@@ -242,3 +242,80 @@ def profile_tile(
                 else:
                     out[index, target, side] = value
             scratch.flags[FIXED, place] = False
+
+
+@kernel
+def walk_tile(
+    given: Histograms,
+    law: Law,
+    limits: Limits,
+    evaluate: Any,
+    climb: Any,
+    parameters: FloatArray,
+    satellites: FloatArray,
+    spacing: float,
+    reach: FloatArray,
+    deepest: float,
+    found: FloatArray,
+    covariances: FloatArray,
+    heights: FloatArray,
+) -> None:
+    """Walk along the profile of the bias: fill the best other parameters at biases on both sides.
+
+    Args:
+        given: histograms; codes left out by the tail guard do not count.
+        law: of the samples.
+        limits: bounds and limits.
+        evaluate: the likelihood.
+        climb: the climb on it.
+        parameters: (H_1 ... H_J, g, mu, sigma) at the maximum, shape (n, J + 3); NaN where there is none.
+        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
+        spacing: of the biases, standard errors.
+        reach: distance that is walked in any case, e-, shape (n,).
+        deepest: fall of the log-likelihood at which the walk ends beyond there, nats.
+        found: out, parameters, those of the maximum in the middle, shape (n, 2 m + 1, J + 3).
+        covariances: out, of all but the bias at each, NaN for what stays, shape (n, 2 m + 1, J + 3, J + 3).
+        heights: out, log-likelihood above that of the maximum, shape (n, 2 m + 1); comes as -inf.
+    """
+    n = given.dark.size
+    size, most = n + N_SHARED, heights.shape[1] // 2
+    room = make_room(given, law)
+    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
+    tools = Tools(limits, evaluate, climb, np.empty((0, 0)), scratch)
+    best, direction, covariance = scratch.small[KEPT_STARTS], np.empty(size), np.empty((size, size))
+    theta, absolute, fixed = scratch.small[HERE], np.empty(size), scratch.flags[FIXED]
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+    goal = _of_profile(np.bool_(False))
+    for index in range(given.counts.shape[0]):
+        pixel = load_pixel(given, index, room)
+        if not theta_of(parameters[index], pixel, limits, best):
+            continue
+        if limits.cells:
+            resolve(law, index, satellites[index, 0], pixel)
+        regular, top = _maximum(pixel, tools, satellites[index, 1], best, covariance)
+        if not regular:
+            continue
+        _direction(n + BIAS, best, covariance, rounding, direction)
+        fixed[n + BIAS] = True
+        for side in range(-1, 2):
+            copy(best, theta)
+            for i in range(1 if side == 0 else most):
+                for j in range(size):
+                    theta[j] += side * spacing * direction[j]
+                outcome, loglik, _ = climb_on(pixel, tools, goal, theta, theta)
+                full, place = np.empty((size, size)), most + side * (i + 1)
+                if outcome != CONVERGED or not invert_arrow(
+                    scratch.evaluations[AT], theta, scratch.flags[HELD], full
+                ):
+                    break
+                copy(theta, absolute)
+                absolute[n + BIAS] += pixel.centre
+                to_natural(
+                    absolute, fixed[:n], scratch.flags[HELD], rounding, full,
+                    found[index, place], covariances[index, place],
+                )  # fmt: skip
+                heights[index, place] = loglik - top
+                walked = abs(theta[n + BIAS] - best[n + BIAS]) / best[n + STEP]
+                if walked > reach[index] and loglik < top - deepest:
+                    break
+        fixed[n + BIAS] = False

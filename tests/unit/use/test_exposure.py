@@ -116,3 +116,20 @@ def test_samples_at_the_top_of_the_adc_are_taken_as_a_limit():
     assert abs(z.std() - 1) < 5 / np.sqrt(2 * N)
     naive = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
     assert pulls(naive, 4.0, naive.stderr).mean() < -5
+
+
+def test_a_bias_that_may_be_an_electron_off_is_in_the_error():
+    """Half an electron for certain would be a shift; a tenth of a chance of one electron is an error."""
+    rng = np.random.default_rng(25)
+    camera = KnownCamera.drawn(rng, (6, 8), read_noise=(0.15, 0.2))
+    _, frames = camera.frames(rng, 2.0, 200)
+    histograms = histogram_frames(frames)
+    calibration = camera.calibration()
+    off = np.stack([camera.gain, camera.bias - 1 / camera.gain, camera.sigma], axis=-1)
+    rivals = np.zeros((6, 8, 2, 4))
+    rivals[..., 0, 0], rivals[..., 0, 1:] = 0.1, off
+    found = estimate_exposure(histograms.counts, histograms.origin, replace(calibration, rivals=rivals))
+    np.testing.assert_allclose(found.calibration, np.sqrt(0.1), rtol=0.05)
+    alone = estimate_exposure(histograms.counts, histograms.origin, calibration)
+    np.testing.assert_array_equal(found.exposure, alone.exposure)
+    assert (alone.calibration == 0).all()
