@@ -29,13 +29,13 @@ from pchem_pipeline.discrepancy.verdict import (
     State,
     Step,
     Verdict,
-    micronats,
     parameters_of,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.registry import effect_classes
 
 __all__ = [
     "LARGEST_REST",
@@ -317,29 +317,30 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
             f"of what shows in the shape of the histograms this sensor cannot tell: {found.doubt}."
         )
     if state == "unexplained":
-        lead = f" (largest in {found.places[0].statistic})" if found.places else ""
+        first = found.places[0] if found.places else None
+        lead = f": {first.sentence or first.statistic}" if first is not None else ""
         none = "no known effect explains it" if not found.limit else "none that was tried explains it"
-        words = f"{lead}, and {none}{_nearest(found)}{_left(added)}"
+        words = f"{lead}; {none}{_nearest(found)}{_left(added)}"
         return f"The {data} disagree with the model{words}."
     if state == "described":
         return _described(found, titles)
     if state == "ambiguous":
-        sets = [" or ".join(c.effect for c in each.candidates) for each in added.additions if not each.named]
+        sets = [
+            " or ".join(_title(c.effect) for c in each.candidates)
+            for each in added.additions
+            if not each.named
+        ]
         also = f"{_and(titles)} is missing, and " if titles else ""
         lacks = f"{also}{_and(sets)}{_rest(found)}{_left(added)}"
         return f"The model lacks something that these {data} cannot tell apart: {lacks}."
     if found.before.at_floor:
-        limit = f"{micronats(found.before.floor)} micronats per sample"
-        return f"The model was missing {_and(titles)}; on the final {data} alone its gap is below {limit}."
+        return f"The model was missing {_and(titles)}, too little for the final {data} alone to show."
     if state == "named_in_part":
-        words = (
-            f"{_closed(found)}{_rest(found)}{_limits(found)}{_nearest(found)}{_left(added)}"
-            f"{_compared(added)}{_gaps(found)}"
-        )
-        return f"A part of what the model was missing is {_and(titles)}: {words}."
+        words = f"{_rest(found)}{_limits(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
+        return f"A part of what the model was missing is {_and(titles)}{words}."
     them = "them" if len(titles) > 1 else "it"
-    words = f"with {them}, {_closed(found)} and what is left is at its floor{_left(added)}{_compared(added)}"
-    return f"The model was missing {_and(titles)}; {words}{_gaps(found)}."
+    words = f"with {them}, no more of the gap is left than chance makes{_left(added)}{_doubts(added)}"
+    return f"The model was missing {_and(titles)}; {words}."
 
 
 def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
@@ -355,7 +356,7 @@ def _described(found: Findings, titles: Sequence[str]) -> str:
     none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (
         f"{none} the {found.samples}{besides}, but what they hold is measured: {words}; "
-        f"with it {_closed(found)}{_rest(found)}; {_alike(found)}{_gaps(found)}."
+        f"with it {_closed(found)}; {_alike(found)}."
     )
 
 
@@ -370,20 +371,19 @@ def _nearest(found: Findings) -> str:
     """Return in words which known effects come nearest to what none explains."""
     doubtful = [each.candidates[0].effect for each in found.added.additions if not each.fits]
     nearest = [tag for tag in doubtful or found.added.nearest if tag not in {e.tag for e in found.named}]
-    return f"; nearest known: {_and(nearest)}" if nearest else ""
+    return f"; nearest known: {_and([_title(tag) for tag in nearest])}" if nearest else ""
+
+
+def _title(tag: str) -> str:
+    """Return what an effect is called."""
+    effect = effect_classes().get(tag)
+    return tag if effect is None else effect.title or tag
 
 
 def _closed(found: Findings) -> str:
     """Return the share of the gap that is closed, in words."""
     share = 1.0 - max(found.added.after.value, 0.0) / found.before.value
     return f"{_share(share)} of the gap on unseen {found.samples} is closed"
-
-
-def _gaps(found: Findings) -> str:
-    """Return the gap before and after, and its floor, in words; they come last."""
-    after = found.added.after
-    gaps = f"{micronats(found.before.value)} -> {micronats(after.value)} micronats per sample"
-    return f" (gap {gaps}, floor {micronats(after.floor)})"
 
 
 def _share(share: float) -> str:
@@ -403,33 +403,27 @@ def _rest(found: Findings) -> str:
 def _limits(found: Findings) -> str:
     """Return in words which parameters of the named effects can go no further: another may hide there."""
     stuck = [
-        f"{name} of {effect.tag} stands at its limit, {value:g}"
+        f"{name} of the {_title(effect.tag)} stands at its limit, {value:g}"
         for effect in found.named
         for name, value in effect.at_limits().items()
     ]
     return f"; {_and(stuck)}, as where an effect that is not known is taken for it" if stuck else ""
 
 
-def _compared(added: Added) -> str:
-    """Return in words what the runner-up and the placebo close in the place of each named effect."""
-    words, doubted = [], []
+def _doubts(added: Added) -> str:
+    """Return a caution where a placebo closes much of what a named effect does."""
+    doubted = []
     for each in added.additions:
         closed = each.before.value - each.after.value
-        if not each.named or closed <= 0.0:
-            continue
-        own = []
-        for role, rival in (("the runner-up", next(iter(each.rivals), None)), ("a placebo", each.placebo)):
-            if rival is None:
-                continue
-            share = (each.before.value - max(rival.gap_after, 0.0)) / closed
-            own.append(f"{role} ({rival.effect}) closes {_share(min(max(share, 0.0), 1.0))} of that")
-            if role == "a placebo" and share > CONVINCING_PLACEBO:
-                doubted.append(each.effect.tag)
-        if each.placebo is None:
-            own.append("no unrelated effect closes any of it")
-        words.append(f"in the place of {each.effect.tag} {_and(own)}")
-    caution = f": take the name {_and(doubted)} with caution" if doubted else ""
-    return f"; {'; '.join(words)}{caution}" if words else ""
+        if each.named and each.placebo is not None and closed > 0.0:
+            share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
+            if share > CONVINCING_PLACEBO:
+                doubted.append(_title(each.effect.tag))
+    return (
+        f"; unrelated effects explain it nearly as well: take the name {_and(doubted)} with caution"
+        if doubted
+        else ""
+    )
 
 
 def _left(added: Added) -> str:
@@ -437,7 +431,7 @@ def _left(added: Added) -> str:
     first = "; ".join(place.sentence for place in added.residuals[:_MOST_RESIDUALS])
     words = f"; what is left: {first}" if first else ""
     if added.stand_ins:
-        names = ", ".join(added.stand_ins)
+        names = _and([_title(tag) for tag in added.stand_ins])
         words += f"; {names} would describe a part of it, but not on all codes alike, and is not named"
     return words
 

@@ -12,8 +12,8 @@ from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.history import history_figures
+from pchem_pipeline.report.pages.page import render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
-from pchem_pipeline.report.pages.report import template
 from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.settings import ReportSettings
@@ -96,15 +96,16 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
     whole = ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]])
     times = history_figures(found.history, found.against)
-    drawn = (draw or draw_here)(
-        [*whole, *times, *(each for figures in maps.values() for each in figures)], _SETTINGS
-    )
+    every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
+    drawn = (draw or draw_here)(every, _SETTINGS)
 
     def pictures(figures: Sequence[Figure]) -> list[Picture]:
         return [Picture(figure, drawn[figure.name]) for figure in figures]
 
     parts = [_part(pair, found, pictures(maps[pair.other.label])) for pair in found.pairs]
-    page = template("compare.html.j2").render(
+    page = render_page(
+        "compare.html.j2",
+        every,
         title=" · ".join(run.title for run in found.runs),
         level="caution" if found.changed else "good",
         name="Changed" if found.changed else "Nothing changed",

@@ -49,39 +49,30 @@ PARTS: tuple[tuple[str, str, str], ...] = (
     (
         "signature",
         "What shows most, before and after",
-        "The picture of the statistic that the added effect moves most (of the largest disagreement, where "
-        "nothing was added), and beside it each statistic before and after. All is in standard deviations "
-        "of what chance alone makes of it, from stacks simulated from the fitted model.",
+        "The statistic that the added effect moves most (where nothing was added, the largest disagreement), "
+        "and each statistic before and after, in standard deviations of chance.",
     ),
     (
         "where",
         "Where data and model disagree",
-        "Every sample is split into a charge channel (the expected electron number) and a readout channel "
-        "(what is left). Effects of light and charge show in the first, effects of the electronics in the "
-        "second. The pictures are of the frames to find with; numbers in text, table and in the figure of "
-        "pulls are means of these and of the frames to confirm with.",
+        "Effects of light and charge show in the charge channel, those of the electronics in the readout "
+        "residuals. Pictures are of the frames to find with, numbers of these and those to confirm with.",
     ),
     (
         "evidence",
         "Which effect it is",
-        "Each candidate's fingerprint (how it would move all statistics together) was compared with the data "
-        "on frames that its strength was not fitted to. Scores are differences of log-probability: larger is "
-        "better, and a difference below about three standard errors decides nothing.",
+        "Each candidate is fitted, and scored on frames that its strength was not fitted to: differences of "
+        "log-probability, larger is better. A difference below three standard errors decides nothing.",
     ),
     (
         "shown",
         "How much of the gap is closed",
-        "The gap is how far the law of the data is from that of the model (Kullback and Leibler), measured "
-        "on frames that no fit has seen. At G nats per sample, N samples are exp(N G) times as likely under "
-        "the true law as under the model; a micronat is 10⁻⁶ of a nat, so at 1 micronat it takes a million "
-        "samples for a factor e. It does not grow with the data; more of them only lower its floor, which "
-        "chance alone makes.",
+        "The gap on frames that no fit has seen, in micronats.",
     ),
     (
         "parameters",
         "The effect, and what it changes",
-        "Parameters of the effects with their standard errors, and how far the delivered maps moved when the "
-        "model grew.",
+        "",
     ),
     (
         "limits",
@@ -181,7 +172,7 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
     sentence = data.found.sentence.replace(" -> ", " → ")
     return DiscrepancyView(
-        level, name, sentence, frames_text(data.found), key_facts(data.found), remarks(data), parts
+        level, name, sentence, frames_text(data.found), key_facts(data), remarks(data), parts
     )
 
 
@@ -244,9 +235,10 @@ def parameter_name(name: str) -> str:
         return name.replace("_", " ")
 
 
-def key_facts(found: Verdict) -> list[KeyFact]:
+def key_facts(data: DiscrepancyData) -> list[KeyFact]:
     """Return the numbers of the first screen."""
-    return [*_effect_facts(found), *_moved_fact(found), *_chance_fact(found), *_gap_fact(found)]
+    found = data.found
+    return [*_effect_facts(data), *_moved_fact(found), *_chance_fact(found), *_gap_fact(found)]
 
 
 def _gap_fact(found: Verdict) -> list[KeyFact]:
@@ -272,15 +264,15 @@ def _interval(gap: GapChange) -> str:
     )
 
 
-def _effect_facts(found: Verdict) -> list[KeyFact]:
+def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
     facts = []
-    for step in found.steps:
+    for step in data.found.steps:
         if (step.effect or step.verdict == "described") and step.parameters:
             values = [
                 f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}"
                 for name, p in step.parameters.items()
             ]
-            facts.append(KeyFact(step.likeliest, *_size_texts(step, values)))
+            facts.append(KeyFact(data.title(step.likeliest), *_size_texts(step, values)))
     return facts[:4]
 
 
@@ -302,11 +294,12 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
         return []
     name, largest = moved
     unit = unit_text(largest.unit)
+    small = ", immaterial" if abs(largest.in_stderr) < _IMMATERIAL else ""
     return [
         KeyFact(
             f"largest move: {parameter_name(name)}",
             f"{_signed(largest.median)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr, 2)} standard errors of a pixel",),
+            (f"{_signed(largest.in_stderr, 2)} standard errors of a pixel{small}",),
         )
     ]
 
@@ -336,11 +329,10 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     extended = [step for step in found.steps if step.effect]
     if extended:
         flags += _closing(found)
-        flags += [flag for step in extended for flag in _compared(step)]
-        flags += _materiality(extended)
+        flags += [flag for step in extended for flag in _compared(step, data)]
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
-            flags.append(Flag("note", f"To tell {rival} apart: {measurement}."))
+            flags.append(Flag("note", f"To tell {data.title(rival)} apart: {measurement}."))
     if found.unexplained:
         most = found.unexplained[0]
         words = most.sentence or most.statistic
@@ -350,7 +342,9 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
         for name, why in found.defects.items()
     ]
     if found.untestable:
-        flags.append(Flag("note", f"Cannot be tested by these data: {', '.join(found.untestable)}."))
+        flags.append(
+            Flag("note", f"Cannot be tested by these data: {', '.join(map(data.title, found.untestable))}.")
+        )
     order = ("serious", "caution", "note", "good")
     return sorted(flags, key=lambda flag: order.index(flag.level))
 
@@ -370,42 +364,25 @@ def _closing(found: Verdict) -> list[Flag]:
     return flags
 
 
-def _compared(step: Step) -> list[Flag]:
+def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     """Say what the runner-up and the placebo of a step close in the place of the named effect."""
     own, flags = 1.0 - max(step.gap_after, 0.0) / step.gap_before if step.gap_before > 0.0 else math.nan, []
     if not own > 0.0:
         return []
-    runner_up, placebo = step.runner_up, step.placebo
+    name, runner_up, placebo = data.title(step.effect or ""), step.runner_up, step.placebo
     if runner_up is not None:
         share = percent(max(step.closed_by(runner_up), 0.0), 1.0)
-        words = f"; it {runner_up.why}" if runner_up.why else ""
-        text = (
-            f"The runner-up for {step.effect}, {runner_up.effect}, would close {share} of the gap of its step"
-        )
-        flags.append(Flag("note", f"{text}, {step.effect} closes {percent(own, 1.0)}{words}."))
+        why = f" and {runner_up.why}" if runner_up.why else ""
+        rival = f"In the place of {name} the runner-up, {data.title(runner_up.effect)}"
+        flags.append(Flag("note", f"{rival}, would close {share} of the gap{why}."))
     if placebo is None:
-        return [
-            *flags,
-            Flag("good", f"No effect unrelated to {step.effect} closes any of the gap in its place."),
-        ]
+        return [*flags, Flag("good", f"No effect unrelated to {name} closes any of the gap in its place.")]
     of_that = step.closed_by(placebo) / own
     doubtful = of_that > CONVINCING_PLACEBO
     end = ": take the name with caution" if doubtful else ""
-    text = f"A placebo ({placebo.effect}, unrelated to {step.effect} and fitted in its place) closes"
-    words = f"{text} {percent(max(of_that, 0.0), 1.0)} of what {step.effect} closes{end}."
+    text = f"A placebo in the place of {name} ({data.title(placebo.effect)}, unrelated to it) closes"
+    words = f"{text} {percent(max(of_that, 0.0), 1.0)} of what it closes{end}."
     return [*flags, Flag("caution" if doubtful else "good", words)]
-
-
-def _materiality(extended: list[Step]) -> list[Flag]:
-    moved = _largest_move(extended)
-    if moved is None:
-        return []
-    name, largest = parameter_name(moved[0]), moved[1]
-    far = _signed(largest.in_stderr, 2)
-    words = f"{name} moved by {far} standard errors of a pixel"
-    if abs(largest.in_stderr) < _IMMATERIAL:
-        return [Flag("note", f"Significant, but immaterial for the maps: at most, {words}.")]
-    return [Flag("note", f"It matters for the maps: {words}.")]
 
 
 def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:

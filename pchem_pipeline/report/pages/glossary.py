@@ -68,10 +68,22 @@ GLOSSARY: tuple[Term, ...] = (
         "little. Flagged pixels are left out of medians.",
     ),
     Term(
+        "gap",
+        "How far the law of the data is from that of the model (Kullback-Leibler divergence), on frames "
+        "that no fit has seen. More data do not change it; they lower its floor, which chance alone makes.",
+        ("floor",),
+    ),
+    Term(
         "hot pixels",
         "Pixels with far more charge than the others: H above its median by more than maps.outlier_sigmas "
         "robust standard deviations. EMVA 1288 leaves the limit to the application.",
         ("hot pixel",),
+    ),
+    Term(
+        "micronat",
+        "10⁻⁶ nat, the unit of the gap. N samples with a gap of G nats each are exp(N G) times as likely "
+        "under the law of the data as under the model: 1 micronat, a million samples: a factor e.",
+        ("micronats",),
     ),
     Term(
         "misfit",
@@ -95,6 +107,11 @@ GLOSSARY: tuple[Term, ...] = (
         ("photon counting distribution",),
     ),
     Term(
+        "placebo",
+        "The best fit of an effect that has nothing to do with the named one. What it closes of the gap, any "
+        "wrong effect could.",
+    ),
+    Term(
         "PRNU",
         "Photo response non-uniformity: spread between pixels of the response to light, over its mean. "
         "Here the spread of H under light stands for it; EMVA 1288 measures at half saturation.",
@@ -107,9 +124,26 @@ GLOSSARY: tuple[Term, ...] = (
         "included. Dark shot noise is not in it; in the temporal dark noise of EMVA 1288 it is.",
     ),
     Term(
+        "readout and charge",
+        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and what is "
+        "left (readout). Effects of light show in the first, those of the electronics in the second.",
+        ("readout residuals", "readout channel", "charge channel"),
+    ),
+    Term(
+        "replicate",
+        "A stack simulated from the fitted model and treated like the data: what chance makes of it.",
+        ("replicates",),
+    ),
+    Term(
         "RMSE",
         "Root mean square difference between the predicted and the measured density of the ensemble; "
         "sampling noise alone leaves some.",
+    ),
+    Term(
+        "sd of chance",
+        "Standard deviation of a statistic between stacks simulated from the fitted model. Of a hundred "
+        "statistics the largest lies near 3 by chance.",
+        ("standard deviations of chance", "sd"),
     ),
     Term(
         "standard error",

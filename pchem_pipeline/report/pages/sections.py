@@ -16,7 +16,6 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
-from pchem_pipeline.report.pages.glossary import GLOSSARY
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, pixel_counts, sentence
@@ -256,10 +255,6 @@ def _configuration(material: Material) -> Section:
     return Section("configuration", "Configuration", "text", content, folded=True)
 
 
-def _glossary(_: Material) -> Section:
-    return Section("glossary", "Glossary", "glossary", {"terms": GLOSSARY}, folded=True)
-
-
 #: The page from top to bottom.
 PAGE: tuple[Maker, ...] = (
     _summary,
@@ -273,5 +268,4 @@ PAGE: tuple[Maker, ...] = (
     _cite,
     _provenance,
     _configuration,
-    _glossary,
 )

@@ -301,8 +301,14 @@ def _quick_look(data: ReportData) -> list[Flag]:
     if not look.found:
         return [Flag("good", nothing_found(look))]
     closer = f"; to look closer: {look.command}" if look.command and data.discrepancy is None else ""
-    flags = [Flag(check.level, f"{check_sentence(check)}{closer}.") for check in look.found[:1]]
-    return flags + [Flag(check.level, f"{check_sentence(check)}.") for check in look.found[1:]]
+    return [
+        # what the model has already speaks for it
+        Flag(
+            "good" if check.in_model else check.level,
+            f"{check_sentence(check)}{closer if number == 0 else ''}.",
+        )
+        for number, check in enumerate(look.found)
+    ]
 
 
 def _conditions(data: ReportData) -> list[Flag]:

@@ -137,4 +137,6 @@ def _gap(found: Verdict) -> list[str]:
             if rival is not None and step.effect:
                 left = f"{rival.effect} leaves {micronats(rival.gap_after)}"
                 words += f"; in the place of {step.effect} the {role} {left}"
+        if step.effect and step.placebo is None:
+            words += f"; no effect unrelated to {step.effect} closes any of it"
     return _wrapped(words)

@@ -23,8 +23,9 @@ from pchem_pipeline.report.inspector.inspector import script
 from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
+from pchem_pipeline.report.pages.page import figure_tables, page_script
 from pchem_pipeline.report.pages.pictures import Drawn
-from pchem_pipeline.report.pages.report import RenderedReport, figure_tables, page_script, render_report
+from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags, key_numbers, sentence
 from pchem_pipeline.report.settings import ReportSettings
 
