@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, Protocol, TextIO
+from typing import Any, Literal, Protocol, TextIO, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.store.progress_file import ProgressFile
 
-__all__ = ["Advance", "Reporter", "paced"]
+__all__ = ["Advance", "Reporter", "paced", "parts_told", "telling_parts"]
 
+T = TypeVar("T")
 ProgressMode = Literal["auto", "on", "off"]
 
 #: Seconds of silence after which a phase says that it is still at work.
@@ -27,11 +29,36 @@ _SILENCE = 20.0
 class Advance(Protocol):
     """Called when units of work are finished."""
 
-    def __call__(self, n: int = 1) -> None:
-        """Advance the bar by ``n`` units."""
+    def __call__(self, n: float = 1) -> None:
+        """Advance the bar by ``n`` units, or a part of one."""
 
 
-def paced(label: str, unit: str, done: int, total: int, new: int, seconds: float) -> dict[str, Any]:
+#: Who hears of the shares of the unit that a thread works on.
+_teller: contextvars.ContextVar[Callable[[float], None] | None] = contextvars.ContextVar(
+    "teller", default=None
+)
+
+
+@contextmanager
+def telling_parts(tell: Callable[[float], None] | None) -> Iterator[None]:
+    """Let ``tell`` hear what share of the unit each part makes that is done within, in this thread."""
+    token = _teller.set(tell)
+    try:
+        yield
+    finally:
+        _teller.reset(token)
+
+
+def parts_told(parts: Iterable[T]) -> Iterator[T]:
+    """Yield the parts of a unit of work, and tell of each that is done: a bar moves within a single tile."""
+    every, tell = list(parts), _teller.get()
+    for part in every:
+        yield part
+        if tell is not None:
+            tell(1.0 / len(every))
+
+
+def paced(label: str, unit: str, done: float, total: int, new: float, seconds: float) -> dict[str, Any]:
     """Return how far a stage is, for machines.
 
     Args:
@@ -73,7 +100,7 @@ class Reporter:
         self._disable = {"auto": None, "on": False, "off": True}[progress] if not quiet else True
         self._quiet = quiet
         self._log: TextIO | None = None
-        self._lock = threading.Lock()
+        self._lock, self._bar = threading.Lock(), threading.RLock()
         self._told = time.monotonic()
         self._compiled, self._to_compile = 0.0, 0.0
         if log is not None:
@@ -171,13 +198,14 @@ class Reporter:
             file=sys.stderr,
             leave=False,
         ) as bar:
-            count, start, last, compiled = done, time.monotonic(), -1.0, self._compiled
+            count: float = done
+            start, last, compiled = time.monotonic(), -1.0, self._compiled
 
             def tell() -> None:
                 nonlocal last
                 last = self._told = time.monotonic()
                 worked = max(last - start - (self._compiled - compiled), 1e-3)
-                pace = paced(label, unit, count, total, count - done, worked)
+                pace = paced(label, unit, _short(count), total, count - done, worked)
                 if pace["remaining"] is not None:
                     pace["remaining"] = round(pace["remaining"] + self._to_compile, 3)
                 left = f"about {self._to_compile:.0f} s to compile" if self._to_compile > 1 else ""
@@ -186,12 +214,14 @@ class Reporter:
                 if self._file is not None:
                     self._file.show(pace)
 
-            def advance(n: int = 1) -> None:
+            def advance(n: float = 1) -> None:
                 nonlocal count
-                count += n
-                bar.update(n)
-                if time.monotonic() - last > 1 or count == total:
-                    tell()
+                with self._bar:
+                    count += n
+                    bar.n = _short(count)
+                    bar.update(0)
+                    if time.monotonic() - last > 1 or bar.n == total:
+                        tell()
 
             tell()
             yield advance
@@ -213,3 +243,9 @@ class Reporter:
 
         self._told = time.monotonic()
         tqdm.write(message, file=sys.stderr)
+
+
+def _short(count: float) -> float:
+    """Return a count of units for people: whole where it is, else with two digits."""
+    rounded = round(count, 2)
+    return int(rounded) if rounded == int(rounded) else rounded

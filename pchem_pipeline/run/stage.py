@@ -27,7 +27,7 @@ from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, S
 from pchem_pipeline.compute.memory import affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
-from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.progress import Reporter, telling_parts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
@@ -93,16 +93,21 @@ def open_store(path: Path) -> RunStore:
 
 @dataclass(frozen=True)
 class MarkedTask:
-    """A task that sets the markers of its unit once it is done, in the worker."""
+    """A task that sets the markers of its unit once it is done, in the worker.
+
+    ``tell`` hears by key what share of a unit is done, where the worker shares the memory.
+    """
 
     store: Path
     stage: str
     fingerprint: str
     task: Callable[[Any], Mapping[str, Any] | None]
+    tell: Callable[[str, float], None] | None = None
 
     def __call__(self, unit: Unit) -> Mapping[str, Any]:
         """Do the unit, then mark it."""
-        summary = dict(self.task(unit) or {})
+        with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
+            summary = dict(self.task(unit) or {})
         records = open_store(self.store).records
         for key in unit.keys:
             records.mark(self.stage, self.fingerprint, key, summary)
@@ -306,7 +311,6 @@ class StageContext:
         todo = self._ready(self._pending_of(units, by_tiles, total), needs)
         self.store.records.unmark(self.stage, self.fingerprint, (key for unit in todo for key in unit.keys))
         self.store.sync()  # what was made for the units, by this process, lies below their markers
-        marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task)
         fatal: list[BaseException] = []
         shown = len(self.selected(units) if by_tiles else units)
         undivided = list(units) == [WHOLE]
@@ -315,15 +319,23 @@ class StageContext:
         with self.reporter.progress(
             self.stage, shown, unit_name, shown - len(todo), hidden=undivided
         ) as advance:
+            told: dict[str, float] = {}
+
+            def tell(key: str, share: float) -> None:
+                share = min(share, 1.0 - told.get(key, 0.0))
+                told[key] = told.get(key, 0.0) + share
+                advance(share)
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
-                advance()
+                advance(1.0 - told.pop(unit.key, 0.0))
                 if outcome.error is not None:
                     self._failed(unit, outcome, fatal)
                 if fatal or self.stop.signal is not None:
                     raise Stop
 
             self.stop.check()
+            heard = tell if executor.shares_memory else None
+            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard)
             try:
                 executor.map(marked, todo, on_result)
             except Stop:

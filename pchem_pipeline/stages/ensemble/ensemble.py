@@ -32,6 +32,7 @@ from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
@@ -305,7 +306,7 @@ def _sum_tile(
         stderr = [store.read(f"fit/{name}_stderr", tile.region) for name in PARAMETERS]
         covariance = np.stack(stderr, axis=-1), store.read("fit/correlation", tile.region)
     rows = []
-    for part in tile.parts():
+    for part in parts_told(tile.parts()):
         everything = _histograms(counts[part], outside[part])
         some = everything if chosen is None else _histograms(*(values[part] for values in chosen))
         place, of_pixels = tile.within(part), [values[part] for values in maps]

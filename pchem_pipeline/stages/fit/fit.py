@@ -20,6 +20,7 @@ from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
+from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
@@ -135,7 +136,7 @@ def _do_tile(
     effects, set_aside = model.effects, model.settings.set_aside_e
     added = read_added_exposure(run_store, model, tile.region)
     arrays: dict[str, NDArray[Any]] = {}
-    for part in tile.parts():
+    for part in parts_told(tile.parts()):
         found = fit_tile(
             {name: values[part] for name, values in histogram.items()},
             settings,

@@ -21,6 +21,7 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.excluding_codes import Interval
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
@@ -148,11 +149,23 @@ def _do_tile(tile: Tile, *, store: Path, stores: Sequence[Path], how: SampleFit)
         sample = RunStore.open(path)
         histograms.append({name: sample.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM})
     target = open_store(store)
-    arrays = fit_samples_tile(histograms, how, pixel_places(target, tile.region))
-    for path_, values in arrays.items():
-        along = path_.startswith("samples/") and path_ != "samples/covariance"
-        target.write(path_, (slice(None), *tile.region) if along else tile.region, values)
+    arrays: dict[str, NDArray[Any]] = {}
+    for part in parts_told(tile.parts()):
+        some = [{name: values[part] for name, values in each.items()} for each in histograms]
+        found = fit_samples_tile(some, how, pixel_places(target, tile.within(part)))
+        for name, values in found.items():
+            lead = values.shape[:1] if _by_sample(name) else ()
+            rest = values.shape[len(lead) + 2 :]
+            whole = arrays.setdefault(name, np.empty((*lead, *tile.shape, *rest), values.dtype))
+            whole[(slice(None), *part) if lead else part] = values
+    for name, values in arrays.items():
+        target.write(name, (slice(None), *tile.region) if _by_sample(name) else tile.region, values)
     words = arrays["fit/fit_status"]
     bits = {"failed": int(FAILED), "poor": int(FitStatus.POOR_FIT)}
     counts = {name: int(np.count_nonzero(words & np.uint16(bit))) for name, bit in bits.items()}
     return {"pixels": int(words.size), **counts}
+
+
+def _by_sample(name: str) -> bool:
+    """Tell whether the first dimension of an array is the sample."""
+    return name.startswith("samples/") and name != "samples/covariance"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pchem_pipeline.run.progress import Reporter, paced
+from pchem_pipeline.run.progress import Reporter, paced, parts_told, telling_parts
 from pchem_pipeline.store.progress_file import ProgressFile, read_progress
 
 
@@ -36,6 +36,19 @@ def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
     assert (first["done"], first["rate"], first["remaining"]) == (1, None, None)
     assert (last["done"], last["total"], last["unit"], last["remaining"]) == (4, 4, "tile", 0.0)
     assert last["rate"] > 100
+
+
+def test_a_bar_moves_within_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(1000))
+    monkeypatch.setattr("pchem_pipeline.run.progress.time.monotonic", lambda: 2.0 * next(clock))
+    reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
+    with reporter.progress("fit", 1, "tile") as advance, telling_parts(advance):
+        assert list(parts_told("abc")) == ["a", "b", "c"]
+    assert list(parts_told("abc")) == ["a", "b", "c"]  # nobody listens
+    reporter.close()
+    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    assert [event["done"] for event in events] == [0, 0.33, 0.67, 1]
+    assert events[1]["remaining"] > 0
 
 
 def test_what_is_still_to_compile_is_part_of_the_remaining_time(tmp_path: Path) -> None:

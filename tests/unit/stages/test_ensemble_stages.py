@@ -274,6 +274,8 @@ def test_electron_stack(finished: StageContext) -> None:
 class _PickledTasks(SerialExecutor):
     """Sends tasks and units through pickle, as a backend of other processes does."""
 
+    shares_memory = False
+
     def map(self, function, items, on_result):
         super().map(pickle.loads(pickle.dumps(function)), pickle.loads(pickle.dumps(list(items))), on_result)
 
