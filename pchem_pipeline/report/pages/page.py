@@ -23,7 +23,7 @@ _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": 
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
 
-def render_page(name: str, figures: Sequence[Figure], *scripts: str, **content: Any) -> str:
+def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **content: Any) -> str:
     """Return a page as HTML, complete in itself.
 
     Args:
