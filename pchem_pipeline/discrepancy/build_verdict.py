@@ -63,7 +63,7 @@ class Addition:
     Attributes:
         effect: with its fitted parameters.
         alone: whether all others are excluded.
-        fits: whether it explains what it moves itself; where not, the candidates are the nearest known.
+        against: why it is not what the data hold, and the candidates are only the nearest known; else empty.
         candidates: those compared, the likeliest first.
         strength_stderr: standard error of its strength.
         before, after: gap on the final samples without and with it.
@@ -76,7 +76,7 @@ class Addition:
 
     effect: Effect
     alone: bool
-    fits: bool
+    against: str
     candidates: tuple[Candidate, ...]
     strength_stderr: float
     before: Gap
@@ -86,6 +86,11 @@ class Addition:
     pulls: tuple[Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     described: bool = False
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.against
 
     @property
     def named(self) -> bool:
@@ -336,7 +341,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     if found.before.at_floor:
         return f"The model was missing {_and(titles)}, too little for the final {data} alone to show."
     if state == "named_in_part":
-        words = f"{_rest(found)}{_limits(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
+        words = f"{_rest(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
         return f"A part of what the model was missing is {_and(titles)}{words}."
     them = "them" if len(titles) > 1 else "it"
     words = f"with {them}, no more of the gap is left than chance makes{_left(added)}{_doubts(added)}"
@@ -369,9 +374,12 @@ def _alike(found: Findings) -> str:
 
 def _nearest(found: Findings) -> str:
     """Return in words which known effects come nearest to what none explains."""
-    doubtful = [each.candidates[0].effect for each in found.added.additions if not each.fits]
-    nearest = [tag for tag in doubtful or found.added.nearest if tag not in {e.tag for e in found.named}]
-    return f"; nearest known: {_and([_title(tag) for tag in nearest])}" if nearest else ""
+    named = {effect.tag for effect in found.named}
+    doubtful = {e.candidates[0].effect: e.against for e in found.added.additions if not e.fits}
+    doubtful = {tag: against for tag, against in doubtful.items() if tag not in named}
+    nearest = [] if doubtful else [_title(tag) for tag in found.added.nearest if tag not in named]
+    words = "".join(f"; most like {_title(tag)}, which does not fit: {why}" for tag, why in doubtful.items())
+    return words + (f"; nearest known: {_and(nearest)}" if nearest else "")
 
 
 def _title(tag: str) -> str:
@@ -398,16 +406,6 @@ def _rest(found: Findings) -> str:
     if after.at_floor or found.before.value <= 0.0:
         return ""
     return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
-
-
-def _limits(found: Findings) -> str:
-    """Return in words which parameters of the named effects can go no further: another may hide there."""
-    stuck = [
-        f"{name} of the {_title(effect.tag)} stands at its limit, {value:g}"
-        for effect in found.named
-        for name, value in effect.at_limits().items()
-    ]
-    return f"; {_and(stuck)}, as where an effect that is not known is taken for it" if stuck else ""
 
 
 def _doubts(added: Added) -> str:

@@ -13,7 +13,7 @@ from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
 from pchem_pipeline.discrepancy.verdict import Place
-from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
 
 __all__ = [
@@ -61,7 +61,7 @@ def suspected_regions(
             values,
             evidence.maps.usable,
             significance=significance / len(maps),
-            single=name.startswith(("goodness", "spread")),
+            single=name.startswith(("goodness", "peaks", "spread")),
             next_along={"x": 1, "y": 0}.get(name.partition(".")[0]),
         )
         for name, values in maps.items()
@@ -87,13 +87,14 @@ def suspected_frames(
 def pixel_maps(evidence: Evidence) -> dict[str, FloatArray]:
     """Return the maps behind the statistics, each about N(0, 1) where nothing is wrong, (y, x).
 
-    ``score.C2`` and so on, ``goodness``; of frames also ``lag.charge``, ``lag.readout`` and ``lag.cross``
-    (the frame before), ``spread.*`` (block means scatter), ``trend.*`` (they rise along the run), and
-    ``x.kk``, ``x.rr``, ``x.rk``, ``y.kk``, ... (the next pixel along x or y): noise of rows raises ``x.rr``
-    where it is, noise of columns ``y.rr``, noise of frames both.
+    ``score.C2`` and so on, ``goodness``, ``peaks``; of frames also ``lag.charge``, ``lag.readout`` and
+    ``lag.cross`` (the frame before), ``spread.*`` (block means scatter), ``trend.*`` (they rise along the
+    run), and ``x.kk``, ``x.rr``, ``x.rk``, ``y.kk``, ... (the next pixel along x or y): noise of rows raises
+    ``x.rr`` where it is, noise of columns ``y.rr``, noise of frames both.
     """
     found = {f"score.{name}": np.asarray(m, np.float64) for name, m in evidence.scores.items()}
     found["goodness"] = np.asarray(evidence.goodness, np.float64)
+    found["peaks"] = np.asarray(evidence.peaks, np.float64)
     time = evidence.time
     if time is None:
         return found
@@ -161,6 +162,7 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
 #: The map in which a statistic would show where it is, by the beginning of its name; likewise the series.
 _MAP_OF = {
     "shape.goodness": "goodness",
+    "shape.peaks": "peaks",
     "time.lag1.charge": "lag.charge",
     "time.lag2.charge": "lag.charge",
     "time.lag1.readout": "lag.readout",
@@ -198,7 +200,7 @@ _SERIES_OF = {
 def map_of(statistic: str) -> str | None:
     """Return the map (of :func:`pixel_maps`) in which a statistic shows its place; None without any."""
     parts = statistic.split(".")
-    if parts[0] == "shape" and parts[1] != "goodness":
+    if parts[0] == "shape" and parts[1] in SCORES:
         return f"score.{parts[1]}"
     if parts[0] == "space" and parts[1] in ("x", "y") and parts[2] != "bits":
         return statistic.removeprefix("space.")
@@ -284,7 +286,8 @@ def _pixel_map(name: str, evidence: Evidence) -> NDArray[np.floating] | None:
         return None
     time = evidence.time
     if parts[0] == "shape":
-        return evidence.goodness if parts[1] == "goodness" else evidence.scores[parts[1]]
+        whole = {"goodness": evidence.goodness, "peaks": evidence.peaks}
+        return whole[parts[1]] if parts[1] in whole else evidence.scores[parts[1]]
     if parts[0] == "tail":
         counts = evidence.tail_low if parts[1] == "low" else evidence.tail_high
         return 6.0 * np.asarray(counts > 0, np.float64)

@@ -53,6 +53,7 @@ def evidence(shape: tuple[int, int] = (32, 40), n_frames: int = 1200, seed: int 
         readout_std=readout_std,
         scores=normal,
         goodness=goodness,
+        peaks=goodness,
         tail_low=rng.poisson(0.01, shape).astype(np.uint32),
         tail_high=rng.poisson(0.01, shape).astype(np.uint32),
         code=CodeResiduals(70, observed, expected, 72, 186),

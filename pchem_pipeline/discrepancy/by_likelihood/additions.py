@@ -80,9 +80,11 @@ class AddedSets:
             addition = self._addition(named, members, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
             gap, fitted = after, extended
-        fits = self.found.rest <= LARGEST_REST or gap.at_floor
+        left = (
+            "" if self.found.rest <= LARGEST_REST or gap.at_floor else "too much of the gap is left beside it"
+        )
         added = Added(
-            additions=tuple(replace(each, fits=fits) for each in additions),
+            additions=tuple(replace(each, against=left or each.against) for each in additions),
             after=gap,
             nearest=self.found.nearest,
             stand_ins=tuple(m.tag for m in self.found.unsteady),
@@ -157,7 +159,7 @@ class AddedSets:
         return Addition(
             effect=member.effect,
             alone=not named.equals,
-            fits=True,
+            against=member.effect.stuck_words(),
             candidates=candidates,
             strength_stderr=_stderr(extended, member, named.apart),
             before=gaps[0],

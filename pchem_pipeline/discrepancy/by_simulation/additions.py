@@ -92,7 +92,9 @@ class AddedRounds:
             still: whether the data disagree with that.
         """
         after = self.gaps.gap(self.z.final, last.mean, last.replicates)
-        unfinished = not after.at_floor and (still or after.value > _REST_OF_NAMED * before.value)
+        # what the final frames prove to be left: few of them tell the gap of a weak effect from none badly
+        left = max(after.interval[0], 0.0)
+        unfinished = not after.at_floor and (still or left > _REST_OF_NAMED * before.value)
         rest = self._rest(last) if unfinished and self.rounds else None
         additions: list[Addition] = []
         gap = before
@@ -107,11 +109,10 @@ class AddedRounds:
                     now = self.gaps.gap(self.z.final, this.extended.mean, this.extended.replicates)
                 else:
                     now = after
-                stands = rest is None or (
-                    after.value < _REST_OF_NAMED * (gap.value - now.value)
-                    and not _implicated(parts[member], rest, this.null)
-                )
-                additions.append(self._addition(this, int(member), (gap, now), stands))
+                against = "" if rest is None else self._unexplained(parts[member], rest, this.null)
+                if rest is not None and left >= _REST_OF_NAMED * (gap.value - now.value):
+                    against = "too much of the gap is left beside it"
+                additions.append(self._addition(this, int(member), (gap, now), against))
                 gap = now
         return Added(tuple(additions), after, unfinished)
 
@@ -121,16 +122,33 @@ class AddedRounds:
         chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
         return np.asarray((self.z.both - last.mean) / np.hypot(chance, allowed))
 
-    def _addition(self, this: Round, member: int, gaps: tuple[Gap, Gap], stands: bool) -> Addition:
+    def _unexplained(self, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
+        """Return in words what an effect moves and the whole model does not account for; empty: nothing.
+
+        Whatever is missing besides, it is then not known that this effect has the right name.
+        """
+        mine = np.where(np.abs(part) > _MOVED * null.std, np.abs(rest), 0.0)
+        worst = int(np.argmax(mine))
+        return f"it leaves {STATISTICS[null.names[worst]].sentence}" if mine[worst] > _LEFT else ""
+
+    def _against(self, this: Round, member: int) -> str:
+        """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.
+
+        A parameter that can go no further was driven there by another effect; and at its best fit an effect
+        accounts for all that it moves.
+        """
         added, parts = this.added.hypotheses[member], this.added.parts
+        allowed = tolerance(parts, self.allowed)
+        wrong = misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
+        return added.effect.stuck_words() or ("it does not account for what it moves itself" if wrong else "")
+
+    def _addition(self, this: Round, member: int, gaps: tuple[Gap, Gap], against: str) -> Addition:
+        added = this.added.hypotheses[member]
         rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.settings.certainty)
-        allowed = tolerance(parts, self.allowed)
-        fits = stands and not misfits(
-            this.extended, self.z, parts[member], self.settings.significance, allowed
-        )
-        named = len(kept) == 1 and fits
         described = type(added.effect).measured_only
+        against = "" if described else against or self._against(this, member)
+        named = len(kept) == 1 and not against and not described
         compared = [
             (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)
             for r in (rivals if named else kept)
@@ -141,7 +159,7 @@ class AddedRounds:
         return Addition(
             effect=added.effect if named else compared[0][0],
             alone=len(kept) == 1,
-            fits=fits or described,
+            against=against,
             described=described,
             candidates=tuple(Candidate.of(e, r.score, r.stderr, r.probability) for e, r in compared),
             strength_stderr=_stderr(added, float(this.added.stderr[member])),
@@ -217,14 +235,6 @@ class _Other:
     mean: FloatArray
     rest: FloatArray
     closes: bool
-
-
-def _implicated(part: FloatArray, rest: FloatArray, null: NullModel) -> bool:
-    """Tell whether an effect moves statistics that the whole model does not account for.
-
-    Whatever is missing besides, it is then not known that this effect has the right name.
-    """
-    return bool(np.any((np.abs(rest) > _LEFT) & (np.abs(part) > _MOVED * null.std)))
 
 
 def _weight(part: FloatArray, null: NullModel) -> float:

@@ -127,12 +127,17 @@ def _places_of_frames(
 
 
 def _regions(evidence: Evidence, usable: NDArray[np.bool_]) -> Iterator[_Found]:
-    """Yield the places of maps that stand out while little of it is elsewhere."""
+    """Yield the places of maps that stand out while little of it is elsewhere.
+
+    Not scattered pixels: effects of few pixels are simulated in others, and would never do to these what the
+    data do.
+    """
     for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_MAPS).values():
         for one in suspects:
             mask = one.region.mask((usable.shape[0], usable.shape[1]))
             inside = int((usable & mask).sum())
-            if one.only_there and FEWEST_PIXELS <= inside <= _LARGEST * usable.sum():
+            placed = one.only_there and one.family != "pixels"
+            if placed and FEWEST_PIXELS <= inside <= _LARGEST * usable.sum():
                 yield _Found(abs(one.z), Part(one.region))
 
 

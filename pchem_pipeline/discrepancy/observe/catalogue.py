@@ -149,6 +149,15 @@ _GOODNESS = [
     Statistic("shape.goodness.mean", "digital", "histograms deviate from the PCD, in all pixels alike"),
     Statistic("shape.goodness.chi", "digital", "histograms deviate from the PCD, differently by pixel"),
     Statistic("shape.goodness.cnt", "digital", "histograms deviate from the PCD, in few pixels strongly"),
+    Statistic(
+        "shape.peaks.mean", "readout", "the form of the peaks deviates from the PCD, in all pixels alike"
+    ),
+    Statistic(
+        "shape.peaks.chi", "readout", "the form of the peaks deviates from the PCD, differently by pixel"
+    ),
+    Statistic(
+        "shape.peaks.cnt", "readout", "the form of the peaks deviates from the PCD, in few pixels strongly"
+    ),
 ]
 _CODE = [
     Statistic("code.rough", "digital", "neighbouring codes deviate from the smooth expectation"),

@@ -200,16 +200,17 @@ def _compared(
     def tail(moment: int) -> NDArray[np.uint32]:
         return np.where(good, laws.moments[:, moment], 0.0).reshape(shape).astype(np.uint32)
 
+    def mapped(values: FloatArray) -> NDArray[np.float32]:
+        return np.where(good, values, np.nan).reshape(shape).astype(np.float32)
+
     evidence = Evidence(
         maps=_maps(masked, good.reshape(shape)),
         n_frames=int((inside + outside.sum(axis=1)).max()),
         charge_std=moments[:, column.MODEL_STD_K].reshape(shape),
         readout_std=moments[:, column.MODEL_STD_R].reshape(shape),
-        scores={
-            name: np.where(good, laws.scores[:, 0, j], np.nan).reshape(shape).astype(np.float32)
-            for j, name in enumerate(SCORES)
-        },
-        goodness=np.where(good, goodness_of(laws.moments), np.nan).reshape(shape).astype(np.float32),
+        scores={name: mapped(laws.scores[:, 0, j]) for j, name in enumerate(SCORES)},
+        goodness=mapped(goodness_of(laws.moments)),
+        peaks=mapped(goodness_of(laws.moments, column.PEAKS_CHI2)),
         tail_low=tail(column.SEEN_LOW),
         tail_high=tail(column.SEEN_HIGH),
         code=residuals,

@@ -26,10 +26,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 #: Columns of ``moments``, see :func:`_channels` for the first eight.
-N_MOMENTS = 19
+N_MOMENTS = 22
 MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET_K = range(8)
 CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
 EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
+PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE = range(19, 22)
 _FOLD = 16
 
 
@@ -43,21 +44,26 @@ def _total(values: NDArray[Any]) -> float:
 
 @kernel
 def _goodness(
-    law: FloatArray, seen: FloatArray, expected: FloatArray, n: float, smallest: float
+    law: FloatArray, seen: FloatArray, expected: FloatArray, n: float, smallest: float, shortest: int
 ) -> tuple[float, float, float]:
-    """Return Pearson's chi-square of merged codes, its mean and variance with the parameters fitted."""
+    """Return Pearson's chi-square of merged codes, its mean and variance with the parameters fitted.
+
+    So many samples are expected of a group at least, and so many codes are in it.
+    """
     chi2 = mean = inverse = 0.0
-    groups = 0
+    groups = merged = 0
     observed = wanted = 0.0
     remaining = n
     taken = np.zeros(N_NUISANCE)
     last = seen.size - 1
     for x in range(seen.size):
+        merged += 1
         observed += seen[x]
         wanted += expected[x]
         for i in range(N_NUISANCE):
             taken[i] += law[x, i]
-        if (wanted >= smallest and remaining - wanted >= smallest) or x == last:
+        full = wanted >= smallest and merged >= shortest
+        if (full and remaining - wanted >= smallest) or x == last:
             if wanted <= 0.0:
                 break
             chi2 += (observed - wanted) ** 2 / wanted
@@ -70,6 +76,7 @@ def _goodness(
             groups += 1
             remaining -= wanted
             observed = wanted = 0.0
+            merged = 0
     variance = 2.0 * mean + max(0.0, inverse - (groups * groups + 2.0 * groups - 2.0) / n)
     return chi2, mean, variance
 
@@ -333,7 +340,10 @@ def summarise_pixels(
         pixel_scores(law, inverse, seen, gram, exposure, scores[p])
         out = moments[p]
         inside = _total(seen)
-        out[CHI2], out[CHI2_MEAN], out[CHI2_VARIANCE] = _goodness(law, seen, expected, inside, 5.0)
+        out[CHI2], out[CHI2_MEAN], out[CHI2_VARIANCE] = _goodness(law, seen, expected, inside, 5.0, 1)
+        out[PEAKS_CHI2], out[PEAKS_MEAN], out[PEAKS_VARIANCE] = _goodness(
+            law, seen, expected, inside, 5.0, max(1, round(width))
+        )
         out[EXPECTED_LOW], out[EXPECTED_HIGH] = below, above
         out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
         _channels(mass, table[0], table[1], seen, out[SEEN_LOW], out[SEEN_HIGH], out)

@@ -60,11 +60,16 @@ def without_skew(z: FloatArray, skewness: FloatArray) -> FloatArray:
     return np.asarray(6.0 / skew * (root - 1.0) + skew / 6.0)
 
 
-def goodness_of(moments: FloatArray) -> FloatArray:
-    """Return the goodness of fit of each pixel as a normal quantile, 0 without degrees of freedom, (n,)."""
-    mean, variance = moments[:, column.CHI2_MEAN], moments[:, column.CHI2_VARIANCE]
+def goodness_of(moments: FloatArray, chi_square: int = column.CHI2) -> FloatArray:
+    """Return the goodness of fit of each pixel as a normal quantile, 0 without degrees of freedom, (n,).
+
+    Args:
+        moments: of the pixels.
+        chi_square: column of the chi-square; its mean and variance follow it.
+    """
+    mean, variance = moments[:, chi_square + 1], moments[:, chi_square + 2]
     some = mean > 0.5
-    z = laws.chi_square(moments[:, column.CHI2], np.where(some, mean, 1.0), np.where(some, variance, 2.0))
+    z = laws.chi_square(moments[:, chi_square], np.where(some, mean, 1.0), np.where(some, variance, 2.0))
     return np.where(some, z, 0.0)
 
 
@@ -79,11 +84,12 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     good = pixels.good
     found = _score_statistics(pixels.scores[good], np.log(exposure[good]))
     moments = pixels.moments[good]
-    z = goodness_of(moments)
-    n = z.size
-    found["shape.goodness.mean"] = float(z.sum() / np.sqrt(n))
-    found["shape.goodness.chi"] = float((np.sum(z**2) - n) / np.sqrt(2.0 * n))
-    found["shape.goodness.cnt"] = outliers(z, two_sided=False)
+    for name, chi_square in (("goodness", column.CHI2), ("peaks", column.PEAKS_CHI2)):
+        z = goodness_of(moments, chi_square)
+        n = z.size
+        found[f"shape.{name}.mean"] = float(z.sum() / np.sqrt(n))
+        found[f"shape.{name}.chi"] = float((np.sum(z**2) - n) / np.sqrt(2.0 * n))
+        found[f"shape.{name}.cnt"] = outliers(z, two_sided=False)
     for side, near, far in (
         ("low", moments[:, _LOW], moments[:, _FAR_LOW]),
         ("high", moments[:, _HIGH], moments[:, _FAR_HIGH]),

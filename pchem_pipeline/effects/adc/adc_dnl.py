@@ -67,6 +67,7 @@ class AdcDnl(Effect):
     )
     strength: ClassVar[str] = "dnl_lsb"
     power: ClassVar[float] = 2.0
+    attained: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
     separate: ClassVar[Mapping[str, str]] = {
         "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
         "adc_inl": "a ramp or a shifted bias over many codes: DNL is new from code to code, INL smooth",

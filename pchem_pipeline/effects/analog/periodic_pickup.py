@@ -60,6 +60,7 @@ class PeriodicPickup(Effect):
     )
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
+    attained: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
         "frame_noise": "a spectrum of the frame means: pickup is a line, frame noise is flat",

@@ -40,7 +40,7 @@ _FEWEST = 2
 # share of the pixels guessed at least: what moves no statistic clearly cannot be scaled to what is there
 _LEAST_FRACTION = 0.04
 _PROBABILITIES = (0.01, 0.03, 0.08, 0.2, 0.4)
-# what outlying pixels are compared by, with goodness of fit before, and how far they must stand out
+# what outlying pixels are compared by, with the form of the peaks before, and how far they must stand out
 _PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
 _LIMITS = np.array([4.2, 6.0, 4.2, 4.5, 4.5, 5.0])
 # standard deviations of a correlation in time beyond which a pixel has a slow trap
@@ -68,7 +68,7 @@ class RtsNoise(Effect):
         "behind correlated double sampling)"
     )
     signature: ClassVar[tuple[str, ...]] = (
-        "shape.goodness.cnt", "shape.He4.chi", "shape.He3.chi", "shape.C2.cnt", "tail.low.count",
+        "shape.peaks.cnt", "shape.He4.chi", "shape.He3.chi", "shape.C2.cnt", "tail.low.count",
         "time.block.readout.cnt",
     )  # fmt: skip
     strength: ClassVar[str] = "fraction"
@@ -163,7 +163,7 @@ class RtsNoise(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return steps of several sizes, each with the probability and share that outlying pixels ask for.
 
-        Probability and order are those whose goodness of fit and scores resemble the outlying pixels'; the
+        Probability and order are those whose form of the peaks and scores resemble the outlying pixels'; the
         number of these gives the share.
         """
         found = cls._correlated(evidence)
@@ -262,16 +262,16 @@ class RtsNoise(Effect):
 
 
 def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
-    """Return what outlying pixels are compared by: goodness of fit and some scores of the usable pixels."""
+    """Return what outlying pixels are compared by: form of the peaks and some scores of the usable pixels."""
     usable = evidence.maps.usable
     return [
         np.nan_to_num(values[usable].astype(np.float64))
-        for values in (evidence.goodness, *(evidence.scores[name] for name in _PROFILE))
+        for values in (evidence.peaks, *(evidence.scores[name] for name in _PROFILE))
     ]
 
 
 def _departure(profile: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far a profile departs from none: upwards in goodness and He4, either way in the others."""
+    """Return how far a profile departs from none: upwards in peaks and He4, either way in the others."""
     return np.concatenate([profile[:2], np.abs(profile[2:])])
 
 

@@ -132,14 +132,16 @@ class PixelLaw:
         return float(efficient @ change) / float(deviation)
 
     def goodness(self, change: FloatArray, n_frames: int) -> float:
-        """Return the goodness of fit to expect of samples whose mass is changed, as a normal quantile.
+        """Return how the form of the peaks will fit samples whose mass is changed, as a normal quantile.
 
-        The cube root of chi squared is about normal (Wilson and Hilferty 1931).
+        By groups of codes as wide as the read noise. The cube root of chi squared is about normal (Wilson and
+        Hilferty 1931).
         """
-        expected = self.mass * n_frames
-        grouped = expected >= _FEWEST
+        first = np.arange(0, self.mass.size, max(round(float(self.maps.read_noise_dn[0])), 1))
+        mass, moved = (np.add.reduceat(values, first) for values in (self.mass, change))
+        grouped = mass * n_frames >= _FEWEST
         degrees = max(int(grouped.sum()) - len(_PARAMETERS), 1)
-        excess = n_frames * float((change[grouped] ** 2 / self.mass[grouped]).sum())
+        excess = n_frames * float((moved[grouped] ** 2 / mass[grouped]).sum())
         width = 2.0 / (9.0 * degrees)
         return float((np.cbrt(1.0 + excess / degrees) - (1.0 - width)) / np.sqrt(width))
 

@@ -56,6 +56,7 @@ class ExposureFlicker(Effect):
     )
     strength: ClassVar[str] = "rms"
     power: ClassVar[float] = 2.0
+    attained: ClassVar[tuple[str, ...]] = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
         "exposure_drift": "a longer run: a flicker does not go on in one direction",
         "frame_noise": "covered pixels, or frames without exposure: constant here",

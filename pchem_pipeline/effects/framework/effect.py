@@ -76,6 +76,8 @@ class Effect(Section):
         rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
             of a few pixels do not tell whether they have the effect.
         measured_only: whether it is no hypothesis, but what is measured where all of those have failed.
+        attained: parameters that may well be at a limit: a frequency at half a cycle, a missing code. A fit
+            that drives any other one there has taken another effect for this one.
     """
 
     tag: str
@@ -90,6 +92,7 @@ class Effect(Section):
     untestable: ClassVar[str] = ""
     rough_law: ClassVar[bool] = False
     measured_only: ClassVar[bool] = False
+    attained: ClassVar[tuple[str, ...]] = ()
     region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
     when: When | None = Field(default=None, description="in which frames it acts; null: in all")
 
@@ -163,12 +166,19 @@ class Effect(Section):
         values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
         return type(self).model_validate(values)
 
+    def stuck_words(self) -> str:
+        """Return in words which parameters stand at a limit; empty: none."""
+        return " and ".join(f"its {name} stands at its limit, {v:g}" for name, v in self.at_limits().items())
+
     def at_limits(self) -> dict[str, float]:
-        """Return the parameters that stand at a limit of their field, by name; those at their default not."""
+        """Return the parameters that stand at a limit of their field, by name.
+
+        Not those at their default, nor those of :attr:`attained`.
+        """
         found = {}
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
-            if not isinstance(value, float) or value == field.default:
+            if not isinstance(value, float) or value == field.default or name in self.attained:
                 continue
             if any(
                 value in (getattr(limit, "ge", None), getattr(limit, "le", None)) for limit in field.metadata

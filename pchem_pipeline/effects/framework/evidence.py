@@ -210,6 +210,8 @@ class Evidence:
         scores: standardised efficient score of each of :data:`SCORES`, about N(0, 1) under the PCD with the
             four parameters fitted, NaN in unusable pixels, shape (y, x) each.
         goodness: goodness of fit of each pixel as a standard normal quantile (large: poor), shape (y, x).
+        peaks: the same by groups of codes as wide as the read noise: what is smooth over several codes shows
+            far better.
         tail_low, tail_high: samples of each pixel beyond the support of its PCD (expected: below 1e-2 in the
             whole split), uint32, shape (y, x).
         code: counts per DN over the sensor.
@@ -227,6 +229,7 @@ class Evidence:
     readout_std: NDArray[np.float64]
     scores: Mapping[str, NDArray[np.float32]]
     goodness: NDArray[np.float32]
+    peaks: NDArray[np.float32]
     tail_low: NDArray[np.uint32]
     tail_high: NDArray[np.uint32]
     code: CodeResiduals

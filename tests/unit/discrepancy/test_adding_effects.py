@@ -13,6 +13,7 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, comp
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
+from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -21,17 +22,23 @@ from pchem_pipeline.effects.framework.registry import effect_class
 
 NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
 M = len(NAMES)
-STRENGTHS = {"row_noise": "row_noise_dn", "frame_noise": "frame_noise_dn", "exposure_drift": "drift"}
+STRENGTHS = {
+    "row_noise": "row_noise_dn",
+    "frame_noise": "frame_noise_dn",
+    "exposure_drift": "drift",
+    "interpixel_capacitance": "coupling",
+}
 #: what a unit of each effect (of strength ** power) does to the statistics once the pixels are refitted
 TRUTH = {
     "row_noise": (np.eye(M)[0] * 40.0, 0.6),
     "frame_noise": (np.eye(M)[1] * 40.0, 1.0),
     "exposure_drift": (np.eye(M)[2] * 40.0, 1.0),
+    "interpixel_capacitance": (np.eye(M)[3] * 40.0, 1.0),
 }
 
 
-def effect(tag: str, strength: float) -> Effect:
-    return effect_class(tag).model_validate({"tag": tag, STRENGTHS[tag]: strength})
+def effect(tag: str, strength: float, **more: float) -> Effect:
+    return effect_class(tag).model_validate({"tag": tag, STRENGTHS[tag]: strength, **more})
 
 
 def factor(one: Effect) -> float:
@@ -44,8 +51,8 @@ def statistics(effects: Sequence[Effect]) -> np.ndarray:
     return np.sum(shifts, axis=0) if shifts else np.zeros(M)
 
 
-def hypothesis(tag: str, strength: float = 0.1) -> Hypothesis:
-    one = effect(tag, strength)
+def hypothesis(tag: str, strength: float = 0.1, **more: float) -> Hypothesis:
+    one = effect(tag, strength, **more)
     # what it does to pixels that are not refitted is half as much again
     return Hypothesis(one, 1.5 * statistics([one]))
 
@@ -151,3 +158,19 @@ def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.Mon
     search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=np.zeros(M))
     assert extended is None
     assert search.model == ()
+
+
+@pytest.mark.parametrize(
+    ("anisotropy", "against"), [(-1.0, "its anisotropy stands at its limit, -1"), (-0.9, "")]
+)
+def test_an_effect_that_can_go_no_further_gets_no_name(
+    monkeypatch: pytest.MonkeyPatch, anisotropy: float, against: str
+) -> None:
+    world = World([effect("interpixel_capacitance", 0.1)])
+    guess = hypothesis("interpixel_capacitance", anisotropy=anisotropy)
+    search, extended = add(world, monkeypatch, guess)
+    search.gaps = StatisticsGap(world.null, 100_000)
+    before = search.gap(world.null, world.z)
+    [added] = search.close(before, extended, world.z, False).additions
+    assert added.against == against
+    assert added.named == (not against)

@@ -87,7 +87,7 @@ def test_it_competes_with_nothing_and_refuses_half_a_table() -> None:
 def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() -> None:
     effect = Empirical(share=0.004, shift_dn=(-8.0,), weight=(1.0,))
     before, after = Gap(2e-3, 5e-5, (0.0, 0.0), {}), Gap(3e-5, 5e-5, (0.0, 0.0), {})
-    addition = Addition(effect, True, True, (), 1e-4, before, after, (), None, (), described=True)
+    addition = Addition(effect, True, "", (), 1e-4, before, after, (), None, (), described=True)
     found = Findings(
         "frames",
         None,

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers.plain_camera import PlainCamera
 from helpers.small_stacks import small_stack
 from scipy import special, stats
 
@@ -350,3 +351,23 @@ def test_what_cannot_be_observed_says_why() -> None:
         observe(frames.astype(np.int32), np.arange(100), n_run=100, block_frames=10)  # type: ignore[arg-type]
     with pytest.raises(PchEmError, match="none of the 16 pixels"):
         observe(np.full_like(frames, 90), np.arange(100), n_run=100, block_frames=10)
+
+
+@pytest.mark.parametrize(("noise", "step", "exposure"), [(0.36, 15.0, 1.0), (0.3, 14.0, 1.5)])
+def test_pixels_that_jump_show_in_the_form_of_their_peaks(noise: float, step: float, exposure: float) -> None:
+    """A few pixels jump by an electron in a fifth of the frames, which the fit takes for charge."""
+    camera = PlainCamera(noise, exposure, step, (24, 24), 900)
+    numbers = np.arange(camera.n_frames)
+
+    def seen(frames: np.ndarray) -> Evidence:
+        return observe(frames, numbers, n_run=numbers.size, block_frames=40)
+
+    frames, rng = camera.frames(11), np.random.default_rng(12)
+    clean = seen(frames)
+    assert all(abs(clean.z[f"shape.peaks.{kind}"]) < 4.5 for kind in ("mean", "chi", "cnt"))
+    jumping = rng.random((24, 24)) < 0.06
+    jumps = rng.choice([-1, 0, 1], frames.shape, p=[0.1, 0.8, 0.1]) * jumping
+    found = seen((frames + np.rint(step * jumps)).astype(np.uint16))
+    assert found.z["shape.peaks.cnt"] > max(4.0, 1.4 * found.z["shape.goodness.cnt"])
+    outlying = found.peaks > 3.5
+    assert (jumping[outlying]).mean() > 0.8

@@ -99,7 +99,7 @@ def test_clean_frames_have_no_place_and_no_time() -> None:
 def test_maps_and_series_are_standard_normal_by_chance() -> None:
     evidence = seen()
     maps, series = pixel_maps(evidence), frame_series(evidence)
-    assert len(maps) == 8 + 1 + 3 + 4 + 6
+    assert len(maps) == 8 + 2 + 3 + 4 + 6
     for name, values in (maps | series).items():
         z = values[np.isfinite(values)]
         assert abs(z.mean()) < 5.0 / np.sqrt(z.size) + 0.05, name

@@ -177,3 +177,14 @@ def test_parameters_at_a_limit_are_told_and_defaults_are_not() -> None:
     assert stuck.at_limits() == {"anisotropy": -1.0}
     assert stuck.model_copy(update={"anisotropy": -0.99}).at_limits() == {}
     assert kind.model_validate({"coupling": 0.0}).at_limits() == {"coupling": 0.0}  # its strength, gone
+
+
+def test_limits_that_are_values_like_others_are_not_told() -> None:
+    """Half a cycle per row is a frequency; a missing code is one of no width."""
+    pickup = registry.effect_class("periodic_pickup").model_validate(
+        {"amplitude_dn": 0.3, "cycles_per_row": 0.5}
+    )
+    assert pickup.at_limits() == {}
+    every = [kind for kind in registry.effect_classes().values() if kind.attained]
+    assert every
+    assert all(set(kind.attained) <= set(kind.model_fields) for kind in every)
