@@ -17,20 +17,30 @@ import pickle
 import re
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from filelock import FileLock
 
-__all__ = ["KernelCache", "cache_folder", "listening", "source_state", "values_of_closure"]
+__all__ = [
+    "KernelCache",
+    "cache_folder",
+    "in_any_order",
+    "listening",
+    "source_state",
+    "values_of_closure",
+]
 
 #: Called with the name of a kernel that is missing and None, then with the seconds that it took to have it.
 Listener = Callable[[str, float | None], None]
 _listeners: list[Listener] = []
 
+
+_waiting = threading.local()  # of each thread `.no`: it does not wait for other processes
 
 _PATIENCE = 300  # seconds that another process may take for one kernel
 _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.MULTILINE)
@@ -103,6 +113,28 @@ def listening(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
+class BeingCompiledError(Exception):
+    """Another process is compiling the kernel."""
+
+
+def in_any_order(compilations: Iterable[Callable[[], Any]]) -> None:
+    """Do what compiles kernels; those that another process is compiling meanwhile come last.
+
+    Processes that need the same kernels at the same time share the work so, instead of waiting in turns.
+    """
+    others: list[Callable[[], Any]] = []
+    for compilation in compilations:
+        _waiting.no = True
+        try:
+            compilation()
+        except BeingCompiledError:
+            others.append(compilation)
+        finally:
+            _waiting.no = False
+    for compilation in others:
+        compilation()
+
+
 def values_of_closure(function: Callable[..., Any]) -> tuple[str, ...]:
     """Return in words what a function made by another function was given: numbers, text, kernels."""
     values = [cell.cell_contents for cell in function.__closure__ or ()]
@@ -133,15 +165,21 @@ class KernelCache:
         """Return the kernel for some types, or None where the caller is to compile it.
 
         What another process is compiling is waited for.
+
+        Raises:
+            BeingCompiledError: another process is compiling it, and :func:`in_any_order` has others to do.
         """
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         found = self._read(path, target_context)
         if found is not None:
             return found
+        locked = self._lock(path, 0.0)
+        if not locked and getattr(_waiting, "no", False):
+            raise BeingCompiledError
         self._begun = time.monotonic()
         self._report(None)
-        if self._lock(path):
+        if locked or self._lock(path, _PATIENCE):
             found = self._read(path, target_context)
             if found is not None:
                 self._unlock(path)
@@ -196,11 +234,11 @@ class KernelCache:
             return None
         return CompileResult._rebuild(target_context, *payload)
 
-    def _lock(self, path: Path) -> bool:
+    def _lock(self, path: Path, patience: float) -> bool:
         """Lock a kernel that is to be compiled; return False if that fails or another holds it too long."""
         from filelock import FileLock, Timeout
 
-        lock = FileLock(path.with_suffix(".lock"), timeout=_PATIENCE)
+        lock = FileLock(path.with_suffix(".lock"), timeout=patience)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock.acquire()

@@ -130,7 +130,8 @@ def announced(reporter: Reporter, stage: str) -> Iterator[None]:
     finally:
         reporter.compiling(0.0, 0.0)
     if seconds:
-        reporter.info(f"{stage}: {len(seconds)} kernels compiled in {sum(seconds):.0f} s")
+        done = "one kernel" if len(seconds) == 1 else f"{len(seconds)} kernels"
+        reporter.info(f"{stage}: {done} compiled in {sum(seconds):.0f} s")
         _remember(stage, len(seconds), sum(seconds))
 
 

@@ -1,16 +1,20 @@
 """Compiled kernels on disk: when they are compiled again, by whom, and that nobody gets another's."""
 
+import gc
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
+from filelock import FileLock
 
 import pchem_pipeline
 from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.base.kernel_cache import in_any_order, listening
 from pchem_pipeline.model.electrons import electrons_numba
 
 INNER = """
@@ -105,6 +109,28 @@ def test_a_kernel_is_compiled_by_one_of_two_processes(sample):
     assert [answer.split("] ")[0] for answer in answers] == ["[8, 9, 27", "[8, 9, 27"]
     assert sum(int(answer.split("] ")[1]) for answer in answers) == 3
     assert len(list((sample.parents[1] / "cache").iterdir())) == 3  # no locks are left
+
+
+def test_what_another_process_compiles_comes_last_in_a_list(tmp_path, monkeypatch):
+    @kernel
+    def cubed(x):
+        return x * x * x
+
+    @kernel
+    def squared(x):
+        return x * x
+
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+    types = (numba.int64,)
+    path = cubed._cache._path(types, cubed.targetctx.codegen())
+    other = FileLock(path.with_suffix(".lock"))
+    other.acquire()
+    begun = []
+    with listening(lambda name, seconds: begun.append(name) if seconds is None else None):
+        in_any_order([lambda: cubed.compile(types), lambda: squared.compile(types), other.release])
+    assert begun == ["squared", "cubed"]
+    assert (cubed(3), squared(3), gc.isenabled()) == (27, 9, True)
+    assert len(list(tmp_path.glob("*.nbc"))) == 2
 
 
 def test_where_nothing_can_be_written_kernels_are_compiled_each_time(sample):

@@ -116,7 +116,7 @@ def test_the_terminal_says_what_is_compiled_and_what_is_left(sleeper, capsys, mo
         heard(("one", None), ("one", 1.0))
     assert said()[1:] == [
         "fit: 1 of about 2 kernels compiled in 1 s, about 3 s left",
-        "fit: 1 kernels compiled in 1 s",
+        "fit: one kernel compiled in 1 s",
     ]
     assert known_compilation("fit") == (2, 4.0)
 
