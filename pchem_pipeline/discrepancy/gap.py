@@ -92,7 +92,9 @@ class StatisticsGap:
 
     null: NullModel
     n_samples: int
-    _known: dict[int, dict[str, FloatArray]] = field(default_factory=dict, repr=False, compare=False)
+    _known: dict[int, tuple[FloatArray, dict[str, FloatArray]]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def gap(self, z: FloatArray, mean: FloatArray, replicates: FloatArray) -> Gap:
         """Return the gap of a model.
@@ -127,7 +129,7 @@ class StatisticsGap:
         where that was estimated from it.
         """
         if id(replicates) in self._known:
-            return self._known[id(replicates)]
+            return self._known[id(replicates)][1]
         known = replicates is self.null.replicates
         own: dict[str, list[float]] = {family: [] for family in self._members()}
         for i in range(replicates.shape[0]):
@@ -140,7 +142,8 @@ class StatisticsGap:
                 squared = _squared_distances(apart, covariance[np.ix_(index, index)])
                 own[family].append(0.5 * float(squared[0]))
         found = {family: np.array(values) for family, values in own.items()}
-        self._known[id(replicates)] = found
+        # the vectors are kept with it: an id is given again to what comes after them
+        self._known[id(replicates)] = replicates, found
         return found
 
 

@@ -7,6 +7,7 @@ longer one takes over what is there. Every beginning of the study is balanced.
 
     python scripts/bench/bench_discrepancy.py FOLDER --minutes 30    # as far as it gets, and the figures
     python scripts/bench/bench_discrepancy.py FOLDER --report        # the figures of what is there
+    python scripts/bench/bench_discrepancy.py FOLDER --table --minutes 60    # all rows of the table in turn
     python scripts/bench/bench_discrepancy.py FOLDER --command 3     # the installed command, with its cost
     python scripts/bench/bench_discrepancy.py FOLDER --null-range --minutes 30    # nothing hidden, any sensor
 """
@@ -19,15 +20,16 @@ import multiprocessing
 import sys
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
-from discrepancy_cases import EFFECTS, Case, Plan, remaining
+from discrepancy_cases import EFFECTS, Case, Plan, remaining, table_cases
 from discrepancy_command import run_commands
 from discrepancy_figures import Answer, print_figures
-from discrepancy_null import run_null_range
+from discrepancy_null import MOST_SAMPLES, run_null_range
+from discrepancy_table import print_table
 from discrepancy_worker import run_case
 
 from pchem_pipeline.compute.environment import prepare_environment
@@ -56,8 +58,8 @@ def source_state() -> str:
     return f"{state:08x}"
 
 
-def run_study(cases: list[Case], options: argparse.Namespace, path: Path) -> None:
-    """Run cases in a pool of processes, and keep each result as soon as it is there."""
+def run_study(cases: Iterable[Case], options: argparse.Namespace, path: Path, many: str) -> None:
+    """Run cases in a pool of processes, and keep each result as soon as it is there; ``many`` are there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists() and not path.read_bytes().endswith(b"\n") and path.stat().st_size:
         with path.open("a") as file:
@@ -74,14 +76,14 @@ def run_study(cases: list[Case], options: argparse.Namespace, path: Path) -> Non
             took = f"{record.get('cpu_seconds', 0):.0f} s" if not answer.failed else answer.failed[:80]
             minutes = (time.monotonic() - start) / 60
             print(
-                f"{minutes:6.1f} min {number:5d}/{len(cases)}  {record['case']['key']:60s} {answer.word:12s}"
+                f"{minutes:6.1f} min {number:5d}/{many}  {record['case']['key']:60s} {answer.word:12s}"
                 f" {answer.names}  ({took})",
                 flush=True,
             )
 
 
 def _results(
-    pool: ProcessPoolExecutor, cases: list[Case], options: argparse.Namespace, start: float
+    pool: ProcessPoolExecutor, cases: Iterable[Case], options: argparse.Namespace, start: float
 ) -> Iterator[dict[str, Any]]:
     waiting = iter(cases)
     running: set[Future[dict[str, Any]]] = set()
@@ -90,7 +92,7 @@ def _results(
             case = next(waiting, None)
             if case is None:
                 break
-            bias = not options.no_bias and case.kind == "single"
+            bias = not (options.no_bias or options.table) and case.kind == "single"
             running.add(pool.submit(run_case, case, options.settings, bias))
         if not running:
             return
@@ -138,10 +140,16 @@ def parse() -> argparse.Namespace:
         "--command", type=int, default=0, metavar="N", help="N stacks through the installed command"
     )
     parser.add_argument(
+        "--table",
+        action="store_true",
+        help="a stack for each row of the table of figures in turn, and the table",
+    )
+    parser.add_argument("--sealed-decoys", action="store_true", help="in --table: those of the sealed half")
+    parser.add_argument(
         "--null-range", action="store_true", help="nothing hidden, sensors of the whole range, in one process"
     )
     parser.add_argument(
-        "--most-samples", type=float, default=3e6, help="frames x pixels of a stack of --null-range"
+        "--most-samples", type=float, default=MOST_SAMPLES, help="frames x pixels of a stack of --null-range"
     )
     return parser.parse_args()
 
@@ -159,6 +167,14 @@ def main() -> None:
     if options.command:
         run_commands(options.command, options.first, shape, options.folder, options.processes)
         return
+    if options.table:
+        path = options.folder / "table.jsonl"
+        if not options.report:
+            done = {r["case"]["key"] for r in read_results(path)}
+            cases = table_cases(options.first, shape, sealed=options.sealed_decoys)
+            run_study((case for case in cases if case.key not in done), options, path, "")
+        print_table({r["case"]["key"]: r for r in read_results(path)}.values())
+        return
     names = ("effects", "levels", "seeds", "first", "nulls", "pairs", "triples", "leave_out", "others")
     names += ("decoys", "sealed")
     cases = Plan(**{name: getattr(options, name) for name in names}, shape=shape).cases()
@@ -166,7 +182,7 @@ def main() -> None:
         done = {r["case"]["key"] for r in read_results(path)}
         todo = remaining(cases, done)
         print(f"{len(cases)} stacks, {len(cases) - len(todo)} of them done already")
-        run_study(todo, options, path)
+        run_study(todo, options, path, str(len(todo)))
     # of a stack that was done twice, the last one
     records = {r["case"]["key"]: r for r in read_results(path)}
     states = {r["state"] for r in records.values()}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -57,12 +58,14 @@ class Case:
     """One stack with something hidden, and how to look at it.
 
     Attributes:
-        kind: single, null, untestable, outside, decoy, sealed, pair or left_out.
+        kind: single, null, untestable, outside, decoy, sealed, pair, left_out, placed (in a part of the
+            sensor or run) or range (nothing hidden, a sensor of the whole range).
         hidden: tags.
         level: times the strength that is found in 95 % of stacks.
         index: number of the repetition.
         shape: rows, columns and frames.
         exclude: candidates that the workflow goes without.
+        place: of what is placed: "rows", "columns" or "frames", first and end; None: everywhere.
     """
 
     kind: str
@@ -71,6 +74,7 @@ class Case:
     index: int
     shape: tuple[int, int, int]
     exclude: tuple[str, ...] = ()
+    place: tuple[str, int, int] | None = None
 
     @property
     def key(self) -> str:
@@ -168,6 +172,55 @@ class Plan:
             if number > self.first + 100 * (count + 1):
                 break
         return chosen[:count]
+
+
+#: effects that can be in a part of the sensor, and of the run
+_OF_REGIONS = ("row_noise", "frame_noise", "heavy_tailed_noise", "signal_dependent_noise", "rts_noise",
+               "exposure_flicker", "overdispersed_counts", "noise_skew")  # fmt: skip
+_OF_FRAMES = ("row_noise", "frame_noise", "heavy_tailed_noise", "exposure_flicker")
+
+
+def table_cases(first: int, shape: tuple[int, int, int], *, sealed: bool) -> Iterator[Case]:
+    """Yield stacks without end, one for each row of the table in turn, so that every beginning is balanced.
+
+    Args:
+        first: number of the first round; another one is another table.
+        shape: rows, columns and frames of all but the null range.
+        sealed: take the decoys from the sealed half.
+    """
+    for i in itertools.count(first):
+        share = [byte / 256.0 for byte in _digest(f"table/{i}")]
+        strong = round(4.0 * 7.5 ** share[0], 1)
+        yield Case("range", (), 0.0, i, shape)
+        yield Case("single", (_one_of(EFFECTS, f"single/{i}"),), strong, i, shape)
+        yield _placed(i, shape, round(12.0 * 2.5 ** share[1], 1))
+        yield Case("pair", _together(i), strong, i, shape)
+        decoys = SEALED if sealed else TRIED
+        yield Case("sealed" if sealed else "decoy", (_one_of(decoys, f"decoy/{i}"),), strong, i, shape)
+
+
+def _placed(index: int, shape: tuple[int, int, int], level: float) -> Case:
+    """Return an effect in a tenth of the rows, columns or frames."""
+    axis = _one_of(("rows", "columns", "frames"), f"axis/{index}")
+    tag = _one_of(_OF_FRAMES if axis == "frames" else _OF_REGIONS, f"placed/{index}")
+    size = shape[("rows", "columns", "frames").index(axis)]
+    length = max(round(size / 10), 2)
+    begin = int.from_bytes(_digest(f"begin/{index}"), "little") % (size - length + 1)
+    return Case("placed", (tag,), level, index, shape, place=(axis, begin, begin + length))
+
+
+def _together(index: int) -> tuple[str, ...]:
+    """Return two or three effects, no twins among them."""
+    size = 3 if index % 4 == 3 else 2
+    for attempt in itertools.count():
+        ranked = sorted(EFFECTS, key=lambda tag: _digest(f"{tag}/{index}/{attempt}"))[:size]
+        if not any(set(twins) <= set(ranked) for twins in TWINS):
+            return tuple(ranked)
+    raise AssertionError
+
+
+def _one_of(tags: Sequence[str], text: str) -> str:
+    return tags[int.from_bytes(_digest(text), "little") % len(tags)]
 
 
 def _digest(text: str) -> bytes:

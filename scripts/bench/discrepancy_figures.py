@@ -195,7 +195,7 @@ def _strengths(pairs: Sequence[tuple[Record, Answer]]) -> None:
         "\nStrength of effects named alone, in its standard errors from the truth (those of the same meaning)"
     )
     for level in sorted({a.level for _, a in pairs}):
-        off = [pull for r, a in pairs if a.alone and a.level == level for pull in _pulls(r)]
+        off = [pull for r, a in pairs if a.alone and a.level == level for pull in pulls(r)]
         _share(
             f"single effects, {level:g} s95: within 3 standard errors", off, lambda z: abs(z) < 3, least=0.95
         )
@@ -207,7 +207,7 @@ _SAME_STRENGTH = {
 }  # fmt: skip
 
 
-def _pulls(record: Record) -> list[float]:
+def pulls(record: Record) -> list[float]:
     """Return the deviation of the found strength in standard errors, none where the meanings differ."""
     [hidden], steps = record.get("hidden") or [{"tag": "", "parameters": {}}], record["verdict"]["steps"]
     name = _SAME_STRENGTH.get(hidden["tag"], "")
@@ -242,10 +242,10 @@ def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
         named = [r["verdict"] for r, a in pairs if a.level == level and a.alone]
         every = [r["verdict"] for r, a in pairs if a.level == level and not a.failed]
         for title, group in (("all", every), ("named alone", named)):
-            _share(f"{level:g} s95, {title}: at its floor after", group, _at_floor, least=0.9)
+            _share(f"{level:g} s95, {title}: at its floor after", group, at_floor, least=0.9)
         if named:
             closed = sorted(v["gap"]["closed_fraction"] for v in named)
-            print(f"    closed fraction where named: median {_median(closed):.3f}, lowest {closed[0]:.3f}")
+            print(f"    closed fraction where named: median {median(closed):.3f}, lowest {closed[0]:.3f}")
     strong = [(r["verdict"]["steps"][0], a) for r, a in pairs if a.level == 4.0 and a.alone]
     with_placebo = [(s, a) for s, a in strong if s.get("placebo") and s["gap_before"] > 0]
     apart = [s for s, a in with_placebo if s["placebo"]["effect"] not in twins_of(next(iter(a.hidden)))]
@@ -254,7 +254,7 @@ def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
     )
     if apart:
         shares = sorted(_closed(s, "placebo") for s in apart)
-        print(f"    closed by the placebo: median {_median(shares):.3f}, largest {shares[-1]:.3f}")
+        print(f"    closed by the placebo: median {median(shares):.3f}, largest {shares[-1]:.3f}")
         worst = Counter(s["placebo"]["effect"] for s in apart if _closed(s, "placebo") > 0.25)
         if worst:
             print("    placebos that close more: " + ", ".join(f"{t} x{n}" for t, n in worst.most_common()))
@@ -262,7 +262,8 @@ def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
     _share("4 s95: the right name closes more than the runner-up", rivals, _better_than_runner_up, least=1.0)
 
 
-def _at_floor(verdict: dict[str, Any]) -> bool:
+def at_floor(verdict: dict[str, Any]) -> bool:
+    """Tell whether the gap that a verdict leaves is at its floor."""
     return bool(verdict["gap"]["after"] <= verdict["gap"]["floor"])
 
 
@@ -310,14 +311,15 @@ def _times(records: Sequence[Record]) -> None:
     seconds = sorted(r["cpu_seconds"] for r in records if "cpu_seconds" in r)
     if seconds:
         stacks = sorted(r["verdict"]["replicates"] for r in records if r.get("verdict"))
-        print(f"\nCPU seconds a stack: median {_median(seconds):.0f}, longest {seconds[-1]:.0f}", end="")
-        print(f"; simulated stacks: median {_median(stacks):g}, most {stacks[-1]}")
+        print(f"\nCPU seconds a stack: median {median(seconds):.0f}, longest {seconds[-1]:.0f}", end="")
+        print(f"; simulated stacks: median {median(stacks):g}, most {stacks[-1]}")
     errors = [r.get(kind) for r in records for kind in ("error", "bias_error")]
     failed = Counter(error[:110] for error in errors if error)
     for error, n in failed.most_common(8):
         print(f"failed x{n}: {error}")
 
 
-def _median(values: Sequence[float]) -> float:
+def median(values: Sequence[float]) -> float:
+    """Return the median of increasing values."""
     n = len(values)
     return (values[n // 2] + values[(n - 1) // 2]) / 2

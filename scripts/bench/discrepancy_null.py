@@ -18,7 +18,8 @@ import numpy as np
 from discrepancy_figures import wilson
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-_RIGHT = ("consistent", "cannot_tell")
+RIGHT = ("consistent", "cannot_tell")
+MOST_SAMPLES = 3e6  # frames x pixels of a stack
 
 
 def run_null_range(path: Path, first: int, minutes: float, most_samples: float) -> None:
@@ -37,7 +38,7 @@ def run_null_range(path: Path, first: int, minutes: float, most_samples: float) 
     with path.open("a") as file:
         while time.monotonic() - start < 60.0 * minutes:
             if seed not in done:
-                records.append(_one(seed, most_samples))
+                records.append(one_of_range(seed, most_samples))
                 file.write(json.dumps(records[-1]) + "\n")
                 file.flush()
                 print(_line(records[-1]), flush=True)
@@ -52,7 +53,7 @@ def print_null_range(records: list[dict[str, Any]]) -> None:
         f"\nNothing hidden, {len(records)} sensors: " + ", ".join(f"{w} {n}" for w, n in words.most_common())
     )
     judged = [r for r in records if r["verdict"] != "refused"]
-    alarms = sum(r["verdict"] not in _RIGHT for r in judged)
+    alarms = sum(r["verdict"] not in RIGHT for r in judged)
     low, high = (100 * end for end in wilson(alarms, len(judged)))
     share = 100 * alarms / max(len(judged), 1)
     interval = f"[{low:.1f}, {high:.1f}]"
@@ -61,7 +62,20 @@ def print_null_range(records: list[dict[str, Any]]) -> None:
     print(f"CPU: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s")
 
 
-def _one(seed: int, most_samples: float) -> dict[str, Any]:
+def null_of_range(seed: int, most_samples: float = MOST_SAMPLES) -> dict[str, Any]:
+    """Return verdict, cost and error of a stack with nothing hidden, as other records have them."""
+    found = one_of_range(seed, most_samples)
+    failed = found["why"] if found["verdict"] == "error" else None
+    return {
+        "verdict": {"verdict": found["verdict"], "effects": found.get("effects", ()), "replicates": 0},
+        "sensor": found,
+        "cpu_seconds": found["cpu_seconds"],
+        "error": failed,
+    }
+
+
+def one_of_range(seed: int, most_samples: float) -> dict[str, Any]:
+    """Look for discrepancies in a stack of a random sensor in which nothing is hidden."""
     from helpers.plain_camera import drawn_camera
 
     from pchem_pipeline.base.errors import InputError, PchEmError

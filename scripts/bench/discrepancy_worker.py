@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from discrepancy_cases import Case
+from discrepancy_null import null_of_range
 from numpy.typing import NDArray
 
 MAKE = Path(__file__).resolve().parents[2] / "tests" / "hidden" / "make.py"
@@ -26,8 +27,12 @@ def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, 
     with tempfile.TemporaryDirectory(prefix="hidden-") as folder:
         try:
             stack, key = Path(folder) / "stack", Path(folder) / "sealed" / "key.json"
+            if case.kind == "range":
+                return record | null_of_range(case.index)
             make(case.hidden, case.level, case.seed, case.shape, stack, key)
             frames = np.load(stack / "frames.npy")
+            if case.place is not None:
+                frames = _in_place(case, frames, Path(folder))
             record |= _look(case, frames, options)
             # only now is the key opened
             record["hidden"] = json.loads(key.read_text())["effects"]
@@ -51,6 +56,18 @@ def make(
     command += ["--seed", str(seed), "--out", str(out), "--key", str(key), "--frames", str(shape[2])]
     command += ["--shape", str(shape[0]), str(shape[1])]
     subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ)
+
+
+def _in_place(case: Case, frames: NDArray[np.uint16], folder: Path) -> NDArray[np.uint16]:
+    """Return the stack with the effect in its place, and the same stack without it elsewhere."""
+    assert case.place is not None
+    axis, begin, end = case.place
+    make((), case.level, case.seed, case.shape, folder / "twin", folder / "twin" / "key.json")
+    placed = np.load(folder / "twin" / "frames.npy")
+    index = [slice(None)] * 3
+    index[("frames", "rows", "columns").index(axis)] = slice(begin, end)
+    placed[tuple(index)] = frames[tuple(index)]
+    return placed
 
 
 def _look(case: Case, frames: NDArray[np.uint16], options: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, error_words
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, SetFit, fit_set
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    PRICE_OF_MORE,
+    Hypothesis,
+    Noise,
+    SetFit,
+    fit_set,
+    log_density,
+)
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -32,6 +39,8 @@ _log = logging.getLogger(__name__)
 _MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
+# nats behind the best, and share of what that explains, from which on an effect is not worth more by itself
+_FAR, _FAR_SHARE = 40.0, 0.5
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 _LARGEST_STEP = 30.0
 REPEATS = 3  # simulations of the hypotheses that sets are made of
@@ -186,11 +195,23 @@ class ReplicateSimulator:
     def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
         """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
 
-        Those are simulated several times in the end.
+        Those are simulated several times in the end. One that is far behind the best by itself, and beside
+        it brings nothing, is left as it is.
         """
         fits = [fit_set([h], shift, noise) for h in hypotheses]
-        order = np.argsort([-fit.log_score(shift, noise) for fit in fits], kind="stable")
-        chosen = [int(i) for i in order[:_REFINED] if fits[i].factors[0] > 0.0]
+        scores = np.array([fit.log_score(shift, noise) for fit in fits])
+        order = np.argsort(-scores, kind="stable")
+        near = scores.max() - _FAR - _FAR_SHARE * (scores.max() - log_density(shift, noise.covariance))
+        best = hypotheses[int(order[0])]
+
+        def promising(i: int) -> bool:
+            if scores[i] >= near:
+                return True
+            pair = fit_set([best, hypotheses[i]], shift, noise)
+            helps = pair.log_score(shift, noise) > scores.max() + PRICE_OF_MORE / 2.0
+            return bool(helps) and hypotheses[i].tag != best.tag
+
+        chosen = [int(i) for i in order if fits[i].factors[0] > 0.0 and promising(int(i))][:_REFINED]
         tuned = self.tuned([(hypotheses[i],) for i in chosen], shift, noise, steps=2, close=_CLOSE)
         sharp = {id(h.effect): h for h in self.fingerprints([one.effect for (one,) in tuned], REPEATS)}
         better = {i: sharp.get(id(one.effect), one) for i, (one,) in zip(chosen, tuned, strict=True)}
