@@ -448,7 +448,9 @@ def _best_frames(
     if contrast is None:
         return None
     families = [_frame_range(contrast), _frame_period(contrast, numbers), _single(values, some)]
-    there = [each for each in families if each is not None]
+    there = [each for each in families if each is not None and each.mask.any()]
+    if not there:
+        return None
     best = min(there, key=lambda each: each.log_p)
     log_p = best.log_p + math.log(len(families))
     at = np.flatnonzero(best.mask)
@@ -462,13 +464,15 @@ def _best_frames(
     return when, _Found(best.family, best.mask, best.z, log_p)
 
 
-def _frame_range(contrast: _Contrast) -> _Found:
-    """Return the best range of frames: of whole cells, then its ends moved by frames."""
+def _frame_range(contrast: _Contrast) -> _Found | None:
+    """Return the best range of frames: of whole cells, then its ends moved by frames; None: all too short."""
     n = contrast.values.size
     total, number = (np.concatenate([[0.0], np.cumsum(v)]) for v in (contrast.values, contrast.some))
     edges = np.unique(np.linspace(0, n, min(_STRETCHES, n) + 1).astype(int))
     z, a, b = _intervals(contrast, np.diff(total[edges]), np.diff(number[edges]))
     first, last = int(edges[a]), int(edges[b])
+    if last <= first:
+        return None
     near = int(np.ceil(n / _STRETCHES)) + 1
     for _ in range(2):
         starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)

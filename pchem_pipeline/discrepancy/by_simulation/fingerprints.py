@@ -207,7 +207,9 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
         design = linalg.solve_triangular(factor, columns, lower=True)
         target = linalg.solve_triangular(factor, shift, lower=True)
         factors, _ = optimize.nnls(design, target)
-        stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
+        variance = np.diag(np.linalg.pinv(design.T @ design))
+        # where effects do the same, rounding may leave less than nothing of what separates them
+        stderr = np.sqrt(np.where(variance > 0.0, variance, np.inf))
     counted = (columns.T * factors[:, None] * noise.events > 0.0) & (shift > 0.0)
     return SetFit(tuple(hypotheses), factors, stderr, np.asarray(counted.any(axis=1)))
 

@@ -114,6 +114,15 @@ def test_frames_are_found(chosen: Any, family: str) -> None:
     assert (seen & wanted).sum() / (seen | wanted).sum() > 0.9
 
 
+def test_a_series_too_short_for_two_stretches_is_looked_at_all_the_same() -> None:
+    rng = np.random.default_rng(1)
+    for n in (40, 90, 150):
+        values = rng.standard_normal(n)
+        values[10:20] += 6.0
+        for stretch in scan_series(values, np.arange(n), significance=0.5, most=4, shortest=n // 2 + 1):
+            assert stretch.when.frames(np.arange(n)).any()
+
+
 def test_a_series_that_scatters_more_for_a_while_has_no_mean_that_is_off() -> None:
     rng = np.random.default_rng(8)
     for _ in range(20):
