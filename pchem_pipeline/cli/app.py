@@ -155,7 +155,7 @@ def run(
 
 
 @app.command()
-@takes_command(without=("tiles", "roi", "max_memory"))
+@takes_command(without=("tiles", "roi"))
 def discrepancy(
     target: Target,
     refit: Annotated[
@@ -189,7 +189,7 @@ def discrepancy(
 
 
 @app.command()
-@takes_command(without=("roi", "max_memory"))
+@takes_command(without=("roi",))
 def joint(
     targets: Annotated[
         list[Path], typer.Argument(help="a joint.yaml, or the runs (YAML or store) in order of exposure")

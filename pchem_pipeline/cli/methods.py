@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["methods"]
 
 
-@takes_command(without=("tiles", "roi", "max_memory"))
+@takes_command(without=("tiles", "roi"))
 def methods(
     target: Target,
     with_runs: Annotated[

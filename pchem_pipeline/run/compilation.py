@@ -25,6 +25,8 @@ from pchem_pipeline.store.files import write_atomic
 __all__ = ["announced", "compilation_lines", "compiled_ahead", "known_compilation", "mark_path"]
 
 _PAUSE = 5.0  # seconds between lines
+#: of this process while it compiles kernels
+_COMPILING_BYTES = 490 << 20
 #: Kernels of a stage and seconds that they take, before anything is known of this machine.
 _GUESS = {"ingest": (7, 6.0), "fit": (8, 40.0), "ensemble": (3, 8.0), "report": (1, 2.0)}
 
@@ -99,10 +101,15 @@ def mark_path(config: RunConfig, stages: Sequence[str]) -> Path:
 
 
 @contextlib.contextmanager
-def announced(reporter: Reporter, stage: str) -> Iterator[None]:
+def announced(reporter: Reporter, stage: str, limit: int | None = None) -> Iterator[None]:
     """Say when a stage compiles kernels, or waits for the second process: how many, how long, what is left.
 
     What is left is what the stage took the last time that it compiled on this machine.
+
+    Args:
+        reporter: is told.
+        stage: its name.
+        limit: memory that the run may take, MiB: where compiling takes more, that is a warning.
     """
     seconds: list[float] = []
     number, total = known_compilation(stage)
@@ -120,6 +127,11 @@ def announced(reporter: Reporter, stage: str) -> Iterator[None]:
             reporter.info(
                 f"{stage}: compiling kernels{about}, once after an installation or a change of them"
             )
+            if limit is not None and limit << 20 < _COMPILING_BYTES:
+                reporter.warning(
+                    f"{stage}: compiling takes up to {_COMPILING_BYTES >> 20} MiB, more than "
+                    f"compute.max_memory (--max-memory) allows ({limit}); what comes after it keeps to that"
+                )
         share = min(sum(seconds) / total, 1.0) if total else None
         reporter.compiling(sum(seconds), max(total - sum(seconds), 0.0))
         reporter.event("compiling", stage=stage, kernel=kernel, seconds=took, share=share)

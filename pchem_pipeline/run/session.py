@@ -123,7 +123,7 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
     """Bring a stage up to date; with those after it, where one pass does the work of all."""
     single_pass = STAGES[name].single_pass
     of_files = not context.config.input.samples
-    with announced(context.reporter, name):
+    with announced(context.reporter, name, context.config.compute.max_memory):
         if of_files and single_pass is not None and set(single_pass.stages) <= set(stages):
             imported(single_pass.run)(context)
         return execute(name, context)

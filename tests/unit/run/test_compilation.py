@@ -109,6 +109,12 @@ def test_the_terminal_says_what_is_compiled_and_what_is_left(sleeper, capsys, mo
         f"fit: compiling kernels (about {guess:.0f} s), once after an installation or a change of them",
         "fit: 2 kernels compiled in 4 s",
     ]
+    with announced(Reporter("off"), "maps", 400):
+        heard(("one", None), ("one", 1.0))
+    assert "490 MiB, more than compute.max_memory (--max-memory) allows (400)" in said()[1]
+    with announced(Reporter("off"), "maps", 600):
+        heard(("one", None), ("one", 1.0))
+    assert len(said()) == 2
     # the next time this is known, and told on the way; a part alone is no new knowledge
     monkeypatch.setattr(compilation, "_PAUSE", -1.0)
     assert known_compilation("fit") == (2, 4.0)
