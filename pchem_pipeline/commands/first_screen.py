@@ -115,10 +115,8 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
 
 
 def _one_line(answer: Mapping[str, Any]) -> str:
-    """Return question and answer, with the first of its reasons."""
-    return (
-        f"{answer['question']} {answer['word']}: {answer['text'].split(': ')[0].split('. ')[0].rstrip('.')}."
-    )
+    """Return question and answer, with the first sentence of its reasons."""
+    return f"{answer['question']} {answer['word']}: {answer['text'].split('. ')[0].rstrip('.')}."
 
 
 def _wrapped(text: str, indent: str, first: str | None = None) -> list[str]:

@@ -48,7 +48,10 @@ def find_joint(
     samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, path.parent)} for each in runs]
     for sample in samples[len(targets) :]:
         sample["bias"] = True
-    content = {"run": {"store": str(place) if remote else place.name}, "input": {"samples": samples}}
+    given: dict[str, Any] = {"samples": samples}
+    if len(targets) == 1:
+        given["against"] = "none"  # a line needs two exposures
+    content = {"run": {"store": str(place) if remote else place.name}, "input": given}
     config = make_config(content, "the command line")
     for each in runs:
         find_run(each)

@@ -46,10 +46,11 @@ class FrameSequence(FrameReader):
         self._ends = np.cumsum([reader.shape[0] for reader in readers]).tolist()
         total = self._ends[-1] if self._ends else 0
         if total < least:
+            shape = f" of {readers[0].shape[1]} x {readers[0].shape[2]} pixels" if readers else ""
             raise InputError(
-                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)} in all; at least {least} needed, "
-                "and some "
-                "thousands for useful estimates; add frames to input.files"
+                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)}{shape} in all; at least {least} "
+                "needed, and some thousands for useful estimates; add frames to input.files (a stack has the "
+                "axes frame, row, column)"
             )
         self._first, end = _frame_range(settings, total, least)
         rows, columns = readers[0].shape[1:]

@@ -54,6 +54,10 @@ CHANNELS = ("charge", "readout")
 PARTS = ("pixels", "maps", "charge_rate", "ensemble", "nuced", "electrons", "components", "truth", "methods")
 
 
+#: Codes from which their distance is known.
+_FEWEST_CODES = 8
+
+
 @dataclass(frozen=True)
 class PixelFit:
     """Histogram and fit of one shown pixel.
@@ -279,6 +283,13 @@ class ReportData:
         """Tell whether more pixels are flagged than the criteria allow: the others are a selection."""
         limit = self.criteria.flagged_pixels
         return self.flagged_share > (0.1 if limit is None else limit)
+
+    @property
+    def code_step(self) -> int:
+        """Distance in DN at which codes occur in the whole sensor: 1, or 4 if left-justified by 2 bits."""
+        dn, counts = (self.ensemble.get(name) for name in ("dn", "counts"))
+        seen = np.empty(0) if dn is None or counts is None else dn[counts > 0]
+        return int(np.gcd.reduce(np.diff(seen).astype(np.int64))) if seen.size >= _FEWEST_CODES else 1
 
     def has_values(self, name: str) -> bool:
         """Tell whether a map exists and at least one pixel has a value in it."""

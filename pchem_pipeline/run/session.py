@@ -238,13 +238,14 @@ def _reading_context(target: Target, reporter: Reporter, options: Options) -> St
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:
     """Raise an error if more pixels have no value than the configuration allows."""
-    from pchem_pipeline.model.fit.status import FAILED
+    from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
     words = context.store.read(name)
     failed = int(((words & int(FAILED)) != 0).sum())
     allowed = context.config.run.allowed_failed_pixels
     if failed > allowed * words.size:
+        reasons = [(int(((words & int(bit)) != 0).sum()), MEANINGS[bit]) for bit in FAILED]
         raise IncompleteRunError(
             f"{failed} of {words.size} pixels have no value, above run.allowed_failed_pixels ({allowed:g}); "
-            "the report lists the reasons"
+            f"the commonest reason: {max(reasons)[1]}"
         )

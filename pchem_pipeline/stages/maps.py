@@ -30,7 +30,9 @@ __all__ = ["maps_tile", "run"]
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 #: of the arrays of a tile that are read and made
 _PIXEL_BYTES = 80 * 8
-_NO_TIME = "integration time is not known: no charge rate; give input.integration_time, s"
+_NO_TIME = (
+    "integration time is not known: no charge rate; give --integration-time (input.integration_time), s"
+)
 
 
 def maps_tile(

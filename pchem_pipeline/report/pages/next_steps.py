@@ -8,6 +8,7 @@ import numpy as np
 
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.criteria import map_summary
 
 #: Stands for the run in a command.
 RUN = "RUN"
@@ -31,6 +32,20 @@ def next_steps(data: ReportData) -> list[Step]:
     """Return what to do next; the first is the one to begin with."""
     if any(stage.get("state") not in (None, "complete") for stage in data.stages) or data.unfitted.any():
         return [Step(f"pchem run {RUN}", "finish the run: a part of it is missing")]
+    step, status = data.code_step, data.fit.get("fit_status")
+    if step > 1 and not step & (step - 1):
+        why = (
+            f"with input.bit_shift: {step.bit_length() - 1} in the YAML, which undoes the left justification"
+        )
+        return [Step(f"pchem run {RUN}", why)]
+    if status is not None and ((status & data.failed_mask) != 0).all():
+        return [
+            Step(
+                f"pchem joint EXPOSED.yaml --bias {RUN} --store joint.zarr",
+                "if these frames hold no electrons by design: fit them together with frames that do",
+            ),
+            Step(f"pchem view {RUN}", "look at the histograms"),
+        ]
     found = []
     if data.often_flagged and data.samples is None:
         found += [
@@ -40,7 +55,7 @@ def next_steps(data: ReportData) -> list[Step]:
                 "leaves open",
             ),
             Step(
-                "pchem plan --read-noise 0.6 --samples 0,2,8 --target conversion_gain=1%",
+                f"pchem plan --read-noise {_read_noise(data)} --samples 0,2,8 --target conversion_gain=1%",
                 "how many frames of which exposures are enough, at the read noise that you expect",
             ),
         ]
@@ -53,6 +68,13 @@ def next_steps(data: ReportData) -> list[Step]:
     if not found:
         found.append(Step(f"pchem view {RUN}", "look at every pixel in the browser"))
     return found
+
+
+def _read_noise(data: ReportData) -> str:
+    """Return the read noise to plan for, e-: the median's, or where most pixels are open a guess above it."""
+    if data.mostly_flagged or not data.has_values("read_noise_e"):
+        return "0.6"
+    return f"{map_summary(data, 'read_noise_e').median:.2g}"
 
 
 def _coarse(data: ReportData) -> bool:

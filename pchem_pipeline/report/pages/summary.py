@@ -187,6 +187,22 @@ def _reasons(data: ReportData) -> str:
     return "".join(f"{'; ' if i else '. Why: '}{text} ({n:,})" for i, (_, text, n) in enumerate(rows))
 
 
+def _spaced_codes(data: ReportData) -> list[Flag]:
+    """Say where only every n-th DN occurs: the samples are no plain output of an ADC."""
+    step = data.code_step
+    if step < 2:
+        return []
+    text = (
+        f"Only every {step}th DN occurs"
+        if step > 3
+        else f"Only every {('second', 'third')[step - 2]} DN occurs"
+    )
+    if step & (step - 1):
+        return [Flag("serious", f"{text}: the values were multiplied after the ADC; raw ones are needed.")]
+    shift = step.bit_length() - 1
+    return [Flag("serious", f"{text}: left-justified samples, it seems; set input.bit_shift: {shift}.")]
+
+
 def _unfitted(data: ReportData) -> list[Flag]:
     missing = int(data.unfitted.sum())
     if not missing:
@@ -353,8 +369,8 @@ def _model(data: ReportData, article: str = "The") -> str:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
-    _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _quick_look, _discrepancy,
-    _conditions,
+    _spaced_codes, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _quick_look,
+    _discrepancy, _conditions,
 )  # fmt: skip
 
 
@@ -390,7 +406,7 @@ def _sensor(data: ReportData) -> Answer:
     question = f"Is this {'set of channels' if data.shape[0] == 1 else 'sensor'} all right?"
     pixels = pixel_counts(data)
     if pixels.fitted == 0:
-        return Answer(question, "serious", "Not known", f"No {data.noun} could be fitted.")
+        return Answer(question, "serious", "Not known", f"No {data.noun} could be fitted{_reasons(data)}.")
     judged = tuple(criteria(data))
     if data.mostly_flagged:
         kept = tuple(each for each in judged if each.setting in ("failed_pixels", "flagged_pixels"))
@@ -423,7 +439,7 @@ def _value_share(data: ReportData) -> str:
 def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     question = "Can I believe these results?"
     if pixel_counts(data).fitted == 0:
-        return Answer(question, "serious", "There are none", "The table of fit status says why.")
+        return Answer(question, "serious", "There are none", f"No {data.noun} has a value.")
     about = [flag for flag in remarks if flag.about == "results"]
     serious = [flag for flag in about if flag.level == "serious"]
     cautions = [flag for flag in about if flag.level == "caution"]

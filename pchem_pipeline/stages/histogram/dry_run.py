@@ -14,12 +14,14 @@ from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
+from pchem_pipeline.run.compilation import mark_path
 from pchem_pipeline.stages.histogram.memory import (
     allowed_bytes,
     band_bytes,
     single_pass_bytes,
     worker_count,
 )
+from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ _COPY_RATIO = 1.77
 #: CPU seconds for each pixel of ensemble and report, and for what does not depend on them
 _REST_SECONDS, _REST_PIXEL_SECONDS = 6.0, 6e-5
 _FIT_SAMPLE = 256
+#: Seconds to count a sample and to fit a pixel, where the kernels are still to be compiled: a guess
+_USUAL_SPEEDS = (4e-9, 2e-4)
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,8 @@ class Plan:
         n, ny, nx = self.shape
         how = "once" if self.single_pass else "twice, by bands of rows (more compute.max_memory: once)"
         return [
-            f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tiles of {self.tile[0]} x {self.tile[1]}, "
+            f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tile{'s' * (self.tiles > 1)} of "
+            f"{min(self.tile[0], ny)} x {min(self.tile[1], nx)}, "
             f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
             f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files {how}: "
             f"{self.read_bytes / 1e9:.3g} GB in all; writes about {self.written_bytes / 1e9:.2g} GB",
@@ -126,7 +131,9 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     ensemble = n if config.ensemble.frames == "all" else min(config.ensemble.frames, n)
     again = ensemble / n + (0 if single_pass else 1 + first)
     copies = config.input.mode == "copy"
-    counting, fitting = _speeds(config, sample, bins, n)
+    ahead = [name for name in pipeline_of(config) if STAGES[name].compiled_ahead]
+    compiled = mark_path(config, ahead).exists()
+    counting, fitting = _speeds(config, sample, bins, n) if compiled else _USUAL_SPEEDS
     samples = n * ny * nx
     seconds = max(samples * reading, samples * (reading + counting) / workers)
     seconds += (fitting * ny * nx + _REST_SECONDS + _REST_PIXEL_SECONDS * ny * nx) / workers

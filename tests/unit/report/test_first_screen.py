@@ -53,6 +53,30 @@ def test_just_below_half_is_a_caution_and_says_that_the_rest_is_a_selection() ->
 
 
 @pytest.mark.parametrize(
+    ("step", "words"), [(4, "input.bit_shift: 2"), (3, "multiplied after the ADC"), (1, "")]
+)
+def test_codes_that_never_occur_are_told_first(step: int, words: str) -> None:
+    data = report_data((8, 8), failed=0.0)
+    dn = np.arange(400, 480)
+    ensemble = {**data.ensemble, "dn": dn, "counts": np.where(dn % step == 0, 10, 0)}
+    text = answers(replace(data, ensemble=ensemble))[1].text
+    assert words in text
+    assert text.startswith("Only every") == (step > 1)
+    steps = next_steps(replace(data, ensemble=ensemble))
+    assert ("bit_shift" in steps[0].why) == (step == 4)
+
+
+def test_frames_without_electrons_are_a_bias_for_others() -> None:
+    data = report_data((8, 8), failed=0.0)
+    status = np.full((8, 8), int(FitStatus.GAIN_NOT_IDENTIFIED), np.uint16)
+    dark = replace(data, fit={**data.fit, "fit_status": status})
+    assert "one Gaussian fits as well" in answers(dark)[0].text
+    assert (
+        next_steps(dark)[0].of("dark.yaml") == "pchem joint EXPOSED.yaml --bias dark.yaml --store joint.zarr"
+    )
+
+
+@pytest.mark.parametrize(
     ("bit", "left_out"),
     [
         (FitStatus.BIAS_AMBIGUOUS, True),

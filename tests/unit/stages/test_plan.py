@@ -12,6 +12,7 @@ import pytest
 
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.stages.histogram import dry_run
 from pchem_pipeline.stages.histogram.dry_run import make_plan
 from pchem_pipeline.stages.histogram.memory import (
     allowed_bytes,
@@ -98,6 +99,14 @@ def test_the_plan_in_words(camera):
     assert "2000 MiB are allowed" in text
     less = config.model_copy(update={"compute": config.compute.model_copy(update={"max_memory": 64})})
     assert "twice, by bands of rows" in "\n".join(make_plan(less, path.parent).words())
+
+
+def test_a_plan_compiles_nothing_that_is_missing(camera, monkeypatch, tmp_path):
+    path = camera(256)
+    config = RunConfig.model_validate(json.loads(path.read_text()))
+    monkeypatch.setattr(dry_run, "mark_path", lambda config, stages: tmp_path / "missing")
+    monkeypatch.setattr(dry_run, "_speeds", None)
+    assert make_plan(config, path.parent).seconds > 0
 
 
 def test_the_limit_is_shared_by_the_workers():
