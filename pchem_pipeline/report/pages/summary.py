@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -399,7 +399,11 @@ class Answer:
 
 def answers(data: ReportData) -> tuple[Answer, Answer]:
     """Answer 'is this sensor all right' and 'can I believe it' from the maps and the remarks."""
-    return _sensor(data), _belief(data, flags(data))
+    sensor, belief = _sensor(data), _belief(data, flags(data))
+    if belief.level == "serious" and sensor.level == "good":
+        text = f"{sensor.text.rstrip('.')}, by results that are not to be believed as they are."
+        sensor = replace(sensor, level="caution", word="Not known", text=text)
+    return sensor, belief
 
 
 def _sensor(data: ReportData) -> Answer:
