@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.effects.framework.compose import effect_words
+from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.report.pages.discrepancy import parameter_texts
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def _place(found: Verdict, hidden: Effect) -> list[str]:
 
 def unnamed(found: Verdict) -> str:
     """Return in words whether a verdict on frames with an effect outside the library is right."""
-    names = [tag for tag in found.effects if tag != "empirical"]
+    names = [tag for tag in found.effects if not effect_class(tag).measured_only]
     if names:
         return f"wrongly named: {', '.join(names)}"
     return {

@@ -7,7 +7,9 @@ anything; what it does not show at all is not named.
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -26,6 +28,11 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
 )
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, leaves_nothing
 from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
+from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
+    Covariances,
+    measured_noise,
+    residual_covariances,
+)
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
@@ -43,13 +50,18 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate, by_part
+from pchem_pipeline.discrepancy.by_simulation.replicate import (
+    Acquisition,
+    Replicate,
+    by_part,
+    simulate_frames,
+)
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT
-from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.observe import fitted_maps, observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
@@ -64,6 +76,8 @@ __all__ = ["FrameExplainer", "FrameStack", "find_discrepancies"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+#: Measures a part of the frames, the pixels fitted with some effects, beside some of these.
+Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Effect | None]
 
 _FEWEST_PIXELS = 32
 _BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
@@ -74,7 +88,7 @@ _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no s
 # than a single one would by chance
 _ESTABLISHED = 4.5
 _DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
-_MEASUREMENTS = 2  # of its shifts: the pixels are refitted with the first ones
+_MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
 
 
@@ -378,11 +392,12 @@ class FrameExplainer:
         return None
 
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
-        """Measure what no effect explains as shifts of the samples, and put it into the model.
+        """Measure what no effect explains as shifts or as noise of the samples, and put it into the model.
 
         Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
         First without the effects that were added, since one that merely mimics has no place beside it; with
-        them where that does not close the gap. None where it closes less than half of what is left.
+        them where that does not close the gap. Noise only with them: it could be any common mode that has a
+        name. None where it closes less than half of what is left.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -391,26 +406,24 @@ class FrameExplainer:
         if left.at_floor:
             return None
         self.effort.release()
-        rounds, model = self.rounds, self.model
+        rounds = self.rounds
         held = tuple(h for this in rounds for h in this.added.hypotheses)
         for kept in [(), held] if held else [()]:
-            found: Refitted | None = None
-            for part in (Part(), *self.frames.parts):
-                one = self._described(z, kept, part)
-                if one is not None and (found is None or one.score > found.score):
-                    found = one
-                if found is not None and leaves_nothing(self._refitter(z, held), found):
-                    break
+            found = self._measured(z, kept, with_noise=kept == held)
             if found is None:
                 continue
             gap = self.gaps.gap(z.final, found.mean, found.vectors)
             if gap.at_floor or gap.value < _DESCRIBED * (
                 left.value if kept else min(left.value, before.value)
             ):
-                self.rounds = [*rounds] if kept else []
-                tags = {h.tag for h in held} - found.tags
-                self.model = tuple(e for e in model if e.tag not in tags)
-                return self._put(Comparison(found, (found,)), found, (), null if kept else self.first)
+                gone = {h.tag for h in held} - found.tags
+                self.model = tuple(e for e in self.model if e.tag not in gone)
+                changed = [
+                    i for i, this in enumerate(rounds) if gone & {h.tag for h in this.added.hypotheses}
+                ]
+                self.rounds = rounds[: min(changed, default=len(rounds))] if kept else []
+                last = self.rounds[-1].extended if self.rounds else self.first
+                return self._put(Comparison(found, (found,)), found, (), last)
         return None
 
     def tolerance(self) -> FloatArray | float:
@@ -517,20 +530,50 @@ class FrameExplainer:
         events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
         return Noise(covariance, self.settings.model_error, events)
 
-    def _described(self, z: Measured, kept: tuple[Hypothesis, ...], part: Part) -> Refitted | None:
-        """Return effects with shifts measured in a part beside them at their best fit, or None."""
+    def _measured(self, z: Measured, kept: tuple[Hypothesis, ...], with_noise: bool) -> Refitted | None:
+        """Return effects with what is best measured beside them, and with the other form beside both.
+
+        Parts are looked at where what is everywhere leaves something.
+        """
         refitter = self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses))
-        effects, window = tuple(h.effect for h in kept), self.frames.window
-        inside = (window or SensorWindow.whole(self.frames.stack.shape)).mask(part.region)
-        seen = self.frames.stack[self.frames.seen][part.frames(self.frames.numbers[self.frames.seen])]
-        measured: Effect | None = None
+        forms: dict[str, Measure] = {"shifts": self._shifts}
+        if with_noise:
+            forms["noise"] = functools.partial(self._noise_of_samples, {})
+        found: Refitted | None = None
+        while forms and not (found is not None and leaves_nothing(refitter, found)):
+            beside, better, score = kept, "", -np.inf
+            if found is not None:
+                beside, score = found.hypotheses, found.score + _CONVINCING
+            for part, form in itertools.product((Part(), *self.frames.parts), tuple(forms)):
+                if part != Part() and found is not None and leaves_nothing(refitter, found):
+                    break
+                try:
+                    one = self._described(z, refitter, beside, part, forms[form])
+                except EffortSpentError:
+                    if found is None:
+                        raise
+                    return found
+                if one is not None and one.score > score:
+                    found, better, score = one, form, one.score
+            if not better:
+                break
+            del forms[better]
+        return found
+
+    def _described(
+        self, z: Measured, refitter: Refitter, kept: tuple[Hypothesis, ...], part: Part, measure: Measure
+    ) -> Refitted | None:
+        """Return effects with what is measured in a part beside them at their best fit, or None.
+
+        Effects of which nothing is certain beside it are left out.
+        """
+        effects, measured = tuple(h.effect for h in kept), None
         for _ in range(_MEASUREMENTS):
-            maps = self._refit(refitter.model(effects if measured is None else (*effects, measured))).maps
-            own = replace(maps, usable=maps.usable & inside)
-            shifts = measured_shifts(seen, own, refitter.model(effects)) if own.usable.any() else None
-            if shifts is None:
+            present = refitter.model(effects if measured is None else (*effects, measured))
+            measured = measure(part, present, refitter.model(effects))
+            if measured is None:
                 return None
-            measured = shifts.at_place(part.region, part.when)
+            measured = measured.at_place(part.region, part.when)
         assert measured is not None
         refitter.allow(measured.tag)
         _, vectors = refitter.draw((*effects, measured), self.settings.extended_replicates)
@@ -538,7 +581,58 @@ class FrameExplainer:
         found = refitter.refined((*kept, Hypothesis(measured, shift)))
         found = refitter.sharpened(found, self.settings.extended_replicates)
         proven = {h.tag for h in self._established(found, z)}
-        return found if proven == found.tags else None
+        if proven == found.tags:
+            return found
+        if measured.tag not in proven:
+            return None
+        return self._described(z, refitter, tuple(h for h in kept if h.tag in proven), part, measure)
+
+    def _shifts(self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]) -> Effect | None:
+        """Measure the shifts of the samples of a part beside effects, with the pixels as they now are."""
+        maps = self._refit(present).maps
+        own = replace(maps, usable=maps.usable & self._inside(part))
+        seen = self.frames.seen[part.frames(self.frames.numbers[self.frames.seen])]
+        return measured_shifts(self.frames.stack[seen], own, beside) if own.usable.any() else None
+
+    def _noise_of_samples(
+        self,
+        known: dict[str, Callable[[Part], Covariances]],
+        part: Part,
+        _: tuple[Effect, ...],
+        beside: tuple[Effect, ...],
+    ) -> Effect | None:
+        """Measure the noise that samples of a part share beyond what effects make of them."""
+        key = "|".join(e.model_dump_json() for e in beside)
+        if key not in known:
+            known[key] = self._covariances(*self._simulated(beside))
+        data = self._covariances(self.frames.stack[self.frames.seen], self.plain.maps)(part)
+        return measured_noise(data, known[key](part), self.plain, self._inside(part))
+
+    def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
+        """Simulate the frames that are seen under a model, and fit their pixels."""
+        seed = self._seed("covariances")
+        drawn = self._mapped(model)[1].usual(seed)
+        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
+        frames = simulate_frames(drawn, model, seed, taken)
+        self.effort.simulate(frames.size, drawn.usable.size, 1)
+        return frames, fitted_maps(frames, ~drawn.usable)
+
+    def _covariances(
+        self, frames: NDArray[np.unsignedinteger], maps: PixelMaps
+    ) -> Callable[[Part], Covariances]:
+        """Return what measures how the samples of a part vary together in frames like those that are seen."""
+        numbers = self.frames.numbers[self.frames.seen]
+
+        def of(part: Part) -> Covariances:
+            some = part.frames(numbers)
+            return residual_covariances(frames[some], numbers[some], maps, self._inside(part))
+
+        return of
+
+    def _inside(self, part: Part) -> NDArray[np.bool_]:
+        """Return which of the pixels lie in a part, (y, x)."""
+        window = self.frames.window or SensorWindow.whole(self.frames.stack.shape)
+        return window.mask(part.region)
 
     def _refitter(self, z: Measured, held: tuple[Hypothesis, ...]) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""

@@ -1,0 +1,198 @@
+"""The empirical component: noise that samples share, by its covariance over frames, rows and columns.
+
+The readout residuals of pairs of samples are multiplied, and their mean products sorted by distance: those of
+near samples, of samples far apart in one row, far apart in one column, and far apart in both. What the model
+makes of such pairs is measured in frames simulated with it, and taken off. What is left beyond chance is the
+covariance of a Gaussian noise. Its variance is known where whole rows, columns or frames share it; that of
+single samples is read noise as well, so there it is the least with which the others are a covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+
+__all__ = ["Covariance", "Covariances", "measured_noise", "residual_covariances"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_SHARED: tuple[Shared, ...] = ("frame", "row", "column", "sample")
+_FARTHEST = 3  # frames, rows and columns
+_GROUPS = 60  # of frames, whose scatter tells the error
+_CLEAR = 5.0  # standard errors that a covariance must have, among some hundred that are looked at
+_CERTAIN = 3.0  # of a model's, in simulated frames: less is taken for none
+_MOST_LAGS = 64
+# of the variance of single samples, over the least: a spectrum that vanishes needs a long moving average
+_OVER_LEAST = 1.15
+_MOST = 0.9  # of the variance of the readout, that the noise may have
+
+
+class Covariance(NamedTuple):
+    """A mean product of residuals, each in its standard deviation, and its standard error."""
+
+    value: float
+    error: float
+
+
+#: Of samples by what shares one value, and by distance.
+Covariances = Mapping[tuple[Shared, Lag], Covariance]
+
+
+def residual_covariances(
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, inside: BoolArray
+) -> Covariances:
+    """Measure how the readout residuals of near and far samples vary together.
+
+    Args:
+        frames: (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, shape (frame,).
+        maps: plain fit of these frames, or of more of the same pixels.
+        inside: pixels that are looked at, shape (y, x).
+    """
+    inside = inside & maps.usable
+    rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        return {}
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    samples = Samples.of(frames, maps).without(~inside)
+    u = np.concatenate([chunk for (chunk,) in samples.chunks((1,), *box)])
+    found: dict[tuple[Shared, Lag], Covariance] = {}
+    for step in range(_FARTHEST + 1):
+        later = np.searchsorted(numbers, numbers + step).clip(max=numbers.size - 1)
+        first = np.flatnonzero(numbers[later] == numbers + step)
+        if first.size >= 2 * _GROUPS:
+            found |= _of_step(u[first], u[later[first]], inside[box], step)
+    return found
+
+
+def _of_step(
+    one: NDArray[np.float32], two: NDArray[np.float32], inside: BoolArray, step: int
+) -> dict[tuple[Shared, Lag], Covariance]:
+    """Return the covariances of frames with those ``step`` later."""
+    far_y, far_x = (min(_FARTHEST, (size - 1) // 4) for size in inside.shape)
+    down, right = range(-far_y, far_y + 1), range(-far_x, far_x + 1)
+    pixels = inside[None].astype(np.float32)
+    sums, counts = (_Pairs.of(a, b, down, right) for a, b in ((one, two), (pixels, pixels)))
+    groups = np.array_split(np.arange(len(one)), _GROUPS)
+    size = np.array([group.size for group in groups])
+
+    def mean(products: FloatArray, pairs: FloatArray) -> FloatArray:
+        """Average over the pairs of each group of frames, 0 without any."""
+        total = np.stack([products[..., group].sum(axis=-1) for group in groups], axis=-1)
+        return np.asarray(total / np.maximum(pairs * size, 1.0))
+
+    frame = mean(sums.frame, counts.frame)
+    row, column = mean(sums.row, counts.row) - frame, mean(sums.column, counts.column) - frame
+    sample = mean(sums.sample, counts.sample) - frame - row[:, None] - column[None, :]
+    every: list[tuple[Shared, Lag, FloatArray, float]] = [
+        ("frame", (step, 0, 0), frame, float(counts.frame[0])),
+        *(("row", (step, dy, 0), row[i], float(counts.row[i, 0])) for i, dy in enumerate(down)),
+        *(("column", (step, 0, dx), column[j], float(counts.column[j, 0])) for j, dx in enumerate(right)),
+        *(
+            ("sample", (step, dy, dx), sample[i, j], float(counts.sample[i, j, 0]))
+            for i, dy in enumerate(down)
+            for j, dx in enumerate(right)
+        ),
+    ]
+    return {
+        (shared, lag): _averaged(values, (1 + (step == 0)) / (pairs * len(one)))
+        for shared, lag, values, pairs in every
+        if pairs and (lag > (0, 0, 0) or (lag == (0, 0, 0) and shared != "sample"))
+    }
+
+
+def _averaged(values: FloatArray, variance: float) -> Covariance:
+    """Return the mean of groups of frames; ``variance`` of it is by chance alone where nothing is shared."""
+    return Covariance(float(values.mean()), float(np.sqrt(max(values.var(ddof=1) / values.size, variance))))
+
+
+class _Pairs(NamedTuple):
+    """Sums of products of pairs by frame: near ones, far ones in a row, in a column, and in neither."""
+
+    sample: FloatArray
+    row: FloatArray
+    column: FloatArray
+    frame: FloatArray
+
+    @classmethod
+    def of(cls, one: NDArray[np.float32], two: NDArray[np.float32], down: range, right: range) -> _Pairs:
+        """Return those of frames (n, y, x) with others, at distances of rows and columns."""
+        near = np.array([[_shifted(one, two, dy, dx) for dx in right] for dy in down])
+        rows = (_line_sums(one, 2), _line_sums(two, 2))
+        columns = (_line_sums(one, 1), _line_sums(two, 1))
+        row = np.array([_shifted(rows[0], rows[1], dy, 0) for dy in down])
+        column = np.array([_shifted(columns[0], columns[1], 0, dx) for dx in right])
+        total = rows[0].sum(axis=(1, 2)) * rows[1].sum(axis=(1, 2))
+        return cls(
+            near,
+            row - near.sum(axis=1),
+            column - near.sum(axis=0),
+            np.asarray(total - row.sum(axis=0) - column.sum(axis=0) + near.sum(axis=(0, 1))),
+        )
+
+
+def _line_sums(frames: NDArray[np.float32], axis: int) -> FloatArray:
+    """Return the sums of frames (n, y, x) along an axis, which stays."""
+    return np.asarray(frames.sum(axis=axis, dtype=np.float64, keepdims=True))
+
+
+def _shifted(one: NDArray[Any], two: NDArray[Any], dy: int, dx: int) -> FloatArray:
+    """Return the sum over a frame of ``one[y, x] two[y + dy, x + dx]``."""
+    here = tuple(slice(max(-n, 0), size - max(n, 0)) for n, size in zip((dy, dx), one.shape[1:], strict=True))
+    there = tuple(slice(max(n, 0), size + min(n, 0)) for n, size in zip((dy, dx), one.shape[1:], strict=True))
+    return np.asarray(
+        np.einsum("tyx,tyx->t", one[(slice(None), *here)], two[(slice(None), *there)], dtype=np.float64)
+    )
+
+
+def measured_noise(
+    data: Covariances, model: Covariances, evidence: Evidence, inside: BoolArray
+) -> EmpiricalNoise | None:
+    """Return the noise that samples share beyond what a model makes; None where they share none.
+
+    Args:
+        data: covariances of the frames.
+        model: of frames simulated with it.
+        evidence: of the frames.
+        inside: pixels that were looked at, shape (y, x).
+    """
+    own = {key: one for key, one in model.items() if abs(one.value) > _CERTAIN * one.error}
+    none = Covariance(0.0, 0.0)
+    left = {key: one.value - own.get(key, none).value for key, one in data.items()}
+    error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.items()}
+    clear = [key for key in left if abs(left[key]) > _CLEAR * error[key]]
+    modes: list[tuple[Shared, tuple[Lag, ...], tuple[float, ...]]] = []
+    powers: list[float] = []
+    for shared in _SHARED:
+        lags = [lag for what, lag in clear if what == shared and any(lag)]
+        lags = sorted(sorted(lags, key=lambda lag: -abs(left[shared, lag]))[:_MOST_LAGS])
+        here = left[shared, (0, 0, 0)] if (shared, (0, 0, 0)) in clear else 0.0
+        values = [left[shared, lag] for lag in lags]
+        least = max(0.0, -float(spectrum(lags, values).min()))
+        power = max(here, least * (_OVER_LEAST if shared == "sample" else 1.0))
+        if power > 0.0:
+            correlation = tuple(round(value / power, 4) for value in values)
+            modes.append((shared, tuple(lags), correlation))
+            powers.append(power)
+    if not modes:
+        return None
+    inside = inside & evidence.maps.usable
+    # what an offset of 1 DN adds to a residual, in its standard deviation
+    response = float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[inside]))
+    most = _MOST * float(np.median(evidence.maps.read_noise_dn[inside])) ** 2
+    return EmpiricalNoise(
+        noise_dn=float(np.sqrt(min(sum(powers) / response**2, most))),
+        modes=tuple(
+            NoiseMode(of=of, share=round(power / sum(powers), 4), lags=lags, correlation=correlation)
+            for (of, lags, correlation), power in zip(modes, powers, strict=True)
+        ),
+    )

@@ -1,0 +1,210 @@
+"""What is measured and not understood: noise that samples share, by its measured spectrum.
+
+Where no known effect explains how samples vary together, it can still be told: a stationary Gaussian noise
+is its covariance by distance in frames, rows and columns, and no more (Wold 1938; Priestley 1981). It is
+drawn as a moving average of white noise whose weights are the Fourier transform of the root of the spectrum.
+Nothing is said about why.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.estimators.common_modes import add_offset
+from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import Dim, EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import SampleLaw
+
+__all__ = ["EmpiricalNoise", "Lag", "NoiseMode", "spectrum"]
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+
+#: A distance: frames, rows, columns.
+Lag = tuple[int, int, int]
+Shared = Literal["sample", "row", "column", "frame"]
+_DIMS: dict[Shared, tuple[Dim, ...]] = {
+    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
+}  # fmt: skip
+_POINTS = 8  # of the spectrum's grid along an axis, for each unit of the largest distance
+_REACH = 3  # of the moving average along an axis, for each of them
+_MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
+_FEW = 4  # distances that are told in words
+
+
+class NoiseMode(Section):
+    """A stationary noise of which each sample, row, column or frame has one value.
+
+    The correlation at a distance holds for the opposite one, too; at those that are not given it is 0.
+    """
+
+    of: Shared = Field(description="what has a value of its own: each sample, row, column or frame")
+    share: float = Field(ge=0, le=1, description="part of the power of the noise, no unit")
+    lags: tuple[Lag, ...] = Field(default=(), max_length=64, description="distances: frames, rows, columns")
+    correlation: tuple[float, ...] = Field(
+        default=(), max_length=64, description="correlation of the values at each of them, no unit"
+    )
+
+    @model_validator(mode="after")
+    def _of_its_axes(self) -> Self:
+        if len(self.lags) != len(self.correlation):
+            raise ValueError("give one correlation for each of lags")
+        fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in _DIMS[self.of]]
+        if any(not any(lag) or any(lag[axis] for axis in fixed) for lag in self.lags):
+            raise ValueError(f"lags of a {self.of} are (frames, rows, columns), not all 0, and 0 within it")
+        return self
+
+    def words(self) -> str:
+        """Return in words what is shared."""
+        whole = "" if self.of == "sample" and self.lags else f"the same in a whole {self.of}"
+        order = np.argsort(-np.abs(self.correlation))[:_FEW]
+        apart = [f"{self.correlation[i]:.2g} {_lag_words(self.lags[i])}" for i in order]
+        more = f" and {len(self.lags) - _FEW} other distances" if len(self.lags) > _FEW else ""
+        shared = f"correlated by {', '.join(apart)}{more}" if apart else ""
+        return ", ".join(part for part in (whole, shared) if part)
+
+
+def _lag_words(lag: Lag) -> str:
+    """Return a distance in words, for example ``1 frame and 2 columns apart``."""
+    parts = [
+        f"{abs(n)} {noun}{'s' if abs(n) > 1 else ''}"
+        for n, noun in zip(lag, ("frame", "row", "column"), strict=True)
+        if n
+    ]
+    slanted = sum(n < 0 for n in lag) % 2 == 1
+    return f"{' and '.join(parts)} apart{' (the other way)' if slanted and len(parts) > 1 else ''}"
+
+
+@register_effect
+class EmpiricalNoise(Effect):
+    """Gaussian noise with a measured correlation over frames, rows and columns.
+
+    Signature: none of its own; it is measured where the data disagree with all that is known, and describes
+    how samples vary together without a name for what makes them so.
+    """
+
+    tag: Literal["empirical_noise"] = Field(default="empirical_noise", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Measured noise that samples share, without an explanation"
+    source: ClassVar[str] = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
+    strength: ClassVar[str] = "noise_dn"
+    power: ClassVar[float] = 2.0
+    measured_only: ClassVar[bool] = True
+    noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of all of it, DN")
+    modes: tuple[NoiseMode, ...] = Field(
+        min_length=1,
+        max_length=4,
+        description="its parts: `of` (what has a value of its own: sample, row, column or frame), `share` of "
+        "the power, `lags` (frames, rows, columns) and the `correlation` at each",
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the noise referred to the input."""
+        total = sum(self.share_of(mode) * _field(mode, i, context) for i, mode in enumerate(self.modes))
+        return add_offset(values, total, context)
+
+    def share_of(self, mode: NoiseMode) -> float:
+        """Return the standard deviation of a mode, DN."""
+        power = sum(each.share for each in self.modes)
+        return self.noise_dn * (mode.share / power) ** 0.5 if power > 0.0 else 0.0
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return noise that a sample shares with the next row's."""
+        mode = NoiseMode(of="sample", share=1.0, lags=((0, 1, 0),), correlation=(0.4,))
+        return (cls(noise_dn=0.5, modes=(mode,)),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return none: it is measured where all else has failed, and competes with nothing."""
+        return ()
+
+    def halo(self) -> int:
+        """Return how far the moving averages reach across rows, px."""
+        return max(_average(mode).reach[1] for mode in self.modes)
+
+    def history(self) -> int:
+        """Return twice how far they reach along time: they are as long before a frame as behind it."""
+        return 2 * max(_average(mode).reach[0] for mode in self.modes)
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law with its variance: exact, a Gaussian on a Gaussian."""
+        return model.with_variance(dn2=self.noise_dn**2)
+
+    def words(self) -> str:
+        """Return what is known of it."""
+        place = f" in {place_words(self)}" if place_words(self) else ""
+        parts = [f"{self.share_of(mode):.2g} DN {mode.words()}" for mode in self.modes]
+        return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({'; '.join(parts)})"
+
+
+class _Average(NamedTuple):
+    """Weights of a moving average by distance, their squares sum up to 1; the largest distance by axis."""
+
+    taps: tuple[tuple[Lag, float], ...]
+    reach: Lag
+
+
+def spectrum(lags: Sequence[Lag], values: Sequence[float]) -> FloatArray:
+    """Return ``2 sum_l values_l cos(w l)`` on a grid of frequencies w, the part of lag 0 left out.
+
+    Args:
+        lags: distances; each stands for its opposite, too.
+        values: covariances or correlations at these.
+    """
+    farthest = np.abs(np.array(lags, np.int64).reshape(-1, 3)).max(axis=0, initial=0)
+    sizes = [max(_POINTS * int(far), 1) for far in farthest]
+    found = np.zeros(sizes)
+    for lag, value in zip(lags, values, strict=True):
+        for sign in (1, -1):
+            found[tuple(sign * n % size for n, size in zip(lag, sizes, strict=True))] += value
+    return np.asarray(np.fft.fftn(found).real)
+
+
+@functools.lru_cache(maxsize=64)
+def _average(mode: NoiseMode) -> _Average:
+    """Return the moving average whose spectrum is nearest to that of a mode."""
+    power = np.maximum(1.0 + spectrum(mode.lags, mode.correlation), 0.0)
+    weights = np.fft.ifftn(np.sqrt(power)).real
+    far = [_REACH * size // _POINTS if size > 1 else 0 for size in weights.shape]
+    taps = []
+    for index in np.ndindex(*(2 * n + 1 for n in far)):
+        lag = tuple(i - n for i, n in zip(index, far, strict=True))
+        taps.append(((lag[0], lag[1], lag[2]), float(weights[lag])))
+    taps.sort(key=lambda tap: -abs(tap[1]))
+    kept = [tap for tap in taps[:_MOST_TAPS] if abs(tap[1]) >= _SMALLEST_TAP * abs(taps[0][1])]
+    norm = sum(weight**2 for _, weight in kept) ** 0.5
+    reach = np.abs([lag for lag, _ in kept]).max(axis=0)
+    return _Average(
+        tuple((lag, weight / norm) for lag, weight in kept), (int(reach[0]), int(reach[1]), int(reach[2]))
+    )
+
+
+def _field(mode: NoiseMode, number: int, context: EffectContext) -> FloatArray:
+    """Return the values of a mode, of variance 1, in a shape that fits (frame, y, x)."""
+    white = context.random.normal(_DIMS[mode.of], number)
+    average = _average(mode)
+    if len(average.taps) == 1:
+        return white
+    found, power = np.zeros(white.shape), np.zeros((1, *white.shape[1:]))
+    for lag, weight in average.taps:
+        # later frames are not known: the average lags behind by its reach
+        lag = (lag[0] - average.reach[0], lag[1], lag[2])
+        there = tuple(slice(max(-n, 0), size - max(n, 0)) for n, size in zip(lag, white.shape, strict=True))
+        here = tuple(slice(max(n, 0), size + min(n, 0)) for n, size in zip(lag, white.shape, strict=True))
+        if all(s.start < s.stop for s in (*there, *here)):
+            found[there] += weight * white[here]
+            power[(slice(None), *there[1:])] += weight**2
+    # at the borders of the sensor some of the white noise is missing
+    return np.asarray(found / np.sqrt(np.maximum(power, np.finfo(np.float64).tiny)))

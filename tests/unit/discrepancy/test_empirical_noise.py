@@ -1,0 +1,222 @@
+"""Noise that samples share: simulated by its spectrum, measured by its covariances, never on clean data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.config.load import parse_config
+from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
+    Covariance,
+    measured_noise,
+    residual_covariances,
+)
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+
+ROWS, COLUMNS, FRAMES, STEP = 16, 18, 900, 12.0
+SHAPE = (ROWS, COLUMNS)
+AMPLITUDE, NEXT = 0.9, 0.7  # DN, and the weight of the neighbour
+POWER = AMPLITUDE**2 * (1 + NEXT**2)
+COVARIANCE = AMPLITUDE**2 * NEXT
+
+
+def of_next_rows(rng: np.random.Generator) -> np.ndarray:
+    """Noise of single samples, correlated with the next row's."""
+    white = rng.standard_normal((FRAMES, ROWS + 1, COLUMNS))
+    return AMPLITUDE * (white[:, 1:] + NEXT * white[:, :-1])
+
+
+def of_whole_rows(rng: np.random.Generator) -> np.ndarray:
+    """Noise of whole rows, correlated with the next row's."""
+    white = rng.standard_normal((FRAMES, ROWS + 1, 1))
+    return AMPLITUDE * (white[:, 1:] + NEXT * white[:, :-1])
+
+
+def of_earlier_frames(rng: np.random.Generator) -> np.ndarray:
+    """Noise of single samples, anticorrelated with the frame before."""
+    white = rng.standard_normal((FRAMES + 1, *SHAPE))
+    return AMPLITUDE * (white[1:] - NEXT * white[:-1])
+
+
+def nothing(rng: np.random.Generator) -> float:
+    """No noise."""
+    return 0.0
+
+
+def stack(seed: int, noise: Any, read_noise: float = 0.25, exposure: float = 1.2) -> np.ndarray:
+    """Return frames of a sensor with more noise than its pixels' own."""
+    rng = np.random.default_rng(seed)
+    mean, bias = exposure * rng.uniform(0.6, 1.4, SHAPE), rng.uniform(95.0, 105.0, SHAPE)
+    own = read_noise * rng.uniform(0.85, 1.15, SHAPE) * STEP
+    size = (FRAMES, *SHAPE)
+    dn = bias + STEP * rng.poisson(mean, size) + own * rng.standard_normal(size) + noise(rng)
+    return np.floor(dn + 0.5).clip(0).astype(np.uint16)
+
+
+def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalNoise | None:
+    """Return what is measured beside a model that makes no covariances."""
+    numbers = np.arange(FRAMES)
+    inside = np.ones(SHAPE, bool) if inside is None else inside
+    evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
+    found = residual_covariances(frames, numbers, evidence.maps, inside)
+    return measured_noise(found, {}, evidence, inside)
+
+
+@pytest.mark.parametrize(
+    ("noise", "of", "lag", "covariance"),
+    [
+        (of_next_rows, "sample", (0, 1, 0), COVARIANCE),
+        (of_whole_rows, "row", (0, 1, 0), COVARIANCE),
+        (of_earlier_frames, "sample", (1, 0, 0), -COVARIANCE),
+    ],
+)
+def test_what_samples_share_is_measured_by_distance(noise, of, lag, covariance):
+    found = measured(stack(4, noise))
+    assert found is not None
+    (mode,) = found.modes
+    assert (mode.of, mode.lags) == (of, (lag,))
+    # pairs at that distance, each with a product of standard deviation 1, of residuals that follow half of it
+    pairs = FRAMES * ROWS * (COLUMNS if of == "sample" else COLUMNS**2)
+    error = 2.0 * (0.25 * STEP) ** 2 / np.sqrt(pairs) + 0.06 * abs(covariance)
+    assert abs(found.noise_dn**2 * mode.correlation[0] - covariance) < 5 * error
+    if of == "row":
+        assert found.noise_dn**2 == pytest.approx(POWER, rel=0.15)
+    else:
+        # the least with which a covariance at one distance is possible is twice as much
+        assert abs(mode.correlation[0]) == pytest.approx(0.5 / 1.15, abs=1e-4)
+    assert "share" in found.words()
+
+
+def test_nothing_is_measured_where_there_is_nothing():
+    for seed, (read_noise, exposure) in enumerate([(0.15, 0.3), (0.25, 4.0), (0.4, 1.0), (0.6, 2.0)]):
+        assert measured(stack(seed, nothing, read_noise, exposure)) is None
+
+
+def test_only_a_part_is_looked_at():
+    def in_left_half(rng):
+        noise = of_whole_rows(rng) * np.ones(SHAPE)
+        noise[:, :, COLUMNS // 2 :] = 0.0
+        return noise
+
+    frames = stack(5, in_left_half)
+    left = np.zeros(SHAPE, bool)
+    left[:, : COLUMNS // 2] = True
+    found = measured(frames, left)
+    assert found is not None
+    assert found.noise_dn**2 == pytest.approx(POWER, rel=0.25)
+    assert measured(frames, ~left) is None
+
+
+def test_what_a_model_makes_is_taken_off():
+    frames = stack(6, of_whole_rows)
+    evidence = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=30)
+    inside = np.ones(SHAPE, bool)
+    data = residual_covariances(frames, np.arange(FRAMES), evidence.maps, inside)
+    assert measured_noise(data, data, evidence, inside) is None
+    by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.items()}
+    assert measured_noise(data, by_chance, evidence, inside) == measured_noise(data, {}, evidence, inside)
+
+
+def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
+    """Return the noise, DN, of a sensor of no other noise and no light, in steps of a hundredth."""
+    maps = {"quanta_exposure": 1e-9, "conversion_gain": 1.0, "bias": 30000.0, "analog_read_noise_e": 1e-6}
+    values = {name: np.full(SHAPE, value) for name, value in maps.items()}
+    truth = TruthMaps(**values, defect=np.zeros(SHAPE, np.uint8))
+    sensor = SimulateSettings(
+        shape=SHAPE, n_frames=n_frames, seed=5, bit_depth=16, effects=(effect.scaled(100.0),)
+    )
+    return (simulate_block(truth, sensor, (0, n_frames))[0] - 30000.0) / 100.0
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        NoiseMode(of="sample", share=1.0, lags=((0, 1, 0),), correlation=(0.42,)),
+        NoiseMode(of="sample", share=1.0, lags=((1, 0, 0), (0, 1, -1)), correlation=(-0.25, 0.2)),
+        NoiseMode(of="row", share=1.0, lags=((0, 1, 0), (1, 0, 0)), correlation=(0.25, -0.22)),
+        NoiseMode(of="column", share=1.0, lags=((0, 0, 2),), correlation=(0.4,)),
+        NoiseMode(of="frame", share=1.0, lags=((1, 0, 0),), correlation=(0.4,)),
+    ],
+    ids=lambda mode: f"{mode.of} {mode.lags}",
+)
+def test_the_simulated_noise_has_its_power_and_correlations(mode):
+    noise = simulated(EmpiricalNoise(noise_dn=2.0, modes=(mode,)))
+    values = {
+        "sample": noise, "row": noise[:, :, :1], "column": noise[:, :1], "frame": noise[:, :1, :1]
+    }[mode.of]  # fmt: skip
+    np.testing.assert_array_equal(noise, np.broadcast_to(values, noise.shape))
+    # neighbours count for less than one each
+    error = 2.0 / np.sqrt(values.size)
+    assert abs(np.mean(values**2) / 4.0 - 1.0) < 5 * error
+    for lag, wanted in zip(mode.lags, mode.correlation, strict=True):
+        one = values[tuple(slice(max(-n, 0), s - max(n, 0)) for n, s in zip(lag, values.shape, strict=True))]
+        two = values[tuple(slice(max(n, 0), s + min(n, 0)) for n, s in zip(lag, values.shape, strict=True))]
+        assert np.mean(one * two) / 4.0 == pytest.approx(wanted, abs=5 * error + 0.03)
+        assert abs(wanted) > 10 * (error if mode.of != "frame" else error / 4)
+
+
+def test_the_same_frames_at_every_division():
+    modes = (
+        NoiseMode(of="sample", share=0.5, lags=((1, 1, 0), (0, 0, 1)), correlation=(0.2, 0.2)),
+        NoiseMode(of="row", share=0.5, lags=((0, 2, 0),), correlation=(-0.4,)),
+    )
+    effect = EmpiricalNoise(noise_dn=3.0, modes=modes)
+    sensor = SimulateSettings(shape=SHAPE, n_frames=20, seed=8, effects=(effect,))
+    truth = TruthMaps(
+        *(np.full(SHAPE, value) for value in (1.0, 0.1, 100.0, 0.2)), defect=np.zeros(SHAPE, np.uint8)
+    )
+    whole = simulate_block(truth, sensor, (0, 20))[0]
+    part = simulate_block(truth, sensor, (7, 12), (5, 9))[0]
+    np.testing.assert_array_equal(part, whole[7:12, 5:9])
+
+
+def test_the_law_of_a_pixel_has_its_variance():
+    effect = EmpiricalNoise.typical()[0].scaled(4.0)
+    maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
+    codes = np.arange(60, 220)
+    law = sample_mass(effect.sample_law(SampleLaw(), maps), (1.2, 1 / STEP, 100.0, 3.0), codes)[0]
+    wider = np.sqrt(9.0 + effect.noise_dn**2)
+    plain = sample_mass(SampleLaw(), (1.2, 1 / STEP, 100.0, wider), codes)[0]
+    np.testing.assert_allclose(law, plain, atol=1e-4)
+
+
+def test_the_spectrum_of_one_distance_is_a_cosine():
+    found = spectrum(((0, 1, 0),), (0.5,))
+    assert found.shape == (1, 8, 1)
+    np.testing.assert_allclose(found[0, :, 0], np.cos(2 * np.pi * np.arange(8) / 8), atol=1e-12)
+
+
+def test_it_competes_with_nothing_and_refuses_what_is_no_correlation():
+    assert "empirical_noise" not in candidate_classes(DiscrepancySettings())
+    with pytest.raises(ValidationError, match="one correlation"):
+        NoiseMode(of="sample", share=1.0, lags=((0, 1, 0),))
+    with pytest.raises(ValidationError, match="0 within it"):
+        NoiseMode(of="row", share=1.0, lags=((0, 0, 1),), correlation=(0.1,))
+
+
+def test_it_is_written_in_a_yaml():
+    text = """
+simulate: {shape: [8, 8], n_frames: 100, output: frames}
+model:
+  effects:
+    - tag: empirical_noise
+      noise_dn: 0.7
+      modes:
+        - {of: row, share: 1.0, lags: [[0, 1, 0]], correlation: [0.48]}
+"""
+    (effect,) = parse_config(text).model.effects
+    assert effect.words() == (
+        "noise of 0.7 DN that samples share (0.7 DN the same in a whole row, correlated by 0.48 1 row apart)"
+    )
