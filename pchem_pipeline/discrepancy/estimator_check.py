@@ -1,0 +1,102 @@
+"""The strength that an effect's estimator finds in simulated frames: a test of effects, others' too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtr
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.maps import draw_truth
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+#: Frames (frame, y, x) of a seed, DN, unsigned.
+Camera = Callable[[int], NDArray[np.unsignedinteger]]
+_BLOCK = 50  # frames, as many as a search looks at in one piece
+
+
+@dataclass(frozen=True)
+class RecoveredStrength:
+    """What an estimator makes of several stacks.
+
+    Attributes:
+        true: strength that the effect has in the stacks.
+        found: that of the likeliest hypothesis in each stack, NaN where there is none, shape (n,).
+    """
+
+    true: float
+    found: NDArray[np.float64]
+
+    @property
+    def n_guesses(self) -> int:
+        """Number of stacks in which the estimator has a hypothesis."""
+        return int(np.isfinite(self.found).sum())
+
+    @property
+    def mean(self) -> float:
+        """Mean strength found; NaN where one stack has no hypothesis."""
+        return float(self.found.mean())
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the mean, from the scatter between the stacks."""
+        return float(self.found.std(ddof=1) / math.sqrt(self.found.size))
+
+    @property
+    def probability(self) -> float:
+        """Chance that an estimator without bias is off by as much (Student's t); NaN as the mean is."""
+        t = abs(self.mean - self.true) / self.standard_error
+        return 2.0 * float(stdtr(self.found.size - 1, -t))
+
+
+def recovered_strength(
+    effect: Effect,
+    *,
+    camera: Camera | None = None,
+    stacks: int = 6,
+    n_frames: int = 1500,
+    shape: tuple[int, int] = (20, 20),
+    seed: int = 1,
+) -> RecoveredStrength:
+    """Return the strengths that the estimator of an effect finds in stacks of simulated frames.
+
+    Each stack is of another sensor, drawn as ``pchem simulate`` draws it, and is looked at as a search looks
+    at frames: histograms, plain fits, statistics.
+
+    Args:
+        effect: with the strength that it has in the frames; 0: there is nothing to be found.
+        camera: takes a seed and returns frames that have the effect, by a simulator of your own, for which
+            ``n_frames`` and ``shape`` mean nothing; None: this package's, with the effect's own ``apply``.
+        stacks: how many.
+        n_frames: in each stack, 200 or more.
+        shape: rows and columns, px.
+        seed: of the first stack; those of the others follow.
+
+    Raises:
+        ConfigError: the effect has no strength.
+        InputError: the frames are too few, or not as described.
+    """
+    if not effect.strength:
+        raise ConfigError(f"effect {effect.tag!r} has no strength; name the field that scales it")
+    found = np.full(stacks, np.nan)
+    for i in range(stacks):
+        frames = _simulated(effect, n_frames, shape, seed + i) if camera is None else camera(seed + i)
+        evidence = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=_BLOCK)
+        hypotheses = type(effect).estimate(evidence)
+        if hypotheses:
+            found[i] = getattr(hypotheses[0], effect.strength)
+    return RecoveredStrength(float(getattr(effect, effect.strength)), found)
+
+
+def _simulated(
+    effect: Effect, n_frames: int, shape: tuple[int, int], seed: int
+) -> NDArray[np.unsignedinteger]:
+    settings = SimulateSettings(shape=shape, n_frames=n_frames, seed=seed, effects=(effect,))
+    return simulate_block(draw_truth(settings), settings, (0, n_frames), electron_frames=0)[0]
