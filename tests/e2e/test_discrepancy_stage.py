@@ -130,6 +130,17 @@ def test_a_second_search_has_nothing_to_do(searched):
     assert "nothing to do" in dry.stderr
 
 
+def test_a_search_ends_at_its_limit_and_goes_further_with_a_higher_one(fitted, tmp_path):
+    shell = copy_of(fitted, tmp_path)
+    result = shell.ok("discrepancy", "run.yaml", "--no-refit", "--effort", "0.0001")
+    found = verdict(shell)
+    assert found["effects"] == []
+    assert "row_noise" in found["limit"]
+    words = " ".join(result.stdout.split())
+    assert "the search ended at its limit before row_noise was fitted" in words
+    assert "--effort raises it" in words
+
+
 def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_path):
     text = (searched[0].folder / "run.yaml").read_text()
     other = copy_of(fitted, tmp_path, text)

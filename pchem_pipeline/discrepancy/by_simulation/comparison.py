@@ -171,9 +171,9 @@ def _placebo(
         return []
     best = pool[max(closing)[1]]
     try:
-        # what a name is worth is always told
-        return [replace(refitter, steps=_PLACEBO_STEPS, allow=lambda _: None).refined((*others, best))]
-    except Exception:  # its defect is told where it is asked for its guesses
+        return [replace(refitter, steps=_PLACEBO_STEPS).refined((*others, best))]
+    # its defect is told where it is asked for its guesses; at the limit of the work its fingerprint must do
+    except Exception:
         return []
 
 
