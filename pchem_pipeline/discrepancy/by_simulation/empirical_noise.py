@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
@@ -81,14 +82,15 @@ def _of_step(
     far_y, far_x = (min(_FARTHEST, (size - 1) // 4) for size in inside.shape)
     down, right = range(-far_y, far_y + 1), range(-far_x, far_x + 1)
     pixels = inside[None].astype(np.float32)
-    sums, counts = (_Pairs.of(a, b, down, right) for a, b in ((one, two), (pixels, pixels)))
-    groups = np.array_split(np.arange(len(one)), _GROUPS)
-    size = np.array([group.size for group in groups])
+    starts = np.arange(_GROUPS) * len(one) // _GROUPS
+    size = np.diff(starts, append=len(one))
+    sums = _Pairs.of(one, two, down, right, starts)
+    # how many pairs a frame has, to which a transform adds what floats leave
+    counts = _Pairs(*(np.rint(n) for n in _Pairs.of(pixels, pixels, down, right, np.zeros(1, np.int64))))
 
     def mean(products: FloatArray, pairs: FloatArray) -> FloatArray:
         """Average over the pairs of each group of frames, 0 without any."""
-        total = np.stack([products[..., group].sum(axis=-1) for group in groups], axis=-1)
-        return np.asarray(total / np.maximum(pairs * size, 1.0))
+        return np.asarray(products / np.maximum(pairs * size, 1.0))
 
     frame = mean(sums.frame, counts.frame)
     row, column = mean(sums.row, counts.row) - frame, mean(sums.column, counts.column) - frame
@@ -116,7 +118,10 @@ def _averaged(values: FloatArray, variance: float) -> Covariance:
 
 
 class _Pairs(NamedTuple):
-    """Sums of products of pairs by frame: near ones, far ones in a row, in a column, and in neither."""
+    """Sums of products of pairs: near ones, far ones in a row, in a column, and in neither.
+
+    Shapes (down, right, groups), (down, groups), (right, groups), (groups,).
+    """
 
     sample: FloatArray
     row: FloatArray
@@ -124,34 +129,35 @@ class _Pairs(NamedTuple):
     frame: FloatArray
 
     @classmethod
-    def of(cls, one: NDArray[np.float32], two: NDArray[np.float32], down: range, right: range) -> _Pairs:
-        """Return those of frames (n, y, x) with others, at distances of rows and columns."""
-        near = np.array([[_shifted(one, two, dy, dx) for dx in right] for dy in down])
-        rows = (_line_sums(one, 2), _line_sums(two, 2))
-        columns = (_line_sums(one, 1), _line_sums(two, 1))
-        row = np.array([_shifted(rows[0], rows[1], dy, 0) for dy in down])
-        column = np.array([_shifted(columns[0], columns[1], 0, dx) for dx in right])
-        total = rows[0].sum(axis=(1, 2)) * rows[1].sum(axis=(1, 2))
+    def of(
+        cls, one: NDArray[np.float32], two: NDArray[np.float32], down: range, right: range, starts: IntArray
+    ) -> _Pairs:
+        """Return those of frames (n, y, x) with others, at distances of rows and columns, by group of frames.
+
+        ``starts`` are the first frames of the groups.
+        """
+        rows = [each.sum(axis=2, dtype=np.float64) for each in (one, two)]
+        columns = [each.sum(axis=1, dtype=np.float64) for each in (one, two)]
+        total = np.add.reduceat(rows[0].sum(axis=1) * rows[1].sum(axis=1), starts)
+        near = _products(one, two, starts)[np.ix_(range(starts.size), down, right)]
+        row, column = (
+            _products(each[0], each[1], starts)[:, lags] for each, lags in ((rows, down), (columns, right))
+        )
+        frame = total - row.sum(axis=1) - column.sum(axis=1) + near.sum(axis=(1, 2))
         return cls(
-            near,
-            row - near.sum(axis=1),
-            column - near.sum(axis=0),
-            np.asarray(total - row.sum(axis=0) - column.sum(axis=0) + near.sum(axis=(0, 1))),
+            np.moveaxis(near, 0, -1),
+            np.moveaxis(row - near.sum(axis=2), 0, -1),
+            np.moveaxis(column - near.sum(axis=1), 0, -1),
+            frame,
         )
 
 
-def _line_sums(frames: NDArray[np.float32], axis: int) -> FloatArray:
-    """Return the sums of frames (n, y, x) along an axis, which stays."""
-    return np.asarray(frames.sum(axis=axis, dtype=np.float64, keepdims=True))
-
-
-def _shifted(one: NDArray[Any], two: NDArray[Any], dy: int, dx: int) -> FloatArray:
-    """Return the sum over a frame of ``one[y, x] two[y + dy, x + dx]``."""
-    here = tuple(slice(max(-n, 0), size - max(n, 0)) for n, size in zip((dy, dx), one.shape[1:], strict=True))
-    there = tuple(slice(max(n, 0), size + min(n, 0)) for n, size in zip((dy, dx), one.shape[1:], strict=True))
-    return np.asarray(
-        np.einsum("tyx,tyx->t", one[(slice(None), *here)], two[(slice(None), *there)], dtype=np.float64)
-    )
+def _products(one: NDArray[Any], two: NDArray[Any], starts: IntArray) -> FloatArray:
+    """Return ``sum one[n, i] two[n, i + d]`` of groups of n by distance d, negative ones from the end."""
+    axes = tuple(range(1, one.ndim))
+    size = [n + _FARTHEST for n in one.shape[1:]]
+    products = np.conj(fft.rfftn(one, size, axes)) * fft.rfftn(two, size, axes)
+    return np.asarray(fft.irfftn(np.add.reduceat(products, starts, axis=0), size, axes), np.float64)
 
 
 def measured_noise(

@@ -536,9 +536,12 @@ class FrameExplainer:
         Parts are looked at where what is everywhere leaves something.
         """
         refitter = self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses))
-        forms: dict[str, Measure] = {"shifts": self._shifts}
+        forms: dict[str, Measure] = {"empirical": self._shifts}
         if with_noise:
-            forms["noise"] = functools.partial(self._noise_of_samples, {})
+            data = self._covariances(self.frames.stack[self.frames.seen], self.plain.maps)
+            forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, {})
+        # one that the model has already is not replaced
+        forms = {tag: form for tag, form in forms.items() if tag not in {e.tag for e in refitter.present}}
         found: Refitted | None = None
         while forms and not (found is not None and leaves_nothing(refitter, found)):
             beside, better, score = kept, "", -np.inf
@@ -596,6 +599,7 @@ class FrameExplainer:
 
     def _noise_of_samples(
         self,
+        data: Callable[[Part], Covariances],
         known: dict[str, Callable[[Part], Covariances]],
         part: Part,
         _: tuple[Effect, ...],
@@ -605,8 +609,7 @@ class FrameExplainer:
         key = "|".join(e.model_dump_json() for e in beside)
         if key not in known:
             known[key] = self._covariances(*self._simulated(beside))
-        data = self._covariances(self.frames.stack[self.frames.seen], self.plain.maps)(part)
-        return measured_noise(data, known[key](part), self.plain, self._inside(part))
+        return measured_noise(data(part), known[key](part), self.plain, self._inside(part))
 
     def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
         """Simulate the frames that are seen under a model, and fit their pixels."""
@@ -623,6 +626,7 @@ class FrameExplainer:
         """Return what measures how the samples of a part vary together in frames like those that are seen."""
         numbers = self.frames.numbers[self.frames.seen]
 
+        @functools.cache
         def of(part: Part) -> Covariances:
             some = part.frames(numbers)
             return residual_covariances(frames[some], numbers[some], maps, self._inside(part))

@@ -15,6 +15,7 @@ from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
     measured_noise,
     residual_covariances,
 )
+from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
@@ -220,3 +221,20 @@ model:
     assert effect.words() == (
         "noise of 0.7 DN that samples share (0.7 DN the same in a whole row, correlated by 0.48 1 row apart)"
     )
+
+
+def test_it_is_found_beside_a_named_effect_and_closes_the_gap():
+    # the only test of the whole way: split, null, row noise, what is measured beside it, final frames
+    def hidden(rng):
+        return of_next_rows(rng) + 0.7 * rng.standard_normal((FRAMES, ROWS, 1))
+
+    settings = DiscrepancySettings(candidates=("row_noise",), replicates=24, extended_replicates=12)
+    found = find_discrepancies(stack(41, hidden), settings=settings)
+    verdict = found.verdict
+    assert (verdict.verdict, verdict.effects) == ("described", ("row_noise",))
+    effects = {effect.tag: effect for effect in found.model}
+    assert effects.keys() == {"row_noise", "empirical_noise"}
+    measured_mode = effects["empirical_noise"].modes[0]
+    assert (measured_mode.of, measured_mode.lags) == ("sample", ((0, 1, 0),))
+    assert verdict.gap.closed_fraction > 0.8
+    assert "share" in verdict.sentence
