@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds
+from pchem_pipeline.config.memory import allowed_bytes
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
@@ -24,7 +25,7 @@ from pchem_pipeline.run.session import Command, run_stages, run_status, working_
 from pchem_pipeline.stages.fit.start import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, prepared, stream_rows, whole_mebibytes
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import remove_file, write_json

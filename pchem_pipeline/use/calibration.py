@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.law.parameters import FloatArray, PixelParameters, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
+
+if TYPE_CHECKING:
+    from pchem_pipeline.model.electrons.electrons import KnownPixels
 
 __all__ = ["PEAKS_OVERLAP_E", "Calibration", "covariance_of"]
 
@@ -49,7 +53,7 @@ class Calibration(PixelParameters):
         ny, nx = self.bias.shape
         return ny, nx
 
-    @property
+    @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """Pixels whose parameters define a calibration, shape (y, x)."""
         known = usable_pixels(
@@ -75,6 +79,8 @@ class Calibration(PixelParameters):
     @property
     def known(self) -> KnownPixels:
         """The pixels as electron numbers are made of."""
+        from pchem_pipeline.model.electrons.electrons import KnownPixels  # loads compiled loops
+
         amplitude, weight = self.own_satellites.T
         return KnownPixels(list(self.columns.T), self.law, (amplitude, weight))
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.parameters import FloatArray
-from pchem_pipeline.use import common_modes_numba
 from pchem_pipeline.use.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -159,6 +158,8 @@ def estimate_offsets(
         calibration: of the pixels, under a law without these offsets.
         modes: which offsets there are.
     """
+    from pchem_pipeline.use import common_modes_numba  # loads compiled loops
+
     n, ny, nx = frames.shape
     m = len(modes.parts)
     rows, columns, left = np.empty((n, m, ny)), np.empty((n, m, nx)), np.empty((n, m))

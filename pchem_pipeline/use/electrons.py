@@ -9,16 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.parameters import FloatArray
-from pchem_pipeline.use import electrons_numba
 from pchem_pipeline.use.calibration import Calibration
 
-__all__ = ["calibration_variance", "electrons", "read_stderr", "stderr_at", "with_its_errors"]
+__all__ = [
+    "add_up",
+    "calibration_variance",
+    "electrons",
+    "read_stderr",
+    "stderr_at",
+    "whole_parts",
+    "with_its_errors",
+]
 
 
 def electrons(
     frames: NDArray[np.unsignedinteger[Any]],
     calibration: Calibration,
     offsets: NDArray[np.float32] | None = None,
+    room: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Return ``g (x - mu)``, less the offsets that frames, rows and columns share.
 
@@ -26,15 +34,62 @@ def electrons(
         frames: DN, shape (frame, y, x).
         calibration: of these pixels.
         offsets: of each sample, DN, shape of the frames; none: None, or an empty array.
+        room: for as many frames or more, in which the result lies then; None: it has its own.
 
     Returns:
         e-, shape (frame, y, x); NaN for pixels without a calibration.
     """
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan).astype(np.float32)
     bias = calibration.bias.astype(np.float32)
-    out = np.empty(frames.shape, np.float32)
-    given = np.zeros((0, 0, 0), np.float32) if offsets is None else offsets
-    electrons_numba.subtract_and_scale(frames, gain, bias, given, out)
+    out = np.empty(frames.shape, np.float32) if room is None else room[: len(frames)]
+    # frame by frame: what is written is still in the cache when it is scaled
+    for t, (frame, own) in enumerate(zip(frames, out, strict=True)):
+        np.subtract(frame, bias, out=own, dtype=np.float32)
+        if offsets is not None and offsets.size:
+            own -= offsets[t]
+        own *= gain
+    return out
+
+
+def add_up(
+    frames: NDArray[np.unsignedinteger[Any]], offsets: NDArray[np.float32], sums: NDArray[np.float64]
+) -> None:
+    """Add x to the sums of pixels, where there are offsets also x^2, x - b and its square; see its range.
+
+    Args:
+        frames: DN, shape (frame, y, x).
+        offsets: b, DN, shape of the frames, or an empty array: none.
+        sums: out, shape (6, y, x): x, x^2, x - b, its square (they stay where there are no offsets), and the
+            smallest and largest x.
+    """
+    sums[0] += frames.sum(axis=0, dtype=np.uint64)
+    np.minimum(sums[4], frames.min(axis=0), out=sums[4])
+    np.maximum(sums[5], frames.max(axis=0), out=sums[5])
+    if not offsets.size:
+        return
+    for frame, offset in zip(frames, offsets, strict=True):
+        value = frame.astype(np.float64)
+        sums[1] += value * value
+        value -= offset
+        sums[2] += value
+        sums[3] += value * value
+
+
+def whole_parts(
+    frames: NDArray[np.unsignedinteger[Any]], offsets: NDArray[np.float32], parts: int, lift: int
+) -> NDArray[np.uint32]:
+    """Return ``x - b`` in whole parts of a DN, ``lift`` DN higher so that none is negative.
+
+    Args:
+        frames: DN, shape (frame, y, x).
+        offsets: b, DN, shape of the frames.
+        parts: codes in a DN.
+        lift: DN.
+    """
+    out = np.empty(frames.shape, np.uint32)
+    for frame, offset, own in zip(frames, offsets, out, strict=True):
+        value = (frame.astype(np.float64) + lift - offset) * parts + 0.5
+        own[:] = np.maximum(value, 0.0)
     return out
 
 

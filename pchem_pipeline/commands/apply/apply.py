@@ -33,17 +33,15 @@ from pchem_pipeline.commands.apply.tasks import (
     offsets_piece,
 )
 from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.formats.map_files import read_image
-from pchem_pipeline.model.electrons.electrons import number_type
-from pchem_pipeline.model.histogram.count import choose_bins, pixels_by_range
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.session import Command, with_overrides
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.stages.histogram.memory import band_bytes
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
@@ -420,6 +418,8 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
 
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     """Count the frames; return the job with the type of the electron numbers."""
+    from pchem_pipeline.model.electrons.electrons import number_type  # loads compiled loops
+
     n, ny, _ = job.source.shape
     job = replace(job, bins=_bins(context, made.frames, job.parts), window=min(job.window, n))
     _create_counted(context, job)
@@ -438,6 +438,8 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
 
 def _bins(context: StageContext, frames: FrameSequence, parts: int) -> int:
     """Return the bins that the histograms of these frames need."""
+    from pchem_pipeline.model.histogram.count import choose_bins, pixels_by_range
+
     settings = context.config.histogram
     head = min(frames.shape[0], 64)
     wide = settings.max_bins // parts

@@ -1,9 +1,12 @@
-"""What the workers of ``pchem apply`` do with a piece of the frames."""
+"""What the workers of ``pchem apply`` do with a piece of the frames.
+
+What loads compiled loops is imported where it is needed: electrons are done without.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +14,16 @@ from numpy.typing import NDArray
 from pchem_pipeline.commands.apply.characterisation import read_calibration, with_moments, write_moments
 from pchem_pipeline.commands.apply.settings import Job, Piece
 from pchem_pipeline.frames.stream import FrameStream
-from pchem_pipeline.model.electrons.electrons import NumberTables, number_tables
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.common_modes import estimate_offsets, offsets_of_samples
-from pchem_pipeline.use.electrons import electrons, with_its_errors
-from pchem_pipeline.use.electrons_numba import add_up, whole_parts
-from pchem_pipeline.use.exposure import estimate_exposure
+from pchem_pipeline.use.electrons import add_up, electrons, whole_parts, with_its_errors
+
+if TYPE_CHECKING:
+    from pchem_pipeline.model.electrons.electrons import NumberTables
+    from pchem_pipeline.model.histogram.count import RowHistograms
 
 __all__ = ["N_SUMS", "convert_piece", "count_piece", "moments_piece", "offsets_of", "offsets_piece"]
 
@@ -51,11 +54,7 @@ def _calibration(job: Job, rows: slice) -> Calibration:
 
 def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDArray[Any]:
     """Return the codes of samples: DN, or parts of a DN without the offsets."""
-    if not job.removed:
-        return frames
-    out = np.empty(frames.shape, np.uint32)
-    whole_parts(frames, offsets, job.parts, job.lift, out)
-    return out
+    return whole_parts(frames, offsets, job.parts, job.lift) if job.removed else frames
 
 
 # -- errors of the calibration ---------------------------------------------------------------------
@@ -94,6 +93,8 @@ def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
 
 def count_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     """Count the frames of some rows; write the range of their codes, and their exposure if wanted."""
+    from pchem_pipeline.model.histogram.count import HistogramAccumulator
+
     output = open_store(job.output)
     rows = slice(piece.y0, piece.y1)
     shape = (piece.y1 - piece.y0, job.source.shape[2])
@@ -115,6 +116,8 @@ def _write_exposure(
     output: RunStore, found: RowHistograms, calibration: Calibration, job: Job, rows: slice
 ) -> None:
     """Write the exposure of some rows and its errors."""
+    from pchem_pipeline.use.exposure import estimate_exposure
+
     origin = found.origin.astype(np.int64) - job.lift * job.parts
     if "exposure" not in job.kinds:  # a prior needs no errors from the calibration
         calibration = replace(calibration, covariance=np.zeros_like(calibration.covariance))
@@ -143,13 +146,15 @@ def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     tables = _tables(output, job, calibration, rows) if "numbers" in job.kinds else None
     sums = np.zeros((N_SUMS, *calibration.shape))
     sums[4] = np.inf
+    electron_frames = "electrons" in job.kinds
+    room = np.empty((job.depth if electron_frames else 0, *calibration.shape), np.float32)
     with FrameStream(job.source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
         for start, (frames,) in stream:
             offsets = offsets_of(output, job, start, start + len(frames), rows)
             region = (slice(start, start + len(frames)), rows, _WHOLE)
             add_up(frames, offsets, sums)
-            if "electrons" in job.kinds:
-                output.write("applied/electrons", region, electrons(frames, calibration, offsets))
+            if electron_frames:
+                output.write("applied/electrons", region, electrons(frames, calibration, offsets, room))
             if tables is not None:
                 _write_numbers(output, tables, _codes(frames, job, offsets), job, region)
     output.write(
@@ -160,6 +165,8 @@ def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
 
 def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -> NumberTables:
     """Return the electron numbers of the codes of some rows."""
+    from pchem_pipeline.model.electrons.electrons import number_tables
+
     ends = output.read("applied_parts/range", (_WHOLE, rows, _WHOLE)) - job.lift * job.parts
     prior = None
     if job.prior_map is not None:

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR
-from pchem_pipeline.model.law.inputs import Parameters, columns_of, kernel_counts, pack, satellites_of
-from pchem_pipeline.model.law.parameters import FloatArray, usable_pixels
+from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = [

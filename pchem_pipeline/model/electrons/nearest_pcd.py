@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.inputs import Parameters, columns_of
-from pchem_pipeline.model.law.parameters import FloatArray
+from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["nearest_pcd"]

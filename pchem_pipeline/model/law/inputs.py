@@ -10,13 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
-from pchem_pipeline.model.law.parameters import PixelParameters
+from pchem_pipeline.model.law.parameters import Parameters
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
 __all__ = [
     "HasSatellites",
-    "Parameters",
-    "columns_of",
     "kernel_counts",
     "pack",
     "satellites_of",
@@ -44,9 +42,6 @@ class HasSatellites(Protocol):
     @property
     def satellite_weight(self) -> FloatArray:
         """Weight; 0 without any."""
-
-
-Parameters = PixelParameters | Sequence[ArrayLike]
 
 
 def pack(models: Sequence[SampleLaw], n: int) -> Law:
@@ -129,13 +124,6 @@ def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
     for own, part in zip(found, parts, strict=True):
         own[..., : part.shape[-1]] = part  # one row is of all pixels
     return found
-
-
-def columns_of(parameters: Parameters) -> FloatArray:
-    """Return (H, g, mu, sigma) as an array of shape (n, 4)."""
-    each = parameters.maps if isinstance(parameters, PixelParameters) else parameters
-    columns = [np.asarray(values, np.float64).ravel() for values in each]
-    return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 
 def satellites_of(

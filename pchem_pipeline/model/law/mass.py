@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
-from pchem_pipeline.model.law.inputs import Parameters, columns_of, kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.parameters import Parameters, columns_of
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["log_likelihood", "sample_mass", "sample_slopes"]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["FloatArray", "PixelParameters", "UsablePixels", "usable_pixels"]
+__all__ = ["FloatArray", "Parameters", "PixelParameters", "UsablePixels", "columns_of", "usable_pixels"]
 
 FloatArray = NDArray[np.float64]
 
@@ -68,6 +68,16 @@ class PixelParameters:
     def read_noise_e(self) -> FloatArray:
         """Read noise with quantisation, sigma_e- = g sigma, e-."""
         return self.conversion_gain * self.read_noise_dn
+
+
+Parameters = PixelParameters | Sequence[ArrayLike]
+
+
+def columns_of(parameters: Parameters) -> FloatArray:
+    """Return (H, g, mu, sigma) as an array of shape (n, 4)."""
+    each = parameters.maps if isinstance(parameters, PixelParameters) else parameters
+    columns = [np.asarray(values, np.float64).ravel() for values in each]
+    return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 
 @dataclass(frozen=True)

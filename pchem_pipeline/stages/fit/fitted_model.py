@@ -8,7 +8,6 @@ import numpy as np
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
-from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.run.model_versions import Region, model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
 
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.model.electrons.electrons import KnownPixels
     from pchem_pipeline.model.law.sample_law import SampleLaw
     from pchem_pipeline.store.run_store import RunStore
 
@@ -91,5 +91,7 @@ def fitted_satellites(
 
 def fitted_pixels(store: RunStore, region: Region | None = None) -> KnownPixels:
     """Return what the stored fit says of the pixels of a region."""
+    from pchem_pipeline.model.electrons.electrons import KnownPixels  # loads compiled loops
+
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
     return KnownPixels(maps, fitted_law(store, maps, region), fitted_satellites(store, region))

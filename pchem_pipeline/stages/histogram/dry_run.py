@@ -11,16 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.memory import allowed_bytes, band_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
 from pchem_pipeline.run.compilation import mark_path
-from pchem_pipeline.stages.histogram.memory import (
-    allowed_bytes,
-    band_bytes,
-    single_pass_bytes,
-    worker_count,
-)
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 

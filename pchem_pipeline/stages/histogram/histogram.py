@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import frame_statistics
@@ -25,7 +26,7 @@ from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import band_bytes, bytes_per_row
+from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
 
 if TYPE_CHECKING:

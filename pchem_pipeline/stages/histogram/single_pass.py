@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.compute.executor import call_all
+from pchem_pipeline.config.memory import allowed_bytes
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.open import open_frames
@@ -34,7 +35,7 @@ from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram.arrays import create_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes, single_pass_rows
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes, single_pass_rows
 from pchem_pipeline.stages.table import STAGES
 
 if TYPE_CHECKING:

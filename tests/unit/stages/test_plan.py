@@ -11,15 +11,11 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.memory import allowed_bytes, band_bytes
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.stages.histogram import dry_run
 from pchem_pipeline.stages.histogram.dry_run import make_plan
-from pchem_pipeline.stages.histogram.memory import (
-    allowed_bytes,
-    band_bytes,
-    bytes_per_row,
-    single_pass_bytes,
-)
+from pchem_pipeline.stages.histogram.memory import bytes_per_row, single_pass_bytes
 
 #: counts a run in a process of its own, and prints the memory that it took
 PROGRAM = """
