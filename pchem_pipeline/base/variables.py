@@ -203,6 +203,13 @@ def _applied() -> list[Variable]:
         ("quality", _MAP, "uint32", "1", "why a pixel has no value, or deserves caution; 0 is fine"),
         ("row_offset", ("frame", "part", "y"), "float32", "DN", "offset of the row that was taken"),
         ("column_offset", ("frame", "part", "x"), "float32", "DN", "offset of the column, likewise"),
+        (
+            "wave_offset",
+            ("frame", "wave", "coefficient"),
+            "float32",
+            "DN",
+            "c and s of the periodic pattern c cos(2 pi (f_y y + f_x x)) + s sin(...) that was taken",
+        ),
         ("offset_part", ("part", *_MAP), "bool", "1", "pixels that share the offsets of the part"),
         ("noise_before", _MAP, "float64", "e-", "standard deviation over the frames as they came"),
         ("noise_after", _MAP, "float64", "e-", "standard deviation without the offsets"),

@@ -1,4 +1,4 @@
-"""Offsets that pixels of a frame, a row or a column share, all of them or those of a part of the sensor.
+"""Offsets that pixels of a frame, a row, a column or a wave share, all or those of a part of the sensor.
 
 Which a model names, and what they were in some frames.
 """
@@ -18,9 +18,9 @@ from pchem_pipeline.use.calibration import Calibration
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["CommonModes", "Offsets", "estimate_offsets", "offsets_of_samples", "scene_of"]
+__all__ = ["CommonModes", "Offsets", "estimate_offsets", "scene_of"]
 
-FRAME, ROW, COLUMN = range(3)
+FRAME, ROW, COLUMN, WAVE = range(4)
 _LEAST_SCENE = 0.02  # e-
 #: Effects that shift many pixels alike.
 _OFFSETS = (
@@ -42,13 +42,16 @@ class CommonModes:
         removed: tags of the effects that are taken from the frames.
         parts: pixels of each part, shape (part, y, x); parts may overlap.
         variances: of offsets of the frames, rows and columns of each part, DN^2, shape (part, 3); 0: none.
-        left: tags of effects on many pixels alike that no offset of a frame, row or column describes.
+        left: tags of effects on many pixels alike that are not the same in other frames.
+        waves: periodic patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each
+            frame: f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
     """
 
     removed: tuple[str, ...] = ()
     parts: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0, 0), np.bool_))
     variances: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     left: tuple[str, ...] = ()
+    waves: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
 
     @classmethod
     def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
@@ -58,20 +61,34 @@ class CommonModes:
         left = dict.fromkeys(effect.tag for effect, axis, _ in found if axis is None)
         parts: dict[bytes, NDArray[np.bool_]] = {}
         variances: dict[bytes, FloatArray] = {}
+        waves = []
         for effect, axis, variance in found:
             if axis is None or effect.tag in left:
                 continue
             mask = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
             key = mask.tobytes()
             parts[key] = mask
-            variances.setdefault(key, np.zeros(3))[axis] += variance
+            own = variances.setdefault(key, np.zeros(3))
+            if axis == WAVE and variance > 0.0:
+                fields = effect.model_dump()
+                place = float(list(parts).index(key))
+                waves.append([fields["cycles_per_row"], fields["cycles_per_column"], variance, place])
+            elif axis != WAVE:
+                own[axis] += variance
         removed = dict.fromkeys(effect.tag for effect, _, _ in found if effect.tag not in left)
         return cls(
             tuple(removed),
             np.array(list(parts.values()), np.bool_).reshape(-1, *shape),
             np.array(list(variances.values())).reshape(-1, 3),
             tuple(tag for tag in left if tag in _OFFSETS),
+            np.array(waves).reshape(-1, 4),
         )
+
+    def turns(self, shape: tuple[int, int]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Return ``exp(2 pi i f y)`` of rows and columns, whose product is a wave: (wave, y), (wave, x)."""
+        turn = 2j * np.pi
+        rows, columns = (turn * self.waves[:, axis, None] * np.arange(shape[axis]) for axis in (0, 1))
+        return np.exp(rows), np.exp(columns)
 
 
 def _mode(effect: Effect) -> tuple[int | None, float]:
@@ -91,9 +108,8 @@ def _mode(effect: Effect) -> tuple[int | None, float]:
         case "readout_alternation":
             return FRAME, values["alternation_dn"] ** 2
         case "periodic_pickup":
-            along = values["cycles_per_row"] != 0.0, values["cycles_per_column"] != 0.0
-            places = {(False, False): FRAME, (True, False): ROW, (False, True): COLUMN}
-            return places.get(along), values["amplitude_dn"] ** 2 / 2.0
+            still = values["cycles_per_row"] == 0.0 and values["cycles_per_column"] == 0.0
+            return FRAME if still else WAVE, values["amplitude_dn"] ** 2 / 2.0
     return None, 0.0
 
 
@@ -104,30 +120,28 @@ class Offsets:
     Attributes:
         rows: offset of each row, that of the frame included, DN, shape (frame, part, y).
         columns: offset of each column, DN, shape (frame, part, x).
+        waves: c and s of each wave, DN, shape (frame, wave, 2).
         left: variance of a sample's offset that stays unknown, DN^2, shape (frame, part).
     """
 
-    rows: FloatArray
-    columns: FloatArray
-    left: FloatArray
+    rows: NDArray[np.floating[Any]]
+    columns: NDArray[np.floating[Any]]
+    waves: NDArray[np.floating[Any]] = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    left: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def of_samples(self, parts: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Return the offset of each sample, DN, shape (frame, y, x).
-
-        Args:
-            parts: pixels of each part, shape (part, y, x).
-        """
-        return offsets_of_samples(self.rows, self.columns, parts)
-
-
-def offsets_of_samples(
-    rows: NDArray[np.floating[Any]], columns: NDArray[np.floating[Any]], parts: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Return the offset of each sample, DN, shape (frame, y, x); see `Offsets`."""
-    out = np.zeros((len(rows), *parts.shape[1:]), np.float32)
-    for part, mask in enumerate(parts):
-        out += mask * (rows[:, part, :, None] + columns[:, part, None, :]).astype(np.float32)
-    return out
+    def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> NDArray[np.float32]:
+        """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
+        parts = modes.parts[:, rows]
+        out = np.zeros((len(self.rows), *parts.shape[1:]), np.float32)
+        for part, mask in enumerate(parts):
+            out += mask * (self.rows[:, part, rows, None] + self.columns[:, part, None, :]).astype(np.float32)
+        down, along = modes.turns(modes.parts.shape[1:])
+        for wave, part in enumerate(modes.waves[:, 3].astype(int)):
+            pattern = parts[part] * down[wave, rows, None] * along[wave]
+            own = self.waves[:, wave, :, None, None].astype(np.float32)
+            out += own[:, 0] * pattern.real.astype(np.float32)
+            out += own[:, 1] * pattern.imag.astype(np.float32)
+        return out
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
@@ -147,7 +161,7 @@ def estimate_offsets(
     calibration: Calibration,
     modes: CommonModes,
 ) -> Offsets:
-    """Return the most probable offsets of the frames, rows and columns.
+    """Return the most probable offsets of the frames, rows, columns and waves.
 
     The posterior mode of normal offsets under the mixture of all pixels of the line (best linear prediction
     where the electron numbers are known): each pixel says of the offset what its electron number leaves open.
@@ -163,6 +177,11 @@ def estimate_offsets(
     n, ny, nx = frames.shape
     m = len(modes.parts)
     rows, columns, left = np.empty((n, m, ny)), np.empty((n, m, nx)), np.empty((n, m))
+    waves = np.empty((n, len(modes.waves), 2))
+    down, along = (np.stack([each.real, each.imag], axis=1) for each in modes.turns((ny, nx)))
+    tables = common_modes_numba.Waves(
+        down, along, modes.waves[:, 2].copy(), modes.waves[:, 3].astype(np.int64)
+    )
     sigma = np.sqrt(calibration.noise_variance_dn2)
     known = np.where(np.isfinite(sigma), scene, np.nan)
     common_modes_numba.find_offsets(
@@ -173,8 +192,10 @@ def estimate_offsets(
         sigma,
         modes.parts,
         modes.variances,
+        tables,
         rows,
         columns,
+        waves,
         left,
     )
-    return Offsets(rows, columns, left)
+    return Offsets(rows, columns, waves, left)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = ["find_offsets"]
+__all__ = ["Waves", "find_offsets"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -18,6 +18,22 @@ BoolArray = NDArray[np.bool_]
 _ROUNDS = 5  # of the expansion in the offsets
 _SWEEPS = 4  # of frame, rows and columns within one
 _LEAST_INFORMATION = 0.05  # of that of a sample whose electron number is known
+
+
+class Waves(NamedTuple):
+    """Periodic patterns: the angle of a sample is the sum of those of its row and of its column.
+
+    Attributes:
+        down: cosine and sine of the angle of each row, shape (wave, 2, y).
+        along: of each column, shape (wave, 2, x).
+        variances: of the coefficients of cosine and sine, DN^2, shape (wave,).
+        parts: number of the part of the sensor, shape (wave,).
+    """
+
+    down: FloatArray
+    along: FloatArray
+    variances: FloatArray
+    parts: NDArray[np.int64]
 
 
 @kernel
@@ -123,17 +139,58 @@ def _climb_parts(
     whole: FloatArray,
     rows: FloatArray,
     columns: FloatArray,
+    waves: Waves,
+    coefficients: FloatArray,
     offset: FloatArray,
     own: FloatArray,
 ) -> None:
-    """Bring the offsets of all parts to the top of a quadratic form, part by part."""
-    for _ in range(1 if len(parts) == 1 else _SWEEPS):
+    """Bring the offsets of all parts to the top of a quadratic form, part by part, wave by wave."""
+    for _ in range(1 if len(parts) + len(coefficients) == 1 else _SWEEPS):
+        for wave in range(len(coefficients)):
+            _climb_wave(form, parts[waves.parts[wave]], waves, wave, coefficients[wave], offset)
         for part in range(len(parts)):
             mask, row, column = parts[part], rows[part], columns[part]
             _add(mask, -1.0, whole[part], row, column, offset)
             _of_part(form, mask, offset, own)
             whole[part] = _climb(own, variances[part], whole[part], row, column)
             _add(mask, 1.0, whole[part], row, column, offset)
+
+
+@kernel
+def _climb_wave(
+    form: FloatArray,
+    mask: BoolArray,
+    waves: Waves,
+    wave: int,
+    coefficients: FloatArray,
+    offset: FloatArray,
+) -> None:
+    """Bring the two coefficients of a wave to the top, all else held; move the offsets of its samples."""
+    down, along = waves.down[wave], waves.along[wave]
+    both = across = other = 0.0  # sums of the squares of cosine and sine, and of their product
+    top_c = top_s = 0.0
+    for y in range(mask.shape[0]):
+        for x in range(mask.shape[1]):
+            if mask[y, x]:
+                c = down[0, y] * along[0, x] - down[1, y] * along[1, x]
+                s = down[1, y] * along[0, x] + down[0, y] * along[1, x]
+                weight = form[1, y, x]
+                rest = offset[y, x] - coefficients[0] * c - coefficients[1] * s
+                slope = form[0, y, x] - weight * rest
+                top_c, top_s = top_c + slope * c, top_s + slope * s
+                both, across, other = both + weight * c * c, across + weight * c * s, other + weight * s * s
+    both, other = both + 1.0 / waves.variances[wave], other + 1.0 / waves.variances[wave]
+    size = both * other - across * across
+    move_c = (other * top_c - across * top_s) / size - coefficients[0]
+    move_s = (both * top_s - across * top_c) / size - coefficients[1]
+    coefficients[0] += move_c
+    coefficients[1] += move_s
+    for y in range(mask.shape[0]):
+        for x in range(mask.shape[1]):
+            if mask[y, x]:
+                c = down[0, y] * along[0, x] - down[1, y] * along[1, x]
+                s = down[1, y] * along[0, x] + down[0, y] * along[1, x]
+                offset[y, x] += move_c * c + move_s * s
 
 
 @kernel
@@ -201,14 +258,17 @@ def find_offsets(
     sigma: FloatArray,
     parts: BoolArray,
     variances: FloatArray,
+    waves: Waves,
     rows: FloatArray,
     columns: FloatArray,
+    coefficients: FloatArray,
     left: FloatArray,
 ) -> None:
-    """Fill the most probable offsets of rows and columns of each frame, that of the frame with its rows.
+    """Fill the most probable offsets of rows, columns and waves of each frame.
 
-    Offsets are normal with the given variances; 0 is no such offset. The log-likelihood of all pixels is
-    expanded around the offsets, and the quadratic form is climbed by turns.
+    That of the whole frame is with its rows. Offsets are normal with the given variances; 0 is no such
+    offset. The log-likelihood of all pixels is expanded around the offsets, and the quadratic form is climbed
+    by turns.
 
     Args:
         frames: DN, shape (frame, y, x).
@@ -218,8 +278,10 @@ def find_offsets(
         sigma: noise of the pixel alone, DN, shape (y, x).
         parts: pixels that share offsets, shape (part, y, x).
         variances: of the offsets of frames, rows and columns of each part, DN^2, shape (part, 3).
+        waves: periodic patterns.
         rows: out, DN, shape (frame, part, y).
         columns: out, DN, shape (frame, part, x).
+        coefficients: out, of cosine and sine of the waves, DN, shape (frame, wave, 2).
         left: out, variance of a sample's offset after all that is known, DN^2, shape (frame, part).
     """
     n_parts, ny, nx = parts.shape
@@ -229,12 +291,19 @@ def find_offsets(
         whole[:] = 0.0
         rows[t] = 0.0
         columns[t] = 0.0
+        coefficients[t] = 0.0
         offset[:] = 0.0
         _from_means(frames[t], exposure, gain, bias, sigma, form)
-        _climb_parts(form, parts, variances, whole, rows[t], columns[t], offset, own)
+        _climb_parts(form, parts, variances, whole, rows[t], columns[t], waves, coefficients[t], offset, own)
         for _ in range(_ROUNDS - 1):
             _from_electrons(frames[t], exposure, gain, bias, sigma, offset, form)
-            _climb_parts(form, parts, variances, whole, rows[t], columns[t], offset, own)
+            _climb_parts(
+                form, parts, variances, whole, rows[t], columns[t], waves, coefficients[t], offset, own
+            )
         for part in range(n_parts):
             rows[t, part] += whole[part]
             left[t, part] = _unknown(form[1], parts[part], variances[part])
+        for wave, part in enumerate(waves.parts):
+            # each coefficient is known by half of the samples' information, and cos^2 + sin^2 = 1
+            known = 0.5 * np.sum(form[1] * parts[part])
+            left[t, part] += 1.0 / (known + 1.0 / waves.variances[wave])

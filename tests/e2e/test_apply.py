@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -143,6 +144,19 @@ def test_nothing_is_overwritten_without_force(lab):
         given = ["--output", "mine", "--format", kind, "--force"]
         assert lab("apply", "run.zarr", "night.tif", *given).code == 2
     assert (lab.folder / "mine" / "notes.txt").read_text() == "keep"
+
+
+def test_electrons_start_without_compiled_loops(night, tmp_path):
+    """numba and scipy take as long to load as a thousand frames of 256 x 256 pixels to calibrate."""
+    code = (
+        "import sys\nfrom pchem_pipeline.cli import app\ntry: app.main(sys.argv[1:])\n"
+        "except SystemExit: pass\nprint(*{'numba', 'scipy', 'pandas', 'xarray'} & set(sys.modules), 'done')"
+    )
+    frames = [str(night / "run.zarr"), str(night / "night.tif"), "--output", str(tmp_path / "out.zarr")]
+    given = [sys.executable, "-c", code, "apply", *frames, "--what", "electrons"]
+    said = subprocess.run(given, capture_output=True, text=True)
+    assert said.stdout.splitlines()[-1] == "done", said.stdout + said.stderr
+    assert (tmp_path / "out.zarr").exists()
 
 
 def test_tiff_and_fits_hold_what_zarr_holds(lab):

@@ -148,7 +148,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     remarks = check_camera(frames, sensor) + check_level(frames, calibration)
     if modes.left and wanted.remove:
         remarks.append(
-            f"{', '.join(modes.left)}: no offset of frames, rows or columns, so it stays in the frames"
+            f"{', '.join(modes.left)}: of a time of the characterisation, so it stays in the frames"
         )
     known = calibration.usable
     noise = (calibration.conversion_gain * calibration.read_noise_dn)[known]
@@ -401,6 +401,16 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
             (n, len(parts), length),
             chunks=(job.depth, len(parts), length),
             removed=list(job.removed),
+        )
+    waves = job.modes.waves
+    if len(waves):
+        context.create(
+            "applied/wave_offset",
+            (n, len(waves), 2),
+            chunks=(job.depth, len(waves), 2),
+            cycles_per_row=waves[:, 0].tolist(),
+            cycles_per_column=waves[:, 1].tolist(),
+            part=waves[:, 3].astype(int).tolist(),
         )
     context.store.write_array("applied/offset_part", parts)
     length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (8 * ny * nx * job.depth)))

@@ -18,7 +18,7 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
-from pchem_pipeline.use.common_modes import estimate_offsets, offsets_of_samples
+from pchem_pipeline.use.common_modes import Offsets, estimate_offsets
 from pchem_pipeline.use.electrons import add_up, electrons, whole_parts, with_its_errors
 
 if TYPE_CHECKING:
@@ -38,11 +38,9 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> NDA
     if not job.removed:
         return np.zeros((0, 0, 0), np.float32)
     frames = slice(t0, t1)
-    return offsets_of_samples(
-        output.read("applied/row_offset", (frames, _WHOLE, rows)),
-        output.read("applied/column_offset", (frames, _WHOLE, _WHOLE)),
-        job.modes.parts[:, rows],
-    )
+    names = ("row_offset", "column_offset", *(("wave_offset",) if len(job.modes.waves) else ()))
+    found = Offsets(*(output.read(f"applied/{name}", (frames, _WHOLE, _WHOLE)) for name in names))
+    return found.of_samples(job.modes, rows)
 
 
 def _calibration(job: Job, rows: slice) -> Calibration:
@@ -83,8 +81,10 @@ def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
             region = (slice(start, start + len(frames)), _WHOLE, _WHOLE)
             output.write("applied/row_offset", region, found.rows.astype(np.float32))
             output.write("applied/column_offset", region, found.columns.astype(np.float32))
+            if len(job.modes.waves):
+                output.write("applied/wave_offset", region, found.waves.astype(np.float32))
             left += found.left.sum(axis=0)
-            largest = max(largest, float(abs(found.of_samples(job.modes.parts)).max()))
+            largest = max(largest, float(abs(found.of_samples(job.modes)).max()))
     return {"left": left.tolist(), "largest": largest}
 
 

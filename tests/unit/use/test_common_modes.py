@@ -30,13 +30,13 @@ def taken(seed, read_noise, spread, exposure=1.0):
     modes = CommonModes(("row_noise",), np.ones((1, *SHAPE), bool), variances)
     calibration = camera.calibration()
     scene = scene_of(frames.mean(axis=0), calibration)
-    return camera, true, frames, offset, estimate_offsets(frames, scene, calibration, modes)
+    return camera, true, frames, offset, modes, estimate_offsets(frames, scene, calibration, modes)
 
 
 @pytest.mark.parametrize(("read_noise", "share"), [((0.15, 0.25), 0.1), ((0.3, 0.45), 0.5)])
 def test_offsets_are_as_near_as_they_say(read_noise, share):
-    camera, true, frames, offset, found = taken(50, read_noise, SPREAD)
-    total = found.of_samples(EVERYWHERE)
+    camera, true, frames, offset, modes, found = taken(50, read_noise, SPREAD)
+    total = found.of_samples(modes)
     variance = ((total - offset) ** 2).mean()
     # where peaks overlap, a sample says less of an offset than its read noise allows
     assert variance < share * (offset**2).mean()
@@ -67,9 +67,10 @@ def test_a_model_names_its_offsets():
     )
     modes = CommonModes.of_model(effects, SHAPE)
     assert modes.removed == ("row_noise", "column_noise", "frame_noise", "bias_drift", "periodic_pickup")
-    np.testing.assert_allclose(modes.variances[0], (0.09 + 0.04, 0.25 + 0.5, 0.16))
-    slanted = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.1, cycles_per_column=0.2)
-    assert CommonModes.of_model([slanted], SHAPE).left == ("periodic_pickup",)
+    np.testing.assert_allclose(modes.variances[0], (0.09 + 0.04, 0.25, 0.16))
+    np.testing.assert_allclose(modes.waves, [[0.1, 0.0, 0.5, 0.0]])
+    still = CommonModes.of_model([PeriodicPickup(amplitude_dn=1.0, cycles_per_frame=0.2)], SHAPE)
+    assert (len(still.waves), still.variances[0, 0]) == (0, 0.5)
 
 
 def test_pixels_without_calibration_tell_nothing():
@@ -99,7 +100,7 @@ def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
     _, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
     calibration = camera.calibration()
     found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
-    error = (found.of_samples(modes.parts) - offset) ** 2
+    error = (found.of_samples(modes) - offset) ** 2
     # a frame's offset is known from 960 samples, a row's from 16
     inside, outside = error[..., 24:].mean(), error[..., :24].mean()
     assert outside < 0.02
@@ -108,9 +109,64 @@ def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
     # taken for all of the row, the tap's noise would be smeared over the pixels beside it
     smeared = CommonModes.of_model([RowNoise(row_noise_dn=1.5), whole], SHAPE)
     wrong = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, smeared)
-    assert ((wrong.of_samples(smeared.parts) - offset) ** 2)[..., :24].mean() > 10 * outside
+    assert ((wrong.of_samples(smeared) - offset) ** 2)[..., :24].mean() > 10 * outside
 
 
 def test_what_has_a_time_stays():
     modes = CommonModes.of_model([RowNoise(row_noise_dn=1.0, when="frames=3:9")], SHAPE)
     assert (modes.removed, modes.left) == ((), ("row_noise",))
+
+
+WAVES = [(0.13, 0.21, "all"), (-0.31, 0.07, "all"), (0.17, 0.0, "all"), (0.0, 0.23, "columns=8:32")]
+
+
+@pytest.mark.parametrize("amplitude", [0.4, 6.0])
+@pytest.mark.parametrize(("per_row", "per_column", "region"), WAVES)
+def test_pickup_of_any_orientation_is_taken_from_each_frame(per_row, per_column, region, amplitude):
+    """Amplitude and phase change from frame to frame; a wave along rows costs two numbers, not one a row."""
+    rng = np.random.default_rng(55)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.3))
+    y, x = np.arange(SHAPE[0])[:, None], np.arange(SHAPE[1])
+    size, phase = rng.rayleigh(amplitude / np.sqrt(2), (N_FRAMES, 1, 1)), rng.uniform(0, 7, (N_FRAMES, 1, 1))
+    inside = (x >= 8) & (x < 32) if region != "all" else True
+    offset = size * np.sin(2 * np.pi * (per_row * y + per_column * x) + phase) * inside
+    true, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
+    pickup = PeriodicPickup(
+        amplitude_dn=amplitude,
+        cycles_per_row=per_row,
+        cycles_per_column=per_column,
+        region=None if region == "all" else region,
+    )
+    modes = CommonModes.of_model([pickup], SHAPE)
+    assert modes.removed == ("periodic_pickup",)
+    calibration = camera.calibration()
+    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    total = found.of_samples(modes)
+    np.testing.assert_allclose(found.of_samples(modes, slice(5, 9)), total[:, 5:9])
+    error = ((total - offset) ** 2)[np.broadcast_to(inside, offset.shape)]
+    # two numbers of some thousand samples: what stays is known, and little beside a sample's 2.5 DN
+    assert 0.6 < error.mean() / found.left.mean() < 1.6
+    assert error.mean() < 0.05
+    before, after = ((electrons(frames, calibration, each) - true).var() for each in (None, total))
+    own = (camera.read_noise_e**2 + camera.gain**2 / 12).mean()
+    if amplitude > 1.0:
+        assert before > 1.5 * own
+    assert abs(after / own - 1) < 0.02
+
+
+def test_a_wave_and_noise_of_rows_are_told_apart():
+    rng = np.random.default_rng(56)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.25))
+    y, x = np.arange(SHAPE[0])[:, None], np.arange(SHAPE[1])
+    phase = rng.uniform(0, 7, (N_FRAMES, 1, 1))
+    offset = 2.0 * np.sin(2 * np.pi * (0.13 * y + 0.21 * x) + phase)
+    offset = offset + 1.5 * rng.standard_normal((N_FRAMES, SHAPE[0], 1))
+    _, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
+    slanted = PeriodicPickup(amplitude_dn=2.0, cycles_per_row=0.13, cycles_per_column=0.21)
+    modes = CommonModes.of_model([RowNoise(row_noise_dn=1.5), slanted], SHAPE)
+    assert len(modes.parts) == 1
+    calibration = camera.calibration()
+    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    error = ((found.of_samples(modes) - offset) ** 2).mean()
+    assert 0.6 < error / found.left.mean() < 1.6
+    assert error < 0.1 * (offset**2).mean()
