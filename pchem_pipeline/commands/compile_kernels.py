@@ -1,7 +1,8 @@
 """Compile the kernels that a run will need: the same stages on a few invented pixels, in a folder of its own.
 
 :mod:`pchem_pipeline.run.compilation` starts this in a process of its own, with the configuration on its
-standard input. What is compiled is what the stages call: there is no list of kernels to keep up to date.
+standard input. What is compiled is what the stages call: there is no list of kernels to keep up to date. A
+stage that needs frames says itself what compiles its kernels.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.compilation import mark_path
+from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.table import STAGES
@@ -26,13 +28,23 @@ __all__ = ["compile_kernels"]
 
 
 def compile_kernels(content: Mapping[str, Any], stages: Sequence[str]) -> None:
-    """Run stages, and those that they need, on invented histograms; then mark their kernels as compiled.
+    """Run stages on invented histograms, or do what they say; then mark their kernels as compiled.
 
     Args:
         content: the configuration of a run, whose input, store and workers are not used.
-        stages: names of stages that work on ready-made histograms.
+        stages: names of stages that work on ready-made histograms, or say what compiles their kernels.
     """
     config = make_config(content, "the run")
+    done = [name for name in stages if STAGES[name].kernels is None]
+    if done:
+        _do_invented(config, content, done)
+    for place in filter(None, (STAGES[name].kernels for name in stages)):
+        imported(place)(config)
+    mark_path(config, stages).touch()
+
+
+def _do_invented(config: RunConfig, content: Mapping[str, Any], stages: Sequence[str]) -> None:
+    """Run stages, and those that they need, in a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="pchem-kernels-") as place:
         folder = Path(place)
         small = make_config(
@@ -47,7 +59,6 @@ def compile_kernels(content: Mapping[str, Any], stages: Sequence[str]) -> None:
         )
         target = Target(small, folder, folder / "run.zarr")
         run_stages(target, _with_upstream(stages), Command(progress="off", quiet=True))
-    mark_path(config, stages).touch()
 
 
 def _invented_input(config: RunConfig, folder: Path) -> dict[str, Any]:

@@ -64,7 +64,9 @@ class Stage:
             which say what the stage will take.
         status_words: array of status words that it writes; too many failed pixels end a command in an error.
         compiled_ahead: compile its kernels in a second process while the stages before it run; it works on
-            ready-made histograms.
+            ready-made histograms, or has ``kernels``.
+        kernels: ``"module:function"`` that takes the configuration and compiles its kernels; None: they are
+            compiled by doing the stage on invented histograms.
     """
 
     name: str
@@ -84,3 +86,4 @@ class Stage:
     plan: str | None = None
     status_words: str | None = None
     compiled_ahead: bool = False
+    kernels: str | None = None

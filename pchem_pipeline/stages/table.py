@@ -156,6 +156,8 @@ _ALL = (
         run=f"{_HERE}.discrepancy.discrepancy:run",
         identity=f"{_HERE}.identities:search_start",
         on_demand=True,
+        compiled_ahead=True,
+        kernels=f"{_HERE}.discrepancy.discrepancy:compile_kernels",
     ),
     Stage(
         "methods",

@@ -171,6 +171,6 @@ def _hits(frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_]) -> I
     seen = (laws.moments[:, columns_of.SEEN_HIGH] > 0).reshape(usable.shape) & usable
     last = (laws.support[:, 0] + laws.support[:, 1] - 1).reshape(usable.shape)
     hits = np.zeros((MOST_HITS, 4), np.int64)
-    found = kernel.find_hits(frames, np.argwhere(seen), last[seen], hits)
+    found = kernel.find_hits(frames, np.ascontiguousarray(np.argwhere(seen)), last[seen], hits)
     hits = hits[: min(found, MOST_HITS)]
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numba
@@ -25,7 +26,7 @@ from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood, evaluation_arguments
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["cells_search", "climb", "compile_fit", "density_search", "regression_basis"]
+__all__ = ["cells_search", "climb", "compilations", "compile_fit", "density_search", "regression_basis"]
 
 _VECTOR = np.zeros(1)
 _OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64, numba.types.int64))
@@ -60,14 +61,19 @@ def _search_arguments() -> tuple[Any, ...]:
 
 @functools.cache
 def compile_fit(given: Any, cells: bool) -> None:
-    """Compile what a fit of tiles calls, the longest first; of several processes each compiles a share.
+    """Compile what a fit of tiles calls; of several processes each compiles a share.
 
     Args:
         given: type (of numba) of the :class:`.tile_numba.Histograms`.
         cells: with the mass of cells; else with the density.
     """
+    in_any_order(compilations(given, cells))
+
+
+def compilations(given: Any, cells: bool) -> list[Callable[[], Any]]:
+    """Return what compiles a fit, kernel by kernel, the longest first; see :func:`compile_fit`."""
     if numba.config.DISABLE_JIT:
-        return
+        return []
     evaluate = _address(numba.types.float64, evaluation_arguments())
     climb_on = _address(_OUTCOME, _climb_arguments())
     search = _address(_FOUND, _search_arguments())
@@ -86,7 +92,7 @@ def compile_fit(given: Any, cells: bool) -> None:
         kernels.insert(1, (rounding_numba.rounding_tile, (rows, _VECTOR, evaluate, rows)))
     first, *others = (functools.partial(each.compile, tuple(types_of(of))) for each, of in kernels)
     addressed = (cells_search, cells_likelihood) if cells else (density_search, density_likelihood)
-    in_any_order([first, *addressed, climb, *others])
+    return [first, *addressed, climb, *others]
 
 
 @functools.cache

@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import SampleHistograms, find_in_histograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
+from pchem_pipeline.discrepancy.observe.compilation import compile_observation
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
@@ -20,15 +22,22 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
+from pchem_pipeline.simulate.chain import dn_dtype
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.survey import survey
 from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["run"]
+__all__ = ["compile_kernels", "run"]
 
 _STAGE = "discrepancy"
+
+
+def compile_kernels(config: RunConfig) -> None:
+    """Compile what the search in frames calls; that in histograms alone calls little else than a fit."""
+    if not config.input.samples:
+        compile_observation(dn_dtype(config.input.bit_depth or 16))
 
 
 @dataclass(frozen=True)
@@ -70,6 +79,7 @@ def _run_frames(
     source = open_source(context)
     block_length(source.shape[0], settings.block_frames)
     tell("looking at every pixel and every frame")
+    compile_observation(source.dtype)
     seen = survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
     window = choose_window(source.shape, settings, roi, seen.places)
     found = find_discrepancies(

@@ -12,6 +12,7 @@ from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.base.kernel import _Kernel
 from pchem_pipeline.commands.compile_kernels import compile_kernels
 from pchem_pipeline.config.load import make_config
+from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.run import compilation
 from pchem_pipeline.run.compilation import (
     announced,
@@ -23,6 +24,9 @@ from pchem_pipeline.run.compilation import (
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.maps import draw_truth
+from pchem_pipeline.simulate.settings import SimulateSettings
 
 CONFIG = {"input": {"files": ["frames.npy"], "bit_depth": 14}, "compute": {"workers": 2}}
 
@@ -161,3 +165,17 @@ def test_what_is_compiled_ahead_is_what_a_run_calls(tmp_path):
     missed = {(module, name) for module, name, _ in variants() - ahead}
     assert {module.rpartition(".")[2] for module, _ in missed} <= {"count_numba", "summaries_numba"}
     assert Path(tmp_path / "run.zarr").exists()
+
+
+def test_what_a_search_calls_is_compiled_ahead(tmp_path):
+    config = make_config(CONFIG, "test")
+    compile_kernels(config.model_dump(mode="json", by_alias=True), ["discrepancy"])
+    assert mark_path(config, ["discrepancy"]).exists()
+    settings = SimulateSettings(shape=(5, 4), n_frames=3)
+    truth = draw_truth(settings)
+    ahead = variants()
+    rng = np.random.default_rng(3)
+    frames = np.rint(100 + 12 * (rng.poisson(2.0, (400, 6, 5)) + 0.25 * rng.standard_normal((400, 6, 5))))
+    observe(frames.astype(np.uint16), np.arange(400), n_run=400, block_frames=50)
+    simulate_block(truth, settings, (0, 3), electron_frames=0)
+    assert {name for _, name, _ in variants() - ahead} == set()
