@@ -43,6 +43,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import (
+    MANY_MISTAKEN,
     Refit,
     Sensor,
     expected_codes,
@@ -489,7 +490,18 @@ class FrameExplainer:
         own, fit = self.frames.effects(model), self._refit(model)
         sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
         self.lost = sensor.lost
-        return fit, sensor
+        return fit, self._corrected(sensor, model) if model else sensor
+
+    def _corrected(self, sensor: Sensor, model: tuple[Effect, ...]) -> Sensor:
+        """Return sensors that, simulated with effects and fitted without, come out as the data do."""
+        if self.plain.ambiguous > MANY_MISTAKEN:
+            return sensor
+        seed = self._seed("fitted")
+        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
+        one = Replicate("fitted", sensor.draw(seed), model, seed, taken)
+        self.n_replicates += 1
+        self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
+        return sensor.corrected(self.plain.maps, one.fitted())
 
     def _replicates(
         self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.population import (
     Posterior,
+    clipped_mean,
     lost_variance,
     posterior_of,
     posterior_of_estimates,
+    to_theta,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
@@ -25,14 +27,16 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["Refit", "Sensor", "expected_codes", "learn_sensor", "refit_maps"]
+__all__ = ["MANY_MISTAKEN", "Refit", "Sensor", "expected_codes", "learn_sensor", "refit_maps"]
 
 FloatArray = NDArray[np.float64]
 
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
+_LEAST_LEFT = 0.2  # of the fitted variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
-_MANY_MISTAKEN = 0.3  # share of pixels from which what is learnt does not rest on their maxima
+#: Share of pixels with a mistaken bias from which what is learnt does not rest on their maxima.
+MANY_MISTAKEN = 0.3
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 
 
@@ -155,6 +159,25 @@ class Sensor:
         values[self.drawn] = self.posterior.draw(np.random.default_rng(seed))
         return PixelMaps.known(np.moveaxis(values, -1, 0), self.drawn)
 
+    def corrected(self, wanted: PixelMaps, simulated: PixelMaps) -> Sensor:
+        """Return sensors of which plain fits come out as wanted, given those of one that was simulated.
+
+        An effect of which the law knows only a part (what a neighbour adds, a sample that is replaced) is in
+        the fitted parameters, mostly the read noise, and simulated on top would be there twice.
+
+        Args:
+            wanted: plain fits of the data.
+            simulated: of a sensor drawn from this one, with the effects of the model.
+        """
+        both = (wanted.usable & simulated.usable).ravel()
+        theta = [
+            to_theta(np.stack([m.ravel()[both] for m in fit.maps], axis=1)) for fit in (wanted, simulated)
+        ]
+        change = clipped_mean(theta[0] - theta[1])
+        # variances add up, their logarithms do not
+        change[3] = np.log(max(2.0 - np.exp(-change[3]), _LEAST_LEFT))
+        return replace(self, posterior=self.posterior.moved(change))
+
     def usual(self, seed: int) -> PixelMaps:
         """Return the same of the pixels whose fit can be relied upon."""
         maps = self.draw(seed)
@@ -205,9 +228,11 @@ def learn_sensor(
             mistaken=mistaken,
         )
         if lost is None:
-            known = mistaken <= _MANY_MISTAKEN
+            known = mistaken <= MANY_MISTAKEN
             lost = lost_variance(posterior, counts[drawn].sum(axis=1), law.of(drawn)) if known else 0.0
-    return Sensor(posterior.raised(lost), drawn.reshape(maps.usable.shape), maps.usable, lost)
+    return Sensor(
+        posterior.moved(np.array([0.0, 0.0, 0.0, lost])), drawn.reshape(maps.usable.shape), maps.usable, lost
+    )
 
 
 def _law_of_all(effects: Sequence[Effect], parameters: FloatArray, places: PixelPlaces) -> SampleLaw | None:

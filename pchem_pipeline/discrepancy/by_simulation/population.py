@@ -29,6 +29,7 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 __all__ = [
     "Population",
     "Posterior",
+    "clipped_mean",
     "lost_variance",
     "posterior_of",
     "posterior_of_estimates",
@@ -107,11 +108,10 @@ class Posterior:
         best = self.weight.argmax(axis=0)
         return to_parameters(self.theta[best, np.arange(best.size)])
 
-    def raised(self, log_variance: float) -> Posterior:
-        """Return it with so much more log sigma_R^2 in all pixels."""
-        more = np.array([0.0, 0.0, 0.0, log_variance])
-        population = replace(self.population, centre=self.population.centre + more)
-        return replace(self, population=population, theta=self.theta + more)
+    def moved(self, change: FloatArray) -> Posterior:
+        """Return it with another theta in all pixels, by ``change``, shape (4,)."""
+        population = replace(self.population, centre=self.population.centre + change)
+        return replace(self, population=population, theta=self.theta + change)
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error."""
@@ -200,10 +200,14 @@ def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: Sample
     mass = np.maximum(sample_mass(own, [np.ascontiguousarray(column) for column in drawn.T], codes), 0.0)
     counts = rng.multinomial(totals[some].astype(np.int64), mass / mass.sum(axis=1, keepdims=True))
     again = posterior_of(counts, first, drawn, own, mistaken=0.0)
-    off = to_theta(again.draw(rng))[:, 3] - to_theta(drawn)[:, 3]
-    middle = np.median(off)
-    widest = 3.0 * _MAD * np.median(np.abs(off - middle))
-    return -float(np.clip(off, middle - widest, middle + widest).mean())
+    return -float(clipped_mean(to_theta(again.draw(rng)) - to_theta(drawn))[3])
+
+
+def clipped_mean(values: FloatArray) -> FloatArray:
+    """Return means over the pixels, (n, m) -> (m,), pixels far from the others cut to three deviations."""
+    middle = np.median(values, axis=0)
+    widest = 3.0 * _MAD * np.median(np.abs(values - middle), axis=0)
+    return np.asarray(np.clip(values, middle - widest, middle + widest).mean(axis=0))
 
 
 def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Posterior:

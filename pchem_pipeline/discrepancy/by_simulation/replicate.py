@@ -92,6 +92,11 @@ class Replicate:
         """Simulate, and observe each part."""
         return tuple(evidence for _, _, evidence in self._observed())
 
+    def fitted(self) -> PixelMaps:
+        """Simulate, and fit the frames of the first part, from nothing, without any effect."""
+        frames = simulate_frames(self.maps, self.effects, self.seed, self.acquisition)
+        return fitted_maps(frames, ~self.maps.usable)
+
     def _observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], NDArray[np.int64], Evidence]]:
         """Simulate; yield the frames of each part, their numbers and their evidence."""
         taken, start = self.acquisition, self.maps

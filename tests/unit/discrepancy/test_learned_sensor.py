@@ -1,5 +1,7 @@
 """Sensors for simulations: their pixels scatter as the true parameters do, not as fitted ones."""
 
+from typing import ClassVar, Literal
+
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
@@ -14,6 +16,7 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import (
     truth_of,
 )
 from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 SPREAD = (0.25, 0.015, 0.06, 3.0)
@@ -130,5 +133,45 @@ def test_read_noise_that_the_fit_takes_for_signal_is_given_back():
     after = off(sensor.posterior)
     # of the median, and of what was learnt again from 500 pixels
     error = 1.25 * 1.48 * np.median(np.abs(after - np.median(after))) * np.hypot(1 / 26, 1 / np.sqrt(500))
-    assert np.median(off(sensor.posterior.raised(-sensor.lost))) < -3.0 * error
+    assert np.median(off(sensor.posterior.moved(np.array([0.0, 0.0, 0.0, -sensor.lost])))) < -3.0 * error
     assert abs(np.median(after)) < 3.0 * error
+
+
+class ColumnMemory(Effect):
+    """A part of the row read before stays on the column; the law of a pixel does not know of it."""
+
+    tag: Literal["column_memory"] = "column_memory"
+    plane: ClassVar[Plane] = Plane.ADC
+    share: float = 0.12
+
+    def halo(self):
+        return 1
+
+    def apply(self, values, context):
+        result = values.copy()
+        result[:, 1:] += self.share * values[:, :-1]
+        return result
+
+
+def test_what_an_effect_without_a_law_adds_is_not_simulated_twice():
+    """Its variance is in the fitted read noise; with the effect on top there would be too much of it."""
+    camera, effect = PlainCamera(0.25, 1.5, 12.0, (20, 20), 900, SPREAD), ColumnMemory()
+    truth = camera.maps(np.random.default_rng(9))[3]
+    frames = camera.frames(9).astype(float)
+    frames[:, 1:] += effect.share * frames[:, :-1]
+    frames = np.rint(frames).astype(np.uint16)
+    numbers = np.arange(len(frames))
+    seen = observe(frames, numbers, n_run=len(frames), block_frames=50)
+    sensor = learn_sensor(frames, numbers, Refit(seen.maps, {}, seen.covariance), (), seen.ambiguous)
+    taken = Acquisition(numbers, len(frames), 50, 12)
+
+    def too_noisy(one):
+        drawn = one.draw(4)
+        noise = np.log(drawn.read_noise_dn * drawn.conversion_gain / truth)[1:][drawn.usable[1:]]
+        return np.median(noise), 1.25 * noise.std() / np.sqrt(noise.size)
+
+    before, error = too_noisy(sensor)
+    assert before > 5.0 * error
+    again = Replicate("fitted", sensor.draw(5), (effect,), 5, taken).fitted()
+    after, error = too_noisy(sensor.corrected(seen.maps, again))
+    assert abs(after) < max(3.0 * error, before / 5.0)
