@@ -60,8 +60,8 @@ def characterise(
     settings nothing is done again.
 
     Args:
-        frames: whole DN, shape (frame, y, x): a numpy array, a dask array (computed block by block) or
-            anything whose slices along the frames become one.
+        frames: whole DN, shape (frame, y, x): a numpy array, a list of frames, a dask array (computed block
+            by block) or anything whose slices along the frames become an array.
         store: folder of the run, such as ``"night.zarr"``; None: a temporary one that goes with the run.
         integration_time: of a frame, s.
         bit_depth: bits of the ADC.
@@ -78,6 +78,7 @@ def characterise(
         IncompleteRunError: more pixels have no value than the settings allow; the store has the run.
     """
     require_xarray("characterise")
+    frames = frames if hasattr(frames, "shape") else np.asarray(frames)
     _check(frames)
     temporary = None if store is not None else Path(tempfile.mkdtemp(prefix="pchem-"))
     try:
@@ -126,8 +127,11 @@ def _check(frames: Any) -> None:
         ConfigError: the message says what it should be.
     """
     shape, dtype = getattr(frames, "shape", ()), np.dtype(getattr(frames, "dtype", object))
-    if len(shape) != 3:
-        raise ConfigError(f"frames of shape {tuple(shape)}: give an array (frame, y, x)")
+    if len(shape) != 3 or shape[0] < 2:
+        raise ConfigError(
+            f"frames of shape {tuple(shape)}: give an array (frame, y, x) of 2 frames or more, "
+            "better some thousands"
+        )
     if dtype.kind not in "ui":
         raise ConfigError(f"frames of {dtype}: PCH-EM needs the whole DN that the ADC gave; give integers")
 

@@ -43,7 +43,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.report.style.style import Drawing
+    from pchem_pipeline.run.progress import ProgressMode
     from pchem_pipeline.use.twin import Twin
 
 __all__ = ["Pixel", "Run", "open_run"]
@@ -99,8 +101,9 @@ class Run:
         self.plot = Plots(lambda: self._data, target.config.report)
 
     def __repr__(self) -> str:
-        states = ", ".join(f"{state.stage} {state.state}" for state in run_status(self._target))
-        return f"<Run {self.path.name}: {self._size()}; {states}>"
+        states = run_status(self._target)
+        open_ = ", ".join(f"{state.stage} {state.state}" for state in states if state.state != "complete")
+        return f"<Run {self.path.name}: {self._size()}; {open_ or 'complete'}>"
 
     def _repr_html_(self) -> str:
         """Return what the first screen of the report says, for a notebook."""
@@ -268,6 +271,36 @@ class Run:
         wanted = ApplySettings(kinds_of(what), prior)
         [place] = apply_to_frames(self._target, [str(f) for f in files], Path(output), wanted, command)
         found: xr.Dataset = xr.open_zarr(str(place), group="applied", consolidated=False, chunks=None)
+        return found
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What the model is missing, as the last search found it; None where nobody looked."""
+        from pchem_pipeline.discrepancy.verdict import read_verdict
+
+        return read_verdict(self.path)
+
+    def discrepancy(
+        self, *, refit: bool = False, effort: float | None = None, progress: ProgressMode = "off"
+    ) -> Verdict:
+        """Search for what the model is missing, and return the verdict; the evidence is in the report.
+
+        Args:
+            refit: add what is named to the model and fit with it, as ``pchem discrepancy`` does; open the run
+                again afterwards.
+            effort: times the usual limit of the search's work; None: as the run's settings say.
+            progress: auto, on or off.
+
+        Raises:
+            PchEmError: the frames are gone or too few, or another command works on the run.
+        """
+        from pchem_pipeline.commands.discrepancy import find_and_add
+        from pchem_pipeline.run.session import Command
+
+        command = Command(progress=progress, quiet=progress == "off")
+        find_and_add(self._target, command, refit=refit, effort=effort)
+        found = self.verdict
+        assert found is not None
         return found
 
     def twin(self, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:

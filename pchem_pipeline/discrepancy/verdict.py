@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -460,6 +461,19 @@ class Verdict(_Part):
     def word(self) -> str:
         """The verdict in a word or three."""
         return self.verdict.replace("_", " ")
+
+    def __repr__(self) -> str:
+        return f"<Verdict {self.word}: {self.sentence}>"
+
+    def _repr_html_(self) -> str:
+        """Return verdict and disagreements, for a notebook."""
+        rows = [
+            f"<li>{escape(place.sentence or place.statistic)} ({place.z:+.1f} sd)</li>"
+            for place in self.where
+        ]
+        return (
+            f"<p><b>{escape(self.word.capitalize())}</b>. {escape(self.sentence)}</p><ul>{''.join(rows)}</ul>"
+        )
 
     def added(self, step: Step) -> str:
         """Return what a step added to the model for its gap: an effect, or the likeliest of several."""

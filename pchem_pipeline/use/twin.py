@@ -35,6 +35,11 @@ class Twin:
     truth: TruthMaps
     settings: SimulateSettings
 
+    def __repr__(self) -> str:
+        rows, columns = self.truth.quanta_exposure.shape
+        effects = ", ".join(effect.tag for effect in self.settings.effects) or "none"
+        return f"<Twin: {rows} x {columns} pixels; effects: {effects}; frames(scene, n) simulates>"
+
     def frames(
         self, scene: float | NDArray[np.float64] | None = None, n: int = 100, *, seed: int = 1
     ) -> NDArray[np.unsignedinteger[Any]]:

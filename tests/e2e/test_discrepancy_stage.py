@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from helpers.commands import Shell
 
+from pchem_pipeline import open_run
+
 CAMERA = """
 # the camera of the north bench
 run: {store: run.zarr, tile: 8}   # small tiles
@@ -193,3 +195,12 @@ def test_without_add_the_model_stays(fitted, tmp_path):
     assert verdict(other)["effects"] == ["row_noise"]
     assert (tmp_path / "run.yaml").read_text() == text
     assert [path.name for path in (tmp_path / "run.zarr/model").glob("0*")] == ["0001.json"]
+
+
+def test_a_notebook_has_the_search_and_its_verdict(searched, tmp_path):
+    shell = copy_of(searched[0], tmp_path)
+    run = open_run(shell.folder / "run.yaml")
+    found = run.discrepancy()  # up to date
+    assert found.effects == run.verdict.effects == ("row_noise",)
+    assert repr(found).startswith("<Verdict named: The model was missing row noise")
+    assert "<li>row means of the readout residuals" in found._repr_html_()

@@ -118,7 +118,7 @@ def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
         _ = run.truth
     with pytest.raises(ConfigError, match="does not exist"):
         pchem_pipeline.open_run(tmp_path / "none.zarr")
-    assert repr(run).startswith("<Run run.zarr: 20 x 28 pixels, 1,200 frames; ingest complete, ")
+    assert repr(run).startswith("<Run run.zarr: 20 x 28 pixels, 1,200 frames; ")
     assert run.status()["report"] == "complete"
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(MissingDependencyError, match="pip install 'xarray>="):
