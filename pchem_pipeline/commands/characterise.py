@@ -126,10 +126,11 @@ def _check(frames: Any) -> None:
     Raises:
         ConfigError: the message says what it should be.
     """
-    shape, dtype = getattr(frames, "shape", ()), np.dtype(getattr(frames, "dtype", object))
+    shape: tuple[int, ...] = tuple(getattr(frames, "shape", ()))
+    dtype = np.dtype(getattr(frames, "dtype", object))
     if len(shape) != 3 or shape[0] < 2:
         raise ConfigError(
-            f"frames of shape {tuple(shape)}: give an array (frame, y, x) of 2 frames or more, "
+            f"frames of shape {shape}: give an array (frame, y, x) of 2 frames or more, "
             "better some thousands"
         )
     if dtype.kind not in "ui":
