@@ -130,8 +130,7 @@ def _check(frames: Any) -> None:
     dtype = np.dtype(getattr(frames, "dtype", object))
     if len(shape) != 3 or shape[0] < 2:
         raise ConfigError(
-            f"frames of shape {shape}: give an array (frame, y, x) of 2 frames or more, "
-            "better some thousands"
+            f"frames of shape {shape}: give an array (frame, y, x) of 2 frames or more, better some thousands"
         )
     if dtype.kind not in "ui":
         raise ConfigError(f"frames of {dtype}: PCH-EM needs the whole DN that the ADC gave; give integers")

@@ -28,7 +28,13 @@ _PAUSE = 5.0  # seconds between lines
 #: of this process while it compiles kernels
 _COMPILING_BYTES = 490 << 20
 #: Kernels of a stage and seconds that they take, before anything is known of this machine.
-_GUESS = {"ingest": (7, 6.0), "fit": (8, 40.0), "ensemble": (3, 8.0), "report": (1, 2.0)}
+_GUESS = {
+    "ingest": (7, 6.0),
+    "fit": (8, 40.0),
+    "ensemble": (3, 8.0),
+    "report": (1, 2.0),
+    "discrepancy": (9, 35.0),
+}
 
 _MODULE = "pchem_pipeline.commands.compile_kernels"
 #: Sections of the configuration that decide which kernels are needed.
@@ -133,7 +139,7 @@ def announced(reporter: Reporter, stage: str, limit: int | None = None) -> Itera
                     f"compute.max_memory (--max-memory) allows ({limit}); what comes after it keeps to that"
                 )
         share = min(sum(seconds) / total, 1.0) if total else None
-        reporter.compiling(sum(seconds), max(total - sum(seconds), 0.0))
+        reporter.compiling(sum(seconds), _left(seconds, number, total))
         reporter.event("compiling", stage=stage, kernel=kernel, seconds=took, share=share)
 
     try:
@@ -149,9 +155,15 @@ def announced(reporter: Reporter, stage: str, limit: int | None = None) -> Itera
 
 def _so_far(seconds: Sequence[float], number: int, total: float) -> str:
     """Return how many kernels are compiled, and what is left."""
-    done = f"{len(seconds)} of about {max(number, len(seconds))} kernels compiled in {sum(seconds):.0f} s"
-    left = total - sum(seconds)
-    return f"{done}, about {left:.0f} s left" if left > 1 else done
+    of = f" of about {number}" if len(seconds) < number else ""
+    left = _left(seconds, number, total)
+    words = f", about {left:.0f} s left" if left > 1 else ""
+    return f"{len(seconds)}{of} kernels compiled in {sum(seconds):.0f} s{words}"
+
+
+def _left(seconds: Sequence[float], number: int, total: float) -> float:
+    """Return the seconds that are left of what compiling took the last time; none where all were compiled."""
+    return max(total - sum(seconds), 0.0) if len(seconds) < max(number, 1) else 0.0
 
 
 def known_compilation(stage: str) -> tuple[int, float]:
