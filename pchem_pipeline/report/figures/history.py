@@ -17,6 +17,8 @@ __all__ = ["history_figures"]
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
 
 
+#: Days of a history that is drawn against time.
+_SHORTEST = 0.04
 _AXES = {"date": "days since the first", "temperature": "sensor temperature, °C", "label": "label"}
 
 
@@ -28,6 +30,8 @@ def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure
     places = np.array([row.place for row in rows])
     ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
     by_date = ordered and against == "date"
+    if by_date and np.ptp(places) < _SHORTEST:  # runs within an hour are drawn in their order
+        ordered = by_date = False
     at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
     axis = _AXES[against] if ordered else "run"
     columns: dict[str, object] = {

@@ -202,8 +202,8 @@ def history_table(found: Comparison) -> Table:
         moved = {symbol(name)[1]: n for name, n in row.moved.items() if n}
         rows.append(
             (
-                row.label,
-                row.date[:10],
+                row.date[:16].replace("T", " ") if row.label == row.date else row.label,
+                "" if row.label == row.date else row.date[:10],
                 "" if row.temperature is None else f"{row.temperature:.4g}",
                 row.run.title,
                 f"{row.run.pixels[0]:,}",

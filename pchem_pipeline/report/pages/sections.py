@@ -176,7 +176,7 @@ def _summary(material: Material) -> Section:
         "stepped_back": key_numbers(data, with_flagged=True) if data.mostly_flagged else [],
         "next": [(step.of(str(data.run.get("store", "RUN"))), step.why) for step in next_steps(data)],
         "flags": [flag for flag in remarks if flag.level != "good"],
-        "passed": [flag for flag in remarks if flag.level == "good"],
+        "passed": [flag for flag in remarks if flag.level == "good" and flag.about == "results"],
         "pictures": [each for each in material.pictures if each.figure.section == "summary"],
         "verdict": material.view,
         "effects": data.discrepancy.found.effects if data.discrepancy else (),
