@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 __all__ = ["Effort", "EffortSpentError"]
 
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
-# pixel, and of its fit with effects and what is learnt of its true parameters
-_SAMPLE, _FIT, _REFIT = 1.0e-7, 1.0e-4, 1.0e-3
+# pixel, of its fit with effects by components of the law, and of what is learnt of the sensor from a pixel
+_SAMPLE, _FIT, _REFIT, _LEARN = 5.0e-8, 4.0e-5, 1.0e-4, 3.0e-4
+_MOST_LEARNT_FROM = 1000  # pixels
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
-_LEAST, _OF_NULL = 100.0, 2.0
+_LEAST, _OF_NULL = 100.0, 3.0
 #: Share of that which is kept for measuring what no effect explains.
 _KEPT = 0.25
 
@@ -70,9 +71,9 @@ class Effort:
         """Count a simulated stack, whose pixels are fitted so many times."""
         self.spent += _SAMPLE * samples + _FIT * pixels * fits
 
-    def refit(self, pixels: int, tags: Iterable[str]) -> None:
-        """Count a fit of all pixels with effects."""
-        self.spent += _REFIT * pixels
+    def refit(self, pixels: int, components: int, tags: Iterable[str]) -> None:
+        """Count a fit of all pixels with effects, whose law has so many components, and what it teaches."""
+        self.spent += _REFIT * pixels * components + _LEARN * min(pixels, _MOST_LEARNT_FROM)
         self.tried |= set(tags)
 
     def check(self, doing: str) -> None:

@@ -480,9 +480,10 @@ class FrameExplainer:
         assert plain.covariance is not None
         if not model:
             return Refit(plain.maps, {}, plain.covariance)
-        self.effort.refit(plain.maps.usable.size, (effect.tag for effect in model))
         frames, numbers = self.frames.stack[self.frames.seen], self.frames.numbers[self.frames.seen]
-        return refit_maps(frames, plain.maps, self.frames.effects(model), plain.covariance, numbers=numbers)
+        fit = refit_maps(frames, plain.maps, self.frames.effects(model), plain.covariance, numbers=numbers)
+        self.effort.refit(plain.maps.usable.size, fit.components, (effect.tag for effect in model))
+        return fit
 
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
         """Return the fit of the seen frames under a model, and sensors to draw replicates from."""

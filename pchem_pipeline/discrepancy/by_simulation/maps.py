@@ -49,11 +49,13 @@ class Refit:
         moved: by parameter: median change against the maps before, the same in standard errors of a pixel,
             and the unit.
         covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
+        components: of the law of a sample, with all effects.
     """
 
     maps: PixelMaps
     moved: Mapping[str, Mapping[str, Any]]
     covariance: NDArray[np.float64]
+    components: int = 1
 
 
 def refit_maps(
@@ -97,7 +99,8 @@ def refit_maps(
         for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
-    return Refit(new_maps, moved, fit.covariance[:, :4, :4].reshape(*shape, 4, 4))
+    covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
+    return Refit(new_maps, moved, covariance, law.components)
 
 
 def expected_codes(

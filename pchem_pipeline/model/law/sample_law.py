@@ -107,6 +107,12 @@ class SampleLaw:
     free_satellite_alarm: float = 1e-4
 
     @property
+    def components(self) -> int:
+        """Number of peaks that each electron number has, those that a fit tries in turn included."""
+        mixed = self.exposure_weights.size * self.added_weights.shape[-1] * self.satellite_weights.shape[-1]
+        return int(mixed) + len(self.free_satellites) * len(self.free_satellite_pattern)
+
+    @property
     def neutral(self) -> bool:
         """Whether this is the PCD itself, cells integrated exactly."""
         mine, plain = _values(self), _values(SampleLaw())

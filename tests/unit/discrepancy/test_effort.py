@@ -9,6 +9,7 @@ from helpers.plain_camera import PlainCamera
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
 CAMERA = PlainCamera(0.3, 1.5, 9.0, (16, 16), 600)
@@ -22,12 +23,12 @@ def test_work_is_counted_and_refused_once_the_limit_is_reached():
     effort.begin()
     null = effort.spent
     effort.check("a")
-    effort.refit(10**9, ["row_noise"])
+    effort.refit(10**9, 1, ["row_noise"])
     with pytest.raises(EffortSpentError, match="b"):
         effort.check("b")
     assert effort.tried == {"row_noise"}
     # a quarter is kept for the end
-    effort.spent = null + 0.8 * 2.0 * null
+    effort.spent = null + 0.8 * 3.0 * null
     with pytest.raises(EffortSpentError):
         effort.check("c")
     effort.release()
@@ -41,6 +42,17 @@ def test_a_small_search_has_its_least_and_one_without_a_limit_none():
         effort.release()
     assert double.most == 2.0 * small.most > 0.0
     assert math.isinf(free.most)
+
+
+def test_a_fit_with_a_law_of_many_components_costs_more():
+    plain, mixed = SampleLaw(), SampleLaw().with_noise([0.9, 0.05, 0.05], shift_e=[0.0, -1.0, 1.0])
+    assert (plain.components, mixed.components) == (1, 3)
+    spent = []
+    for law in (plain, mixed):
+        effort = Effort(1.0)
+        effort.refit(10**6, law.components, [])
+        spent.append(effort.spent)
+    assert spent[1] > 2.9 * spent[0]
 
 
 @pytest.fixture(scope="module")
