@@ -10,23 +10,6 @@ import shlex
 from enum import IntEnum
 from pathlib import Path
 
-__all__ = [
-    "ChangedError",
-    "ConfigError",
-    "ExitCode",
-    "IncompleteRunError",
-    "InputError",
-    "LockedError",
-    "MissingDependencyError",
-    "NotBelievedError",
-    "PchEmError",
-    "StoreError",
-    "error_words",
-    "install_hint",
-    "one_line",
-    "quoted",
-]
-
 #: Extra to the libraries that it installs, as ``pyproject.toml`` has them.
 EXTRAS = {
     "fits": ("astropy>=6.1",),

@@ -23,8 +23,6 @@ from numba.core.typed_passes import NativeLowering
 
 from pchem_pipeline.base.kernel_cache import KernelCache, values_of_closure
 
-__all__ = ["callback", "kernel", "types_of"]
-
 
 def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, borrows: bool = False) -> Any:
     """Compile a loop when it is first called.

@@ -26,15 +26,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from filelock import FileLock
 
-__all__ = [
-    "KernelCache",
-    "cache_folder",
-    "in_any_order",
-    "listening",
-    "source_state",
-    "values_of_closure",
-]
-
 #: Called with the name of a kernel that is missing and None, then with the seconds that it took to have it.
 Listener = Callable[[str, float | None], None]
 _listeners: list[Listener] = []

@@ -2,7 +2,5 @@
 
 from __future__ import annotations
 
-__all__ = ["QUANTISATION_VARIANCE"]
-
 #: DN^2: variance of rounding to whole DN, an error uniform over 1 DN
 QUANTISATION_VARIANCE = 1.0 / 12.0

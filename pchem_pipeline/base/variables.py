@@ -8,19 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-__all__ = [
-    "CHARGE_RATES",
-    "FREE_SATELLITES",
-    "INTERVALS",
-    "LENGTHS",
-    "PARAMETERS",
-    "VARIABLES",
-    "Variable",
-    "interval_names",
-    "variable_at",
-    "variables_of",
-]
-
 #: The four parameters of the PCD, in the order of every (…, parameter) axis.
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 

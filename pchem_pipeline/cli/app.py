@@ -25,8 +25,6 @@ from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
 
-__all__ = ["app", "main"]
-
 app = typer.Typer(
     name="pchem",
     help="Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM.",

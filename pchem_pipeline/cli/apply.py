@@ -13,8 +13,6 @@ from pchem_pipeline.cli.options import Target, takes_command
 if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
 
-__all__ = ["apply"]
-
 
 @takes_command(without=("force", "dry_run", "tiles", "roi"))
 def apply(

@@ -12,8 +12,6 @@ from pchem_pipeline.cli.options import Target, takes_command
 if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
 
-__all__ = ["methods"]
-
 
 @takes_command(without=("tiles", "roi"))
 def methods(

@@ -16,8 +16,6 @@ from pchem_pipeline.base.errors import ConfigError
 if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
 
-__all__ = ["Progress", "Quiet", "Strict", "Target", "Workers", "region_of", "takes_command"]
-
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
 Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
 Progress = Annotated[

@@ -11,8 +11,6 @@ import typer
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.cli.options import Target
 
-__all__ = ["twin"]
-
 
 def twin(
     target: Target,

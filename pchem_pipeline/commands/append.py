@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.run.target import Target
 
-__all__ = ["append_frames"]
-
 #: there from the moment when the arrays are neither of the old nor of all frames until they are of all
 _BEGUN = ".pchem/appending.json"
 

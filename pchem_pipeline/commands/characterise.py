@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.fit.result import FitResult
     from pchem_pipeline.run.progress import ProgressMode
 
-__all__ = ["characterise", "fit_counts"]
-
 _BLOCK_BYTES = 64 << 20
 
 

@@ -24,8 +24,6 @@ from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.table import STAGES
 
-__all__ = ["compile_kernels"]
-
 
 def compile_kernels(content: Mapping[str, Any], stages: Sequence[str]) -> None:
     """Run stages on invented histograms, or do what they say; then mark their kernels as compiled.

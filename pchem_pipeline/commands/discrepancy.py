@@ -15,8 +15,6 @@ from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["find_and_add"]
-
 _BEFORE = ("ingest", "histogram")
 _AFTERWARDS = ("fit", "maps", "ensemble", "report")
 

@@ -22,8 +22,6 @@ from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["FORMATS", "export_run"]
-
 #: Formats that maps can be exported to, their CSV summary, and a table in the words of EMVA 1288.
 FORMATS = ("fits", "tiff", "npz", "csv", "emva")
 

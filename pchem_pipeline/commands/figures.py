@@ -22,8 +22,6 @@ from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Wanted", "figures_of_run", "gather_run", "millimetres", "warn_if_old"]
-
 #: Narrowest and widest figure, mm.
 _WIDTHS = (40.0, 400.0)
 _UNITS = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72.0, "": 1.0}

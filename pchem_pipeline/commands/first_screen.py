@@ -15,8 +15,6 @@ from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = ["first_screen", "run_to_first_screen"]
-
 _WIDTH = 100
 
 

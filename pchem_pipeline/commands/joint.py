@@ -17,8 +17,6 @@ from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 
-__all__ = ["find_joint", "run_joint"]
-
 
 def find_joint(
     targets: Sequence[Path], bias: Sequence[Path] = (), store: Path | None = None, *, write: bool = True

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.session import Command
     from pchem_pipeline.run.target import Target
 
-__all__ = ["compare_methods"]
-
 
 def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) -> str:
     """Run the stage, refresh the report where there is one, and return the table in words.

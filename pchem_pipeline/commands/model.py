@@ -30,16 +30,6 @@ from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = [
-    "ListedModel",
-    "adopt_verdict",
-    "list_models",
-    "model_lines",
-    "models_json",
-    "use_model",
-    "yaml_of",
-]
-
 _SEARCH = "discrepancy"
 
 

@@ -20,8 +20,6 @@ from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["find_or_start", "first_try", "other_settings", "write_template"]
-
 _YAML = (".yaml", ".yml")
 #: Settings that differ, as many as a message tells.
 _SHOWN = 4

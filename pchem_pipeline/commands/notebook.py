@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.progress import ProgressMode
     from pchem_pipeline.use.twin import Twin
 
-__all__ = ["Pixel", "Run", "open_run"]
-
 
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run for reading.

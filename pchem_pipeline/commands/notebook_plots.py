@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.report.style.style import Drawing
 
-__all__ = ["Figures", "Plots", "width_of"]
-
 #: The maps that ``Plots.maps`` draws where none is named.
 _MAPS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 

@@ -21,8 +21,6 @@ from pchem_pipeline.store.run_store import RunStore
 if TYPE_CHECKING:
     from pchem_pipeline.planning.verify import Verification
 
-__all__ = ["PlanRequest", "make_plan"]
-
 _DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
 _ROUNDS = 4
 _LARGEST_STEP = 3.0  # wrong maxima make errors that more frames end at once

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.target import Target
 
-__all__ = ["TWIN_FRAMES", "twin_of", "write_twin"]
-
 #: Bits of the ADC where the run does not say, and frames where nothing else is asked for.
 _BIT_DEPTH, TWIN_FRAMES = 16, 1000
 _HEAD = """# The camera of {run} as it was measured: pchem run makes its frames and characterises them.

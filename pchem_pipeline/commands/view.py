@@ -34,8 +34,6 @@ from pchem_pipeline.stages.report.pixels import bin_masses
 from pchem_pipeline.stages.report.stored import read_histograms, read_model
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Answer", "RunView", "make_server", "serve"]
-
 ADDRESS = "127.0.0.1"
 _FILES = {
     "/report.json": "application/json",

@@ -13,8 +13,6 @@ from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.progress_file import read_progress
 
-__all__ = ["json_line", "pace_words", "rows", "watch"]
-
 _INTERVAL = 1.0
 #: Moves the cursor up so many lines and clears what is below.
 _UP = "\x1b[{}A\x1b[J"

@@ -22,8 +22,6 @@ from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, Stop, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
 
-__all__ = ["DistributedExecutor", "OtherVersionsError", "library_versions"]
-
 T = TypeVar("T")
 
 #: libraries that decide the bits of a result, or that must understand each other

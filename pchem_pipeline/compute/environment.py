@@ -11,8 +11,6 @@ from typing import Any
 
 from pchem_pipeline.base.kernel_cache import cache_folder
 
-__all__ = ["available_memory", "available_workers", "cpu_seconds", "peak_rss_bytes", "prepare_environment"]
-
 #: Unix alone has it.
 _RESOURCE: Any = importlib.import_module("resource") if importlib.util.find_spec("resource") else None
 

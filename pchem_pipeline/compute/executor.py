@@ -16,19 +16,6 @@ from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, PchEmErr
 from pchem_pipeline.compute.environment import available_workers, prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
-__all__ = [
-    "DaskPoolExecutor",
-    "Executor",
-    "Notices",
-    "OnResult",
-    "Outcome",
-    "Stop",
-    "call_all",
-    "guarded",
-    "make_executor",
-    "out_of_memory",
-]
-
 T = TypeVar("T")
 
 

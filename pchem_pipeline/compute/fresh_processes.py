@@ -23,8 +23,6 @@ from typing import Any, TypeVar
 from pchem_pipeline.base.errors import IncompleteRunError
 from pchem_pipeline.compute.executor import OnResult, Outcome, guarded
 
-__all__ = ["FreshProcessExecutor"]
-
 T = TypeVar("T")
 _MODULE = "pchem_pipeline.compute.fresh_processes"
 

@@ -12,15 +12,6 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.compute.executor import DaskPoolExecutor, Executor
 
-__all__ = [
-    "BASE_BYTES",
-    "SECOND_PROGRAM_BYTES",
-    "affordable",
-    "check_limit",
-    "keep_memory_tight",
-    "resident_bytes",
-]
-
 #: the program with its libraries and compiled kernels
 BASE_BYTES = 260 << 20
 #: a second program beside it that compiles kernels

@@ -8,8 +8,6 @@ from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["ClusterSettings", "ComputeSettings"]
-
 
 class ClusterSettings(Section):
     """A dask cluster made by the run, for example ``dask_jobqueue.SLURMCluster``."""

@@ -30,8 +30,6 @@ from pchem_pipeline.store.files import write_atomic
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["check_writable", "with_model", "write_model"]
-
 _SECTION = "model"
 
 

@@ -15,19 +15,6 @@ from pydantic_core import to_jsonable_python
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.config.tree import RunConfig
 
-__all__ = [
-    "complaints",
-    "dump_config",
-    "load_config",
-    "make_config",
-    "parse_config",
-    "present_keys",
-    "setting_of",
-    "yaml_content",
-    "yaml_text",
-]
-
-
 #: values of a configuration: 100,000 named files are not unusual
 _MOST_VALUES = 1_000_000
 #: complaints that are listed, and characters of a key or value in them

@@ -10,8 +10,6 @@ from pchem_pipeline.compute.memory import BASE_BYTES
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
 
-__all__ = ["allowed_bytes", "band_bytes", "worker_count"]
-
 
 def worker_count(config: RunConfig) -> int:
     """Return the workers on this machine that a configuration asks for."""

@@ -13,8 +13,6 @@ from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pchem_pipeline.config.tree import RunConfig
 
-__all__ = ["SCHEMA_NAME", "commented_config", "json_schema"]
-
 _HEAD = """\
 # A run of pchem_pipeline. Every setting is shown with its default; delete what you do not change.
 # Paths are relative to this file. Start with: pchem run {name}

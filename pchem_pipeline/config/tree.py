@@ -18,8 +18,6 @@ from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.simulate.settings import SimulateSettings
 
-__all__ = ["RunConfig", "RunSettings"]
-
 
 class RunSettings(Section):
     """What concerns the run as a whole."""

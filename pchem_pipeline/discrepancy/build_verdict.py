@@ -37,16 +37,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 
-__all__ = [
-    "LARGEST_REST",
-    "Added",
-    "Addition",
-    "Findings",
-    "Fitted",
-    "build_verdict",
-    "largest_pulls",
-]
-
 FloatArray = NDArray[np.float64]
 
 #: Share of the gap that effects may leave, where it is above its floor, and still explain it.

@@ -9,8 +9,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-__all__ = ["Effort", "EffortSpentError"]
-
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
 # pixel, of its fit with effects by components of the law, and of what is learnt of the sensor from a pixel
 _SAMPLE, _FIT, _REFIT, _LEARN = 5.0e-8, 4.0e-5, 1.0e-4, 3.0e-4

@@ -17,8 +17,6 @@ from scipy import linalg
 from pchem_pipeline.discrepancy.null import NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 
-__all__ = ["Gap", "StatisticsGap"]
-
 FloatArray = NDArray[np.float64]
 
 _FLOOR_QUANTILE = 0.95

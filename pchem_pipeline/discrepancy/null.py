@@ -16,19 +16,6 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 
-__all__ = [
-    "Measured",
-    "NullModel",
-    "as_matrix",
-    "disagrees",
-    "free_of_parameters",
-    "look_elsewhere",
-    "misfits",
-    "moments",
-    "suspicious",
-    "two_sided",
-]
-
 FloatArray = NDArray[np.float64]
 
 _OF_ORDER = ("time", "frame", "space")

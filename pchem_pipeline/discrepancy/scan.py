@@ -19,8 +19,6 @@ from scipy import special
 
 from pchem_pipeline.effects.framework.region import Region, When
 
-__all__ = ["Stretch", "Suspect", "affected_share", "scan_map", "scan_series"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 

@@ -21,8 +21,6 @@ from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, MODES, PERIOD, Pa
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.region import Region, Taps
 
-__all__ = ["Shared", "scan_pairs"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]

@@ -6,8 +6,6 @@ from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["DiscrepancySettings"]
-
 
 class DiscrepancySettings(Section):
     """Comparison of the frames with replicates simulated from the fitted model, and naming of effects."""

@@ -20,8 +20,6 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 
-__all__ = ["size_of"]
-
 _MOST_ROWS = 12  # and columns: what all pixels of a frame share has one draw a frame
 _BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
 _BITS = 24

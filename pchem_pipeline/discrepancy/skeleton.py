@@ -25,8 +25,6 @@ from pchem_pipeline.discrepancy.where import locate
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["Explainer", "search", "silent"]
-
 Explanation = TypeVar("Explanation")
 
 

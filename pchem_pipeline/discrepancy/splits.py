@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.verdict import Examined
 
-__all__ = ["MINIMUM_FRAMES", "Splits", "block_length", "split_frames"]
-
 #: fewer frames leave hardly five blocks to each third
 MINIMUM_FRAMES = 300
 _SHORTEST, _LONGEST, _BLOCKS = 20, 100, 60

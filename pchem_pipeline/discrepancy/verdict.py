@@ -26,32 +26,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
 
-__all__ = [
-    "CONVINCING_PLACEBO",
-    "RARE",
-    "SCHEMA_VERSION",
-    "VERDICT_FILE",
-    "Candidate",
-    "Change",
-    "Discrepancy",
-    "Examined",
-    "Families",
-    "GapChange",
-    "Measured",
-    "Moved",
-    "Place",
-    "Pull",
-    "Rival",
-    "Size",
-    "State",
-    "Step",
-    "Surveyed",
-    "Verdict",
-    "micronats",
-    "parameters_of",
-    "read_verdict",
-]
-
 #: As the field ``schema_version`` of :class:`Verdict` has it.
 SCHEMA_VERSION = 3
 #: Share of the samples below which the size of an effect is that of the samples that it changes.

@@ -16,17 +16,6 @@ from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
 
-__all__ = [
-    "PAIRS",
-    "frame_series",
-    "locate",
-    "map_of",
-    "pixel_maps",
-    "series_of",
-    "suspected_frames",
-    "suspected_regions",
-]
-
 FloatArray = NDArray[np.float64]
 
 #: Maps of neighbours, along x and along y: charge with charge, readout with readout, one with the other.

@@ -10,20 +10,6 @@ from datetime import UTC, datetime
 from numbers import Integral
 from typing import Any
 
-__all__ = [
-    "FACT_NAMES",
-    "CameraFacts",
-    "StatedFacts",
-    "bits_of",
-    "celsius",
-    "duration_of",
-    "facts_from_names",
-    "first_of",
-    "seconds_of",
-    "shared_facts",
-    "text_of",
-]
-
 _LONGEST = 80
 _ZERO_CELSIUS = 273.15
 #: names that programs give to the facts in attributes, sidecars and JSON records, the usual one first

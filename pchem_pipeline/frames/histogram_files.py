@@ -23,8 +23,6 @@ from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["HistogramInput", "is_histogram_input", "read_histograms"]
-
 #: more bins than any ADC of interest has codes; a wider span is a mistake in the file
 _MOST_BINS = 1 << 24
 

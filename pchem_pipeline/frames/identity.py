@@ -14,17 +14,6 @@ import xxhash
 
 from pchem_pipeline.base.errors import InputError
 
-__all__ = [
-    "FileHasher",
-    "content_identity",
-    "digest_of",
-    "file_size",
-    "hash_file",
-    "identity_of_hashes",
-    "quick_identity",
-    "sample_hash",
-]
-
 _BLOCK = 1 << 22
 
 

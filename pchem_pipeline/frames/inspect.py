@@ -15,8 +15,6 @@ from pchem_pipeline.frames.registry import detect_format, reader_class
 from pchem_pipeline.frames.resolve import resolve_files
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["FileReport", "InputReport", "survey"]
-
 
 @dataclass
 class FileReport:

@@ -8,8 +8,6 @@ from pchem_pipeline.frames.inspect import survey
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["open_frames"]
-
 
 def open_frames(
     settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True, least: int = 2

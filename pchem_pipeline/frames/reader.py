@@ -19,8 +19,6 @@ from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["FrameReader", "check_window"]
-
 
 class FrameReader(ABC):
     """Frames of one file (or of many, see `open_frames`), read by blocks of frames and bands of rows.

@@ -14,8 +14,6 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError, install_hint
 from pchem_pipeline.frames.reader import FrameReader
 
-__all__ = ["ENTRY_POINT_GROUP", "detect_format", "frame_suffixes", "reader_class", "reader_names", "require"]
-
 ENTRY_POINT_GROUP = "pchem_pipeline.readers"
 
 #: module and class of each of our readers; raw comes last since any bytes could be raw

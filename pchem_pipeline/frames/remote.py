@@ -16,8 +16,6 @@ from typing import Any
 from pchem_pipeline.base.errors import InputError, MissingDependencyError, install_hint
 from pchem_pipeline.store.files import whole_file, write_atomic
 
-__all__ = ["fetch", "is_remote"]
-
 _URL = re.compile(r"^[a-z][a-z0-9+.-]+://")
 _GLOB = re.compile(r"[*?\[]")
 #: descriptions that lie beside raw files

@@ -11,8 +11,6 @@ from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["HISTOGRAM_SUFFIXES", "input_paths", "natural_key", "resolve_files"]
-
 HISTOGRAM_SUFFIXES = {".csv": "histogram", ".npy": "histogram", ".npz": "histogram", ".txt": "histogram"}
 _GLOB = re.compile(r"[*?\[]")
 _NUMBER = re.compile(r"(\d+)")

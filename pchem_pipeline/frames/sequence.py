@@ -16,8 +16,6 @@ from pchem_pipeline.frames.inspect import InputReport
 from pchem_pipeline.frames.reader import FrameReader, check_window
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["FrameSequence"]
-
 _SCRATCH_BYTES = 1 << 24
 
 

@@ -8,8 +8,6 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["InputSettings", "SampleSettings"]
-
 
 class SampleSettings(Section):
     """One exposure of several that are fitted together: an ordinary run of the same pixels."""

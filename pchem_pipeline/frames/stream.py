@@ -25,8 +25,6 @@ from pchem_pipeline.frames.identity import FileHasher, file_size, identity_of_ha
 from pchem_pipeline.frames.reader import FrameReader
 from pchem_pipeline.frames.sequence import FrameSequence
 
-__all__ = ["Block", "FrameSource", "FrameStream", "HashedFrameStream", "Rows"]
-
 #: bytes of decoded frames that a thread holds before they are cut into bands of rows
 _SCRATCH_BYTES = 8 << 20
 

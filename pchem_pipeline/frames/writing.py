@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 
-__all__ = ["WRITERS", "StackFacts", "write_frames"]
-
 #: module and usual suffix of each format that can be written
 WRITERS = {
     "tiff": ("tiff", ".tif"),

@@ -16,17 +16,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.methods.moments import SampleMoments, sample_moments
 
-__all__ = [
-    "Estimates",
-    "Method",
-    "PixelSamples",
-    "Sample",
-    "Settings",
-    "no_estimates",
-    "register_method",
-    "registered",
-]
-
 FloatArray = NDArray[np.float64]
 Needs = Literal["one sample", "a dark and a bright sample", "a series of samples"]
 

@@ -18,16 +18,6 @@ from pchem_pipeline.model.errors.expected_information import (
     shared_information,
 )
 
-__all__ = [
-    "COMPARED",
-    "ErrorSummary",
-    "MethodResult",
-    "compare",
-    "errors_of",
-    "pixel_bounds",
-    "summarise_errors",
-]
-
 #: What is compared: (H, g, read noise) relative, the bias in electrons.
 COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 

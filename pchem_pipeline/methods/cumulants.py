@@ -13,8 +13,6 @@ from pchem_pipeline.methods.base import (
     register_method,
 )
 
-__all__ = ["Cumulants"]
-
 
 @register_method
 class Cumulants(Method):

@@ -17,8 +17,6 @@ from pchem_pipeline.methods.base import (
 from pchem_pipeline.methods.plain_em import first_start, run_em
 from pchem_pipeline.model.law.pcd import log_pcd
 
-__all__ = ["DarkAndBrightMle", "log_likelihoods"]
-
 
 @register_method
 class DarkAndBrightMle(Method):

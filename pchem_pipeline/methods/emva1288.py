@@ -13,8 +13,6 @@ from pchem_pipeline.methods.base import (
     register_method,
 )
 
-__all__ = ["Emva1288"]
-
 _LINEAR_RANGE = 0.7  # of the saturation, EMVA 1288 release 3.1, section on sensitivity
 
 

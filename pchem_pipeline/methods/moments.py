@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SampleMoments", "sample_moments"]
-
 
 class SampleMoments(NamedTuple):
     """k-statistics of n pixels, shape (n,) each; NaN where the sample is too small.

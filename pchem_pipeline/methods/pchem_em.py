@@ -8,8 +8,6 @@ from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Setting
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
-__all__ = ["PchEm"]
-
 
 @register_method
 class PchEm(Method):

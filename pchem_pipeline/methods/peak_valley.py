@@ -17,8 +17,6 @@ from pchem_pipeline.methods.base import (
 from pchem_pipeline.methods.plain_em import first_start
 from pchem_pipeline.model.law.inputs import kernel_counts
 
-__all__ = ["PeakValley", "read_noise_of_valley"]
-
 _SMOOTHING = 0.12  # standard deviation of the smoothing in units of the distance of two peaks
 
 

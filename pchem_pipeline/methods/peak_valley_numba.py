@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = ["MOST_PEAKS", "peaks_tile"]
-
 #: Most peaks of a histogram that are used.
 MOST_PEAKS = 64
 

@@ -13,8 +13,6 @@ from pchem_pipeline.methods.base import (
     register_method,
 )
 
-__all__ = ["TwoSamplePhotonTransfer", "gain_variance"]
-
 
 @register_method
 class TwoSamplePhotonTransfer(Method):

@@ -14,8 +14,6 @@ from pchem_pipeline.methods.base import (
     register_method,
 )
 
-__all__ = ["PhotonTransferSeries"]
-
 
 @register_method
 class PhotonTransferSeries(Method):

@@ -18,8 +18,6 @@ from pchem_pipeline.methods.base import (
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.inputs import kernel_counts
 
-__all__ = ["PlainEm", "first_start", "run_em"]
-
 
 @register_method
 class PlainEm(Method):

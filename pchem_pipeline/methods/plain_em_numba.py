@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = ["em_tile"]
-
 _SMALL = 1e-17  # terms below this share of their sum are left out
 
 

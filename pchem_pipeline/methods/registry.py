@@ -11,8 +11,6 @@ from types import MappingProxyType
 import pchem_pipeline.methods
 from pchem_pipeline.methods.base import Method, registered
 
-__all__ = ["methods"]
-
 
 @functools.cache
 def methods() -> Mapping[str, Method]:

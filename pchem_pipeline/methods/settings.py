@@ -8,8 +8,6 @@ from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["MethodsSettings"]
-
 _ReadNoise = Annotated[float, Field(ge=0.05, le=3)]
 
 

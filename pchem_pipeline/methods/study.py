@@ -23,8 +23,6 @@ from pchem_pipeline.model.errors.expected_information import (
 )
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
-__all__ = ["SHARES", "StudyPoint", "study_point"]
-
 #: Exposures of the samples in units of H, by what a method needs; frames are shared evenly.
 SHARES: dict[str, tuple[float, ...]] = {
     "one sample": (1.0,),

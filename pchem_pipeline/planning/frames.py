@@ -14,8 +14,6 @@ from pchem_pipeline.model.errors.expected_information import expected_informatio
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import TARGET_NAMES, Target
 
-__all__ = ["best_exposure", "contour_data", "exposure_grid", "frames_grid", "frames_needed", "precision"]
-
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 

@@ -18,8 +18,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
 from pchem_pipeline.planning.point import FloatArray, Point
 
-__all__ = ["Ambiguity", "ambiguity", "gain_rival", "rounding_shift"]
-
 _COARSE = 0.9  # DN: rounding errors fall as exp(-2 pi^2 sigma^2), to 1e-7 here
 _OFFSETS = (1.0, 0.75, 0.5, 1.25)  # e- off at the brightest sample; the rival lies near 1
 _GAIN_CHANGES = (0.1, 0.2)  # of ln g

@@ -15,8 +15,6 @@ from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import Target
 
-__all__ = ["LEAST_SHARE", "Need", "Plan", "SamplesPlan", "plan_one_sample", "plan_samples"]
-
 #: Parameters that are an electron off where the electron numbers are.
 _COUNTED = ("quanta_exposure", *CHARGE_RATES, "bias")
 #: Without so much knowledge of the gain, the bound says nothing about real fits.

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
-__all__ = ["FloatArray", "Point"]
-
 FloatArray = NDArray[np.float64]
 
 

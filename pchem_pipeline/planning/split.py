@@ -18,8 +18,6 @@ from pchem_pipeline.planning.frames import exposure_grid
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import Target
 
-__all__ = ["Split", "best_samples", "best_split", "split_frames"]
-
 _STEPS = 4000
 _LEAST_SHARE = 0.01
 

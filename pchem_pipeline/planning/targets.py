@@ -13,8 +13,6 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.planning.point import FloatArray, Point
 
-__all__ = ["TARGET_NAMES", "Target", "parse_target"]
-
 #: Parameters that can be planned for, with the units in which a precision can be given.
 TARGET_NAMES: dict[str, tuple[str, ...]] = {
     "quanta_exposure": ("%", "e-"),

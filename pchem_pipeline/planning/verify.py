@@ -14,8 +14,6 @@ from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import Target
 
-__all__ = ["Check", "Verification", "verify", "verify_samples"]
-
 
 @dataclass(frozen=True)
 class Check:

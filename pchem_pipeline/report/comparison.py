@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.run_differences import MapDifference, Reasons
 
-__all__ = ["Against", "ArrayRow", "Comparison", "HistoryRow", "Pair", "RunFacts", "Setting"]
-
 #: How an array of two runs compares: to the bit; within rounding; not; absent in one of them.
 State = Literal["identical", "equal", "changed", "lost", "new"]
 

@@ -23,19 +23,6 @@ from pchem_pipeline.report.settings import Criteria
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.sums import StackSums
 
-__all__ = [
-    "CHANNELS",
-    "FEW_CHANNELS",
-    "LINE_MAPS",
-    "MAP_NAMES",
-    "PARTS",
-    "DiscrepancyData",
-    "PixelFit",
-    "ReportData",
-    "Sample",
-    "Samples",
-]
-
 FloatArray = NDArray[np.float64]
 
 #: A line of fewer channels than this gets a point for each, no histogram.

@@ -8,8 +8,6 @@ from pydantic import Field, field_validator
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["Criteria", "ReportSettings"]
-
 PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 

@@ -22,8 +22,6 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.files import write_atomic
 
-__all__ = ["announced", "compilation_lines", "compiled_ahead", "known_compilation", "mark_path"]
-
 _PAUSE = 5.0  # seconds between lines
 #: of this process while it compiles kernels
 _COMPILING_BYTES = 490 << 20

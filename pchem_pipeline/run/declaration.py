@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
 
-__all__ = ["SinglePass", "Stage", "imported"]
-
 
 def imported(place: str) -> Callable[..., Any]:
     """Import and return the function that ``"package.module:function"`` names."""

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["StageState", "differences", "fingerprint_content", "rests_on", "setting_values", "status"]
-
 _TILE = "run.tile"
 
 

@@ -15,8 +15,6 @@ from pchem_pipeline.run.stage import StageContext, open_store
 if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import FrameSource
 
-__all__ = ["StoredFrames", "open_source"]
-
 
 @dataclass(frozen=True)
 class StoredFrames:

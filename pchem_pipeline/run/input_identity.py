@@ -13,16 +13,6 @@ from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.files import read_json, write_json
 
-__all__ = [
-    "identity_is_new",
-    "ingested_identity",
-    "inspect_input",
-    "keep_identity",
-    "keep_ingested",
-    "known_identity",
-    "shortened",
-]
-
 _LISTED_FILES = 64
 
 

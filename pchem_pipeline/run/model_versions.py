@@ -30,22 +30,6 @@ from pchem_pipeline.store.records import fingerprint_of
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = [
-    "AddedArrays",
-    "ModelVersion",
-    "keep_in_force",
-    "model_in_force",
-    "model_of",
-    "model_of_content",
-    "model_versions",
-    "present_content",
-    "read_added_exposure",
-    "verdict_version",
-    "version_with",
-    "with_digest",
-    "write_added_exposure",
-]
-
 _GROUP = "model"
 _EXPOSURE, _WEIGHT = "added_exposure", "added_weight"
 Region = tuple[slice, slice]

@@ -17,8 +17,6 @@ from typing import Any, Literal, Protocol, TextIO, TypeVar
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.store.progress_file import ProgressFile
 
-__all__ = ["Advance", "Reporter", "paced", "parts_told", "telling_parts"]
-
 T = TypeVar("T")
 ProgressMode = Literal["auto", "on", "off"]
 

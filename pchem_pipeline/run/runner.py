@@ -16,8 +16,6 @@ from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 
-__all__ = ["execute"]
-
 _LIBRARIES = ("numpy", "scipy", "numba", "zarr", "dask", "tifffile", "astropy", "h5py", "matplotlib")
 
 

@@ -9,8 +9,6 @@ from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Sample", "SensorInfo"]
-
 
 @dataclass(frozen=True)
 class Sample:

@@ -26,8 +26,6 @@ from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.progress_file import ProgressFile
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Command", "cropped", "run_stages", "run_status", "up_to", "working_run"]
-
 
 @dataclass(frozen=True)
 class Command:

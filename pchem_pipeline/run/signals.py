@@ -10,8 +10,6 @@ from types import FrameType
 
 from pchem_pipeline.base.errors import ExitCode, PchEmError
 
-__all__ = ["InterruptedRunError", "StopRequest", "stop_on_signals"]
-
 
 class InterruptedRunError(PchEmError):
     """The user or the system asked the run to stop; what was finished is kept."""

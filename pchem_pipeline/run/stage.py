@@ -37,8 +37,6 @@ from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
-__all__ = ["WHOLE", "Options", "Prepared", "StageContext", "Unit", "nothing_left", "open_store"]
-
 
 class Unit(Protocol):
     """A piece of a stage's work."""

@@ -12,8 +12,6 @@ from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Target", "find_run"]
-
 
 @dataclass(frozen=True)
 class Target:

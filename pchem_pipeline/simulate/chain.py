@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.simulate.settings import SimulateSettings
     from pchem_pipeline.simulate.truth import TruthMaps
 
-__all__ = ["dn_dtype", "frames_per_block", "simulate_block"]
-
 _SAMPLE_PURPOSE = "sample"
 # bytes per sample of a block: digital and electron numbers
 _BYTES_PER_SAMPLE = 8

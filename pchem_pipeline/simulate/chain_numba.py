@@ -12,8 +12,6 @@ from pchem_pipeline.simulate.streams_numba import (
     uniform_row,
 )
 
-__all__ = ["draw_rows", "simulate_rows"]
-
 # tables up to this length are searched from the bottom, longer ones by bisection
 _LINEAR = 48
 

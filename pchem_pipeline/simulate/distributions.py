@@ -12,17 +12,6 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.simulate.patterns import Pattern
 
-__all__ = [
-    "Constant",
-    "Distribution",
-    "DistributionBase",
-    "Gamma",
-    "LogNormal",
-    "LogUniform",
-    "Normal",
-    "Uniform",
-]
-
 
 class DistributionBase(Section):
     """What every distribution has: bounds and spatial patterns.

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.simulate.distributions import Distribution
     from pchem_pipeline.simulate.settings import SimulateSettings
 
-__all__ = ["draw_truth"]
-
 
 def draw_truth(settings: SimulateSettings, rows: tuple[int, int] | None = None) -> TruthMaps:
     """Draw the true parameter maps (y, x) of the sensor, or of a band of its rows.

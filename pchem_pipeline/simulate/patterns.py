@@ -8,8 +8,6 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["ColumnPattern", "GradientPattern", "Pattern", "PatternBase", "RadialPattern", "RowPattern"]
-
 
 class PatternBase(Section):
     """What every pattern has."""

@@ -21,8 +21,6 @@ from pchem_pipeline.simulate.distributions import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["truncated_quantile"]
-
 
 def truncated_quantile(distribution: Distribution, u: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the quantiles of a distribution truncated to its bounds.

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.simulate.settings import SimulateSettings
 
-__all__ = ["with_scene"]
-
 
 class _Sequence(Effect):
     """Frame n sees image n; after the last one the sequence begins anew. For pixels that see anything."""

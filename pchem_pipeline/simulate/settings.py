@@ -13,8 +13,6 @@ from pchem_pipeline.effects.framework.registry import EffectList
 from pchem_pipeline.simulate.distributions import Distribution, LogNormal, Normal
 from pchem_pipeline.simulate.patterns import ColumnPattern
 
-__all__ = ["Correlation", "HotPixels", "ParameterSettings", "SimulateSettings"]
-
 ParameterName = Literal[
     "quanta_exposure", "dark_current", "conversion_gain", "dn_per_electron", "bias", "analog_read_noise_e"
 ]

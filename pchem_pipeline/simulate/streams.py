@@ -25,16 +25,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import Dim
 
-__all__ = [
-    "Key",
-    "KeyedStreams",
-    "make_key",
-    "normal_quantile",
-    "poisson_quantile",
-    "to_words",
-    "uniform_pair",
-]
-
 Key = tuple[np.uint64, np.uint64]
 
 # counter word of a dimension along which the numbers do not differ

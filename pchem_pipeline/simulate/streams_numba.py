@@ -12,16 +12,6 @@ import numpy as np
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = [
-    "fill_uniform",
-    "normal_from_uniform",
-    "philox_block",
-    "poisson_from_uniform",
-    "poisson_quantile",
-    "poisson_start",
-    "uniform_row",
-]
-
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
 # multipliers and Weyl constants of Philox4x32 (Salmon, Moraes, Dror and Shaw, SC11)

@@ -14,8 +14,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Defect", "TruthMaps"]
-
 # variance of rounding to whole DN, uniform over one DN (sigma_Q of the paper)
 #: largest quanta exposure that can be simulated, e-
 LARGEST_EXPOSURE = 1e7

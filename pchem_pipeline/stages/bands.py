@@ -14,8 +14,6 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["Band", "cut_rows", "plan_bands", "rows_together", "tile_bands"]
-
 #: bands for each worker: enough to keep all busy to the end
 _BANDS_PER_WORKER = 4
 

@@ -11,16 +11,6 @@ from pchem_pipeline.run.model_versions import model_versions, present_content, w
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
 
-__all__ = [
-    "adc_limits",
-    "fit_inputs",
-    "input_content",
-    "integration_time",
-    "other_samples",
-    "search_start",
-    "verdict",
-]
-
 
 def input_content(context: StageContext) -> dict[str, Any]:
     """Return what the content of the input is.

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.reader import FrameReader
     from pchem_pipeline.frames.sequence import FrameSequence
 
-__all__ = ["CopyUnit", "frames_tile", "run"]
-
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)
 #: files of frames beyond which several chunks share one

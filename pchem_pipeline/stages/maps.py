@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["maps_tile", "run"]
-
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 #: of the arrays of a tile that are read and made
 _PIXEL_BYTES = 80 * 8

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.report.stored import StoredRun
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["read_sums", "run_quick_look"]
-
 #: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
 _MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22
 #: Pixels whose codes are looked at, in so many pieces of the sensor, and the fewest that say anything.

@@ -22,18 +22,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = [
-    "SAMPLES_UNTIL",
-    "OpenSample",
-    "check_samples",
-    "exposure_axis",
-    "open_samples",
-    "sample_facts",
-    "sample_sensor",
-    "sample_targets",
-    "shown_sample",
-]
-
 #: The stage up to which the run of each sample must be brought, before they are fitted together.
 SAMPLES_UNTIL = "histogram"
 

@@ -35,8 +35,6 @@ from pchem_pipeline.store.files import storage_error, write_atomic
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["frames_tile", "run"]
-
 TRUTH_FILE = "truth.npz"
 # memory for the frames in the making, over all workers
 _BUDGET = 256 << 20

@@ -15,8 +15,6 @@ from pchem_pipeline.run.declaration import SinglePass, Stage
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
 
-__all__ = ["STAGES", "pipeline", "pipeline_of"]
-
 _HERE = "pchem_pipeline.stages"
 
 _INPUT_SETTINGS = (

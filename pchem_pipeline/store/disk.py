@@ -17,19 +17,6 @@ from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-__all__ = [
-    "aside",
-    "make_folder",
-    "put",
-    "remove",
-    "remove_tree",
-    "replace",
-    "sync_file",
-    "sync_folder",
-    "unsynced",
-    "write",
-]
-
 Data = bytes | bytearray | memoryview
 
 _SYNCS_AT_ONCE = 8

@@ -17,20 +17,6 @@ from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = [
-    "canonical_json",
-    "is_blank",
-    "read_json",
-    "remove_file",
-    "remove_folder",
-    "storage_error",
-    "sync_folder",
-    "whole_file",
-    "without_nan",
-    "write_atomic",
-    "write_json",
-]
-
 _CURES = {
     errno.ENOSPC: "the disk is full: free some space and run again, finished tiles are kept",
     errno.EDQUOT: "the disk quota is used up: free some space and run again, finished tiles are kept",

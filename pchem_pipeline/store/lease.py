@@ -23,8 +23,6 @@ from pchem_pipeline.base.errors import LockedError, StoreError
 from pchem_pipeline.store.progress_file import process_lives
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = ["check_lease", "leased"]
-
 #: seconds between signs of life, and without one until a lock counts as left behind
 BEAT, LEFT_BEHIND = 60.0, 600.0
 

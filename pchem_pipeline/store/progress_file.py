@@ -14,8 +14,6 @@ from typing import Any
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store.files import write_atomic
 
-__all__ = ["ProgressFile", "process_lives", "read_progress"]
-
 
 class ProgressFile:
     """The file ``.pchem/progress.json`` of a run; it is there while a command works on the run.

@@ -18,8 +18,6 @@ from pchem_pipeline.store.files import (
 )
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = ["Records", "StageRecord", "fingerprint_of"]
-
 
 def fingerprint_of(content: dict[str, Any]) -> str:
     """Return the SHA-256 of the canonical JSON of ``content``."""

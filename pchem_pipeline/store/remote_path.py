@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
 
 from pchem_pipeline.base.errors import MissingDependencyError, StoreError, install_hint
 
-__all__ = ["RemoteError", "RemotePath", "lock_folder", "place_of", "refused"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Path makes one slash of two

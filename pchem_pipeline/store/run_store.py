@@ -39,8 +39,6 @@ from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["SCHEMA_VERSION", "RunStore"]
-
 #: Version of the layout; another version is refused.
 SCHEMA_VERSION = 1
 

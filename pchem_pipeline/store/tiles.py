@@ -9,8 +9,6 @@ from typing import Literal
 
 from pchem_pipeline.base.errors import ConfigError
 
-__all__ = ["Tile", "TileSize", "parse_tiles", "roi_tiles", "tile_grid", "tile_shape"]
-
 #: The setting: a side, rows and columns, or chosen by the sensor.
 TileSize = int | tuple[int, int] | Literal["auto"]
 

@@ -14,8 +14,6 @@ from zarr.storage import FsspecStore, LocalStore
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
-__all__ = ["DiskStore", "foreign_codecs", "zarr_store"]
-
 #: codecs that only turn bytes into numbers; others (pickle, ...) may run code of whoever wrote them
 _PLAIN = frozenset(
     {

@@ -17,8 +17,6 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 if TYPE_CHECKING:
     from pchem_pipeline.model.electrons.electrons import KnownPixels
 
-__all__ = ["PEAKS_OVERLAP_E", "Calibration", "covariance_of"]
-
 #: Read noise, e-, above which the peaks of neighbouring electron numbers overlap so far that the most
 #: probable number is often wrong, and the expectation says more.
 PEAKS_OVERLAP_E = 0.4

@@ -18,8 +18,6 @@ from pchem_pipeline.use.calibration import Calibration
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["CommonModes", "Offsets", "estimate_offsets", "scene_of"]
-
 FRAME, ROW, COLUMN, WAVE = range(4)
 _LEAST_SCENE = 0.02  # e-
 #: Effects that shift many pixels alike.

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = ["Waves", "find_offsets"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 

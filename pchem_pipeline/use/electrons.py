@@ -11,16 +11,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use.calibration import Calibration
 
-__all__ = [
-    "add_up",
-    "calibration_variance",
-    "electrons",
-    "read_stderr",
-    "stderr_at",
-    "whole_parts",
-    "with_its_errors",
-]
-
 
 def electrons(
     frames: NDArray[np.unsignedinteger[Any]],

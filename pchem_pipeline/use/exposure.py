@@ -13,8 +13,6 @@ from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
 
-__all__ = ["ExposureMaps", "estimate_exposure"]
-
 
 @dataclass(frozen=True)
 class ExposureMaps:

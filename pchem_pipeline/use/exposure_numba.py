@@ -15,8 +15,6 @@ from pchem_pipeline.model.law.levels_numba import Codes, Levels, list_levels, pl
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN, Pixel
 
-__all__ = ["estimate_exposures"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E
 
-__all__ = ["FLAG_MEANINGS", "QualityFlag", "flag_attributes", "flags"]
-
 
 class QualityFlag(IntFlag):
     """Bits of ``applied/quality`` beyond those of ``fit_status``, which come first."""

@@ -16,8 +16,6 @@ from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
-__all__ = ["Twin", "extrapolated", "redrawn", "twin_maps"]
-
 _LEAST_GAIN, _LEAST_NOISE_DN, _LEAST_EXPOSURE = 1e-6, 1e-3, 1e-6
 #: Side of the blocks of pixels that a larger sensor is made of: correlations of neighbours stay within them.
 _BLOCK = 16

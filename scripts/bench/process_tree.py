@@ -16,8 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Took", "run_measured"]
-
 _EVERY = 0.2
 
 

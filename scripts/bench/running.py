@@ -15,8 +15,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Outcome", "evict", "machine", "plain_numbers", "read_once", "run_pchem", "save_figure"]
-
 STAGES = ("ingest", "histogram", "fit", "maps", "ensemble", "report")
 
 

@@ -53,8 +53,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.run.target import Target
 
-__all__ = ["apply_to_frames"]
-
 #: Name of the work in the records of the output.
 STAGE = "apply"
 _VERSION = 2

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.fit.settings import FitSettings
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["check_run", "doubtful_pixels", "read_calibration", "with_moments", "write_moments"]
-
 #: Gap below which a rival counts, nats; read noise and standard error of the bias from which on, e-, the
 #: curvature of the likelihood at its maximum does not tell how far it reaches: where either is less, or the
 #: gap larger, errors by the curvature are less than 5 % too small, at 0.45 e- and 4,000 frames 20 % and more.

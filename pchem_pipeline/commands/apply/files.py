@@ -14,8 +14,6 @@ from pchem_pipeline.frames.formats.cube_files import Cube, write_fits_cube, writ
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["PROVENANCE", "write_files"]
-
 #: File beside the images that says what they were made of.
 PROVENANCE = "provenance.json"
 

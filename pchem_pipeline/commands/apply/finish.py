@@ -16,8 +16,6 @@ from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.electrons import calibration_variance, read_stderr, stderr_at
 from pchem_pipeline.use.quality import flag_attributes, flags
 
-__all__ = ["finish_maps"]
-
 _BELOW = 5.0  # standard errors of the mean
 
 

@@ -12,8 +12,6 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.use.common_modes import CommonModes
 
-__all__ = ["FORMATS", "KINDS", "ApplySettings", "Job", "Piece", "kinds_of"]
-
 #: What can be asked for.
 KINDS = ("electrons", "numbers", "exposure")
 #: Formats of the output.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.settings import InputSettings
     from pchem_pipeline.run.target import Target
 
-__all__ = ["check_camera", "check_level", "open_like_run", "top_code"]
-
 #: Frames that are looked at before anything is done.
 _SEEN = 16
 #: Standard deviations of a sample below the bias at which the bias is another.

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.electrons.electrons import NumberTables
     from pchem_pipeline.model.histogram.count import RowHistograms
 
-__all__ = ["N_SUMS", "convert_piece", "count_piece", "moments_piece", "offsets_of", "offsets_piece"]
-
 #: Sums of a pixel over frames: x, x^2, the same without offsets, smallest and largest x.
 N_SUMS = 6
 

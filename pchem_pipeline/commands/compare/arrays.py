@@ -15,8 +15,6 @@ from pchem_pipeline.report.comparison import ArrayRow
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["NOT_COMPARED", "compare_arrays"]
-
 #: Groups that are left out, and why.
 NOT_COMPARED = {
     "frames": "the digest of the camera files tells that they are the same",

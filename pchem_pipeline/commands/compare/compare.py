@@ -32,8 +32,6 @@ from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_worker
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["MAPS", "compare_runs", "comparison_of"]
-
 #: The maps that are compared.
 MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
 

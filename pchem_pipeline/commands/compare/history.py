@@ -26,8 +26,6 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["HISTORY_CSV", "HistorySettings", "history_csv", "history_rows"]
-
 #: Name of the file.
 HISTORY_CSV = "history.csv"
 

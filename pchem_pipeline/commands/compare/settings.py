@@ -11,9 +11,6 @@ from pchem_pipeline.report.comparison import Setting
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["settings_that_differ", "versions_that_differ"]
-
-
 #: Settings that decide results by another way than a stage's list.
 _BESIDE = {"input.integration_time": ("maps",), "input.kind": ("maps",), "input.files": ("ingest",)}
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["COMPARED", "compare", "judgement", "unnamed"]
-
 #: Maps whose bias is told, and of which the truth is kept.
 COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 

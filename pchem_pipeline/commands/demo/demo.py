@@ -16,8 +16,6 @@ from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["comparison_table", "run_demo"]
-
 _COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 

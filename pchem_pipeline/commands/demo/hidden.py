@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target
     from pchem_pipeline.simulate.truth import TruthMaps
 
-__all__ = ["OUTSIDE", "RANDOM", "SEALED_KEY", "hidden_effect", "run_hidden_demo", "what_to_hide"]
-
 #: The word for an effect that is not told before the end: of the library or not, with a place or without.
 RANDOM = "random"
 #: The word for one outside the library.

@@ -21,8 +21,6 @@ from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["AddedSets"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -17,17 +17,6 @@ from scipy import special
 from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, saturated
 from pchem_pipeline.discrepancy.verdict import Place
 
-__all__ = [
-    "Interval",
-    "doubtful_peaks",
-    "electrons_of",
-    "find_residuals",
-    "inside",
-    "place_words",
-    "set_aside_residual",
-    "valleys",
-]
-
 FloatArray = NDArray[np.float64]
 
 _RESOLVED = 0.3  # e-: read noise above which there are no valleys

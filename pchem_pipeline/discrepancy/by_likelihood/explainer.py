@@ -35,8 +35,6 @@ from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.shared import Samples
 
-__all__ = ["HistogramExplainer", "SampleHistograms", "find_in_histograms"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

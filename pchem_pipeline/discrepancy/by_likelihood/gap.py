@@ -17,8 +17,6 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import chance_of_cells, satur
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent
 
-__all__ = ["LikelihoodGap", "carried_over"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -17,8 +17,6 @@ from pchem_pipeline.model.fit.shared import Samples
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["NO_ORDER", "Member", "find_members", "law_of"]
-
 FloatArray = NDArray[np.float64]
 
 #: Why effects in time and space cannot be looked for.

@@ -28,8 +28,6 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import (
     of_best_kind,
 )
 
-__all__ = ["Explanation", "Named", "combs_coincide", "explain"]
-
 FloatArray = NDArray[np.float64]
 
 _SIGMAS = 3.0

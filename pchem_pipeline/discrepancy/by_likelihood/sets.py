@@ -21,18 +21,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = [
-    "SWAPPED",
-    "Choice",
-    "FittedSet",
-    "SetComparison",
-    "compare_sets",
-    "find_rivals",
-    "of_best_kind",
-    "saturated",
-    "split_samples",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

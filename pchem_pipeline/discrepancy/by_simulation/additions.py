@@ -26,8 +26,6 @@ from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival
 from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["AddedRounds", "Round"]
-
 FloatArray = NDArray[np.float64]
 
 _CLEAR_MARGIN = 50.0  # nats

@@ -28,8 +28,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
 
-__all__ = ["REPEATS", "Mapper", "ReplicateSimulator", "candidate_classes", "placebo_for", "serial"]
-
 FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
 #: Runs replicates and returns their statistics in the same order; an exception in place of those that failed.

@@ -28,8 +28,6 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere, two_sided
 from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["Comparison", "compare", "leaves_nothing", "own_signature", "unrelated"]
-
 FloatArray = NDArray[np.float64]
 
 _MOST_SINGLES = 7

@@ -23,8 +23,6 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["measured_shifts"]
-
 FloatArray = NDArray[np.float64]
 
 _MOST_PIXELS = 600  # that stand for all

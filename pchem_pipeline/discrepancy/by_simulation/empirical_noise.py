@@ -20,8 +20,6 @@ from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["Covariance", "Covariances", "measured_noise", "residual_covariances"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]

@@ -73,8 +73,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 
-__all__ = ["FrameExplainer", "FrameStack", "find_discrepancies"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 #: Measures a part of the frames, the pixels fitted with some effects, beside some of these.

@@ -23,22 +23,6 @@ from scipy import linalg, optimize
 
 from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = [
-    "Choice",
-    "Contender",
-    "Hypothesis",
-    "Noise",
-    "ScoredSet",
-    "SetFit",
-    "choose",
-    "correction",
-    "fit_set",
-    "log_density",
-    "score_set",
-    "seen_among",
-    "tolerance",
-]
-
 FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3

@@ -27,8 +27,6 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["MANY_MISTAKEN", "Refit", "Sensor", "expected_codes", "learn_sensor", "refit_maps"]
-
 FloatArray = NDArray[np.float64]
 
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}

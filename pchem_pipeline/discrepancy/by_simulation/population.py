@@ -26,17 +26,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = [
-    "Population",
-    "Posterior",
-    "clipped_mean",
-    "lost_variance",
-    "posterior_of",
-    "posterior_of_estimates",
-    "to_parameters",
-    "to_theta",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -20,8 +20,6 @@ from pchem_pipeline.discrepancy.by_simulation.maps import Refit
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 
-__all__ = ["Refitted", "Refitter", "is_dear"]
-
 FloatArray = NDArray[np.float64]
 
 _FEW = 6  # replicates at each strength on the way

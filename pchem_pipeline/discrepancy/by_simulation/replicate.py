@@ -17,8 +17,6 @@ from pchem_pipeline.simulate.chain import dn_dtype, simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 
-__all__ = ["OF_OTHER", "Acquisition", "Replicate", "by_part", "simulate_frames", "truth_of"]
-
 #: Begins the names of the statistics of a replicate's second part.
 OF_OTHER = "other:"
 

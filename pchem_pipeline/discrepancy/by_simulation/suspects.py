@@ -24,8 +24,6 @@ from pchem_pipeline.discrepancy.where import frame_series, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
 
-__all__ = ["suspected_parts"]
-
 FloatArray = NDArray[np.float64]
 
 #: Of a place among all places of all maps; maps rest on fits, whose errors are not quite normal.

@@ -12,8 +12,6 @@ from typing import Literal
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import parse_place
 
-__all__ = ["EXACT", "FAMILIES", "STATISTICS", "VERSION", "Statistic"]
-
 VERSION = 1
 
 Family = Literal["shape", "code", "tail", "time", "frame", "space"]

@@ -24,8 +24,6 @@ from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 
-__all__ = ["compile_observation"]
-
 _SIDE = 2
 _PARAMETERS = (2.0, 0.1, 100.0, 3.0)  # H, g, mu and sigma of the pixels of a stack that nobody looks at
 

@@ -23,19 +23,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.normal_numba import normal_mass
 
-__all__ = [
-    "COLUMNS",
-    "NOTHING",
-    "N_COLUMNS",
-    "N_NUISANCE",
-    "N_TESTS",
-    "fill_law",
-    "pixel_scores",
-    "supports",
-    "whiten",
-    "within",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -11,17 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-__all__ = [
-    "best",
-    "chi_square",
-    "counted",
-    "extreme",
-    "largest_normal",
-    "largest_power",
-    "poisson",
-    "repeats",
-]
-
 FloatArray = NDArray[np.float64]
 
 _SMALL = 1e-12

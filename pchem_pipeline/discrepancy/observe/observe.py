@@ -39,8 +39,6 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-__all__ = ["MINIMUM_BLOCKS", "UNTRUSTWORTHY", "fitted_maps", "observe", "observe_histograms"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -21,8 +21,6 @@ from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-__all__ = ["CHANNELS", "MODES", "PERIOD", "FrameBlocks", "Pairs", "Samples", "Stack", "pairs_of"]
-
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]

@@ -22,8 +22,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_classes
 
-__all__ = ["FEWEST_FRAMES", "FEWEST_PIXELS", "Part", "SensorWindow", "part_evidence", "part_statistics"]
-
 #: Of a part that is looked at by itself.
 FEWEST_PIXELS, FEWEST_FRAMES = 16, 64
 _LEADING = 2  # statistics of a signature that are looked at

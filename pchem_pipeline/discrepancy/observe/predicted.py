@@ -17,8 +17,6 @@ from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, predicted
 from pchem_pipeline.effects.framework.evidence import PredictedSamples
 
-__all__ = ["GROUP", "groups_of", "predicted_samples", "predicted_statistics"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -16,8 +16,6 @@ from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.predicted import groups_of
 from pchem_pipeline.effects.framework.evidence import PreviousBits
 
-__all__ = ["BITS", "bit_statistics", "previous_bits"]
-
 FloatArray = NDArray[np.float64]
 
 BITS = 8  # the lowest ones

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
 
-__all__ = ["line_statistics", "repeated_lines"]
-
 _FIRST = 2  # samples of a line that are compared before all of them are
 _IMPOSSIBLE = 1e-3  # repeats by chance, below which each is proof
 

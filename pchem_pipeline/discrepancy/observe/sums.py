@@ -18,8 +18,6 @@ from pchem_pipeline.discrepancy.observe import sums_numba as kernel
 from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 
-__all__ = ["MOST_HITS", "FrameSums", "PixelStatistics", "blocks_of", "pixel_statistics", "sum_frames"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

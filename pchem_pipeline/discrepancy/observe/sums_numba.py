@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = ["LAGS", "count_repeats", "find_hits", "sum_block"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Float32Array = NDArray[np.float32]

@@ -17,8 +17,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS, supports
 
-__all__ = ["LONGEST_SUPPORT", "PixelLaws", "pixel_laws"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

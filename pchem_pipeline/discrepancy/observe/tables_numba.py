@@ -20,8 +20,6 @@ from pchem_pipeline.discrepancy.observe.law_numba import (
     within,
 )
 
-__all__ = ["N_MOMENTS", "summarise_pixels"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -16,16 +16,6 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 
-__all__ = [
-    "STANDS_OUT",
-    "goodness_of",
-    "in_order",
-    "outliers",
-    "period_statistics",
-    "sample_statistics",
-    "without_skew",
-]
-
 FloatArray = NDArray[np.float64]
 
 #: A pixel beyond this many standard deviations counts as one that stands out.

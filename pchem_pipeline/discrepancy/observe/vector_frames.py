@@ -16,17 +16,6 @@ from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.sums import FrameSums, PixelStatistics
 from pchem_pipeline.discrepancy.observe.vector import outliers
 
-__all__ = [
-    "FrameView",
-    "frame_statistics",
-    "neighbour_sums",
-    "pixel_lags",
-    "quadrant_series",
-    "quadrant_sums",
-    "space_statistics",
-    "time_statistics",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 _Slices = tuple[slice, slice]

@@ -11,8 +11,6 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-__all__ = ["SIGNIFICANCE", "Check", "Level", "QuickLook", "graded"]
-
 Level = Literal["good", "note", "caution", "serious"]
 
 #: A check counts as failed when chance does as much, in any of the checks, with a smaller probability.

@@ -22,8 +22,6 @@ from pchem_pipeline.discrepancy.observe.vector import period_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many
 
-__all__ = ["CodeSample", "code_checks"]
-
 FloatArray = NDArray[np.float64]
 
 #: Statistics of the codes, and what they say.

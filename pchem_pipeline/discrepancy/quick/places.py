@@ -13,8 +13,6 @@ from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.discrepancy.scan import scan_map
 from pchem_pipeline.effects.framework.region import Region
 
-__all__ = ["SensorPlace", "block_deviations", "sensor_maps", "sensor_place"]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 

@@ -28,8 +28,6 @@ from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_ch
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
-__all__ = ["quick_look"]
-
 FloatArray = NDArray[np.float64]
 
 #: Lines with a variance above this multiple of the median hold hot pixels, and are left out of frame means.

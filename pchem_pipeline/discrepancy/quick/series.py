@@ -11,8 +11,6 @@ from scipy import special
 from pchem_pipeline.discrepancy.observe.laws import best, chi_square
 from pchem_pipeline.discrepancy.quick.checks import Check
 
-__all__ = ["normal_p", "of_many", "series_checks"]
-
 FloatArray = NDArray[np.float64]
 
 _SLOWEST = (2, 4, 8, 16, 32)

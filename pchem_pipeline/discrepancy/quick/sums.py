@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 
-__all__ = ["Lines", "StackSums"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

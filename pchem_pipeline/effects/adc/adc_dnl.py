@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["AdcDnl"]
-
 _CHUNK = 1024
 # random edges further away would change their order, others further than a code leave it
 _FARTHEST_RANDOM, _FARTHEST = 0.499, 1.0

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, PreviousBits
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["BinaryOffset"]
-
 _LEAST_GAIN = 16.0  # fall of chi2 that the best of 8 bits must bring: by chance once in 2,000 stacks
 _MORE_GAIN = 25.0  # that of a further bit
 _MOST_PEAKS = 3  # bits with levels of their own in the law; of the others the variance

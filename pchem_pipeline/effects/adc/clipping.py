@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import CodeResiduals, Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["Clipping"]
-
 # counts expected beyond the limit, and standard errors of the pile-up at it
 _EXPECTED_BEYOND = 8.0
 _PILE_UP = 4.0

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["AnalogMemory"]
-
 
 @register_effect
 class AnalogMemory(Effect):

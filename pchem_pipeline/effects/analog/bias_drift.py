@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["BiasDrift"]
-
 _NODES = (3, 5, 9, 17, 33)
 _FRAMES_PER_NODE = 12
 _LOBES = 7

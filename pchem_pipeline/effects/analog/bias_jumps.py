@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["BiasJumps"]
-
 Path = tuple[tuple[int, float], ...]
 
 # how the quadrants' means add up to those of the parts that jump together

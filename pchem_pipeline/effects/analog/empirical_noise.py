@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["EmpiricalNoise", "Lag", "NoiseMode", "spectrum"]
-
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
 #: A distance: frames, rows, columns.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext, RandomSource
     from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
-__all__ = ["FlickerNoise"]
-
 _Flicker = TypeVar("_Flicker", bound="FlickerNoise")
 
 # correlation times, frames, among which the estimator looks

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["FrameNoise"]
-
 
 @register_effect
 class FrameNoise(Effect):

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["GainDrift"]
-
 _NODES = (3, 5, 9, 17)
 _SIGMAS = 2.5
 _LEAST_RESPONSE = 0.15

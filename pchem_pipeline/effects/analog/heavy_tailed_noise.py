@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["HeavyTailedNoise"]
-
 _TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["InterpixelCapacitance"]
-
 
 @register_effect
 class InterpixelCapacitance(Effect):

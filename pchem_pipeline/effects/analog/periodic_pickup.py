@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["PeriodicPickup"]
-
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")
 
 _LOBES = 5

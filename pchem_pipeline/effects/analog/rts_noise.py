@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext, RandomSource
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["RtsNoise"]
-
 # draws that are no frame's
 _WHERE, _SIZE = 0xFFFFFFFE, 0xFFFFFFFF
 # steps, e-, and samples averaged that the estimator looks for, with probabilities

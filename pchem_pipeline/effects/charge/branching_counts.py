@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["BranchingCounts"]
-
 
 @register_effect
 class BranchingCounts(Effect):

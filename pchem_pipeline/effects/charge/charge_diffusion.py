@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
 
-__all__ = ["ChargeDiffusion"]
-
 
 @register_effect
 class ChargeDiffusion(Effect):

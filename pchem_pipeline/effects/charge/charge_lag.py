@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import EffectContext
 
-__all__ = ["ChargeLag"]
-
 
 @register_effect
 class ChargeLag(Effect):

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["SpuriousCharge"]
-
 
 @register_effect
 class SpuriousCharge(Effect):

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["Bend", "SampledPixels", "best_bend", "sampled_tangents"]
-
 _PIXELS = 256
 _PERIODS = 48
 _MOST_CODES = 1500

@@ -21,8 +21,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Steps", "find_steps", "noise_variance"]
-
 
 # cosines of the common mode, and the errors that a jump must be large
 _WAVES = 12

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["BlockCharge", "ExposureProfile", "block_charge", "exposure_nodes", "exposure_profile"]
-
 FloatArray = NDArray[np.float64]
 
 

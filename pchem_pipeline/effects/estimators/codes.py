@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.evidence import CodeResiduals, PixelMaps
 
-__all__ = ["Residuals", "code_range", "edge_shifts", "few_shifts", "roughness", "usable_codes"]
-
 Residuals = tuple["NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
 
 # fewest expected counts at which a relative residual is about normal

@@ -19,19 +19,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = [
-    "WORTH_A_GUESS",
-    "add_offset",
-    "chebyshev_nodes",
-    "is_narrow",
-    "line_excess",
-    "mean_variance",
-    "quantile_means",
-    "responsivity",
-    "run_position",
-    "with_offsets",
-]
-
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
 #: Standard errors from which on an excess is worth a hypothesis. One split of the frames sees less than all

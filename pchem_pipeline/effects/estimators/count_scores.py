@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["charlier_information", "count_excess"]
-
 FloatArray = NDArray[np.float64]
 
 # the information is smooth in both: nodes of its table, e-

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["merged_edges"]
-
 
 def merged_edges(
     model: SampleLaw, first: int, shifts: NDArray[np.float64]

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["binomial_upper", "further_uniform", "numbered", "regrouped", "sent_to_neighbours"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge
 
-__all__ = ["Fading", "FadingCells", "fading_of"]
-
 # a cell must explain this chi-square to tell the time constant, and the differences of four cells that one
 _PRICE_OF_CELL = 6.0
 _PRICE_OF_DETAIL = 9.0

@@ -15,8 +15,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Line", "coherent_line", "incoherent_line"]
-
 # probability of any line where there is none
 _FALSE_ALARM = 0.02
 # frames of a spectrum over frames and lines: enough to tell a line, and bounded memory

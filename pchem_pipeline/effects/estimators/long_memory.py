@@ -17,8 +17,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["between_grid_points", "frame_key", "two_states"]
-
 # frames apart by that many correlation times are independent but for 1e-7
 _FAR = 16.0
 _BITS = 29

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["MovedShare", "moved_shares"]
-
 
 class MovedShare(NamedTuple):
     """A share of moved samples, its standard error, and by how much it lowers chi2 of the codes."""

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-__all__ = ["PixelLaw", "refitted", "select_pixels", "typical_pixels"]
-
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 #: polynomials (a, b) that the four parameters of the PCD take up: bias, exposure, gain, read noise
 _PARAMETERS = ((1, 0), (0, 1), (1, 1), (2, 0))

@@ -11,8 +11,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PREDICTORS", "Predictor", "predicted"]
-
 Predictor = Literal["median", "mean", "row"]
 PREDICTORS: tuple[Predictor, ...] = get_args(Predictor)
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["first_order", "strength_of"]
-
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 EffectType = TypeVar("EffectType", bound="Effect")
 

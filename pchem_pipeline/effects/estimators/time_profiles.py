@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SETTLING", "along_path", "check_path", "settling"]
-
 #: time constants that estimators try, in lengths of the run
 SETTLING = (0.05, 0.1, 0.2, 0.4)
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.telegraph import Telegraph
 
-__all__ = ["DarkCurrentRts"]
-
 # a pixel stands out beyond this standard normal number: one in 150,000 by chance
 _STANDS_OUT = 4.35
 _MOST_OF_A_SENSOR = 0.3

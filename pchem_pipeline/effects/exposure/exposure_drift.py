@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["ExposureDrift"]
-
 _T = TypeVar("_T", bound="ExposureDrift")
 
 # nodes of a free path, and the chi-square that each must explain

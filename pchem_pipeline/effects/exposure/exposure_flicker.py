@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["ExposureFlicker"]
-
 # cycles in the run below which a change is a drift
 _SLOWEST = 20
 # frequencies on either side of a line that say what is there without it

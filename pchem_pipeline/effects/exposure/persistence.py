@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-__all__ = ["Persistence"]
-
 # rows and columns of the grids: to find something, and to describe it
 _GRIDS = (8, 16)
 # time constants tried, in lengths of the run

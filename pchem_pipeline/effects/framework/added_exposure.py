@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.effects.framework.evidence import PixelMaps
 
-__all__ = ["AddedExposure", "added_exposures"]
-
 
 class AddedExposure(NamedTuple):
     """Exposure beside H as a discrete mixture over the frames, (j, y, x) each or (j, n) of a list of pixels.

@@ -18,16 +18,6 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "PixelPlaces",
-    "effect_words",
-    "model_words",
-    "pixel_maps",
-    "place_words",
-    "sample_law",
-    "title_words",
-]
-
 
 def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.bool_]) -> PixelMaps:
     """Return (H, g, mu, sigma) of n pixels as effects take them, each (n,), NaN where not usable.

@@ -19,16 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law.parameters import PixelParameters
 
-__all__ = [
-    "SCORES",
-    "CodeResiduals",
-    "Evidence",
-    "PixelMaps",
-    "PredictedSamples",
-    "PreviousBits",
-    "TimeSeries",
-]
-
 #: Per-pixel efficient scores: products of Hermite (readout) and Charlier (charge) polynomials beyond the four
 #: that are the PCD's own parameters.
 SCORES = ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.region import Region, Span, Taps, When
 
-__all__ = ["frames_of", "mask_file", "overlap", "region_mask", "runs_of", "simplest_region"]
-
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import Enum
 
-__all__ = ["Plane"]
-
 
 class Plane(Enum):
     """Where in the signal chain an effect acts; iteration gives the order of the chain.

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["GRAMMAR", "Region", "Span", "Taps", "When", "parse_place"]
-
 Quadrant = Literal["top left", "top right", "bottom left", "bottom right"]
 
 #: The syntax of a place and a time in one line, for messages.

@@ -23,8 +23,6 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.effect import Effect, registered_effects, tag_of
 from pchem_pipeline.effects.framework.plane import Plane
 
-__all__ = ["ENTRY_POINT_GROUP", "EffectList", "broken_plugins", "effect_class", "effect_classes"]
-
 ENTRY_POINT_GROUP = "pchem_pipeline.effects"
 
 _log = logging.getLogger(__name__)

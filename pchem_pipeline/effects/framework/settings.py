@@ -7,8 +7,6 @@ from pydantic import Field
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.registry import EffectList
 
-__all__ = ["ModelSettings"]
-
 
 class ModelSettings(Section):
     """The model with which the pixels are fitted."""

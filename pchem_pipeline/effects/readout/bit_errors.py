@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["BitErrors"]
-
 Fault = Literal["zero", "one", "flip"]
 _FAULTS: tuple[Fault, ...] = ("zero", "one", "flip")
 _MOST_BITS = 24

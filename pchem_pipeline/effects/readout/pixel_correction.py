@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PredictedSamples
 
-__all__ = ["PixelCorrection"]
-
 # standard deviations by which samples must equal their prediction too often, and exceed it too seldom
 _EQUAL, _ABOVE = 4.0, 3.0
 _FEWEST = 20.0  # samples above the threshold by chance

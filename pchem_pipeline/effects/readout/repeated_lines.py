@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-__all__ = ["RepeatedLines"]
-
 _FEWEST_SHOWN = 8.0  # repeats of each line in a simulation that shows what they do
 
 

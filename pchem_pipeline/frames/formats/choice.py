@@ -7,8 +7,6 @@ from pathlib import Path
 
 from pchem_pipeline.base.errors import InputError
 
-__all__ = ["choose_dataset"]
-
 
 def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
     """Return the dataset to read: the wanted one, else the only one of three axes or more, else of two.

@@ -24,8 +24,6 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import FileHasher
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 
-__all__ = ["ContiguousReader", "Layout", "OpenedFile", "even_offsets", "unsigned_type", "unstore"]
-
 _MOST_BYTES = 1 << 30
 #: targets of one call of preadv
 _MOST_VECTORS = 1024

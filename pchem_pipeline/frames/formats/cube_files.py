@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["Cube", "write_fits_cube", "write_tiff_cube"]
-
 #: Bytes above which a TIFF file needs offsets of 64 bits.
 _LARGEST_TIFF = 1 << 32
 _UNSIGNED_ZERO = {2: 1 << 15, 4: 1 << 31}

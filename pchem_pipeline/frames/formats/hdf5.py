@@ -29,8 +29,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["Hdf5Reader", "write_frames"]
-
 _LOCK = threading.Lock()
 
 

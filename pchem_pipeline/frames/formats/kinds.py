@@ -12,8 +12,6 @@ import numpy as np
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.settings import InputSettings
 
-__all__ = ["check_coded", "check_samples", "full_window", "stack_shape"]
-
 #: rows or columns, above which a header is damaged; it keeps a row of frames in memory
 _MOST_PIXELS = 1 << 20
 #: a file of coded frames, and a coded piece of it, that may hold much in little

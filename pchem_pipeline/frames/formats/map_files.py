@@ -15,8 +15,6 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["MapImage", "read_image", "write_fits", "write_npz", "write_tiff"]
-
 
 @dataclass(frozen=True)
 class MapImage:

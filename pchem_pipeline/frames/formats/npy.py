@@ -17,8 +17,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["NpyReader", "write_frames"]
-
 
 class NpyReader(ContiguousReader):
     """An array (frames, rows, columns), or one frame (rows, columns), in C order."""

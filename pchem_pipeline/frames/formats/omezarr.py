@@ -21,8 +21,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["ZarrReader", "write_frames"]
-
 
 class ZarrReader(FrameReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""

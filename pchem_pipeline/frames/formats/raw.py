@@ -25,8 +25,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["RawReader", "find_sidecar", "write_frames"]
-
 
 class _Sidecar(BaseModel):
     """What a sidecar can say."""

@@ -21,8 +21,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["SerReader", "write_frames"]
-
 _HEADER = struct.Struct("<14s7i40s40s40s2q")
 _MAGIC = b"LUCAM-RECORDER"
 #: ticks of 100 ns from year 1 to 1970

@@ -40,8 +40,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-__all__ = ["TiffReader", "write_frames"]
-
 _QUIET = logging.NullHandler()
 
 

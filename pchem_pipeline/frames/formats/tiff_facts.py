@@ -23,13 +23,6 @@ from pchem_pipeline.frames.camera import (
     text_of,
 )
 
-__all__ = [
-    "check_chain",
-    "images_behind_one_page",
-    "stated_channels",
-    "stated_facts",
-]
-
 
 class _Kind(NamedTuple):
     """Bytes of the parts of a directory, and where the header names the first one."""

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["false_discovery", "misfit", "poorest"]
-
 
 def false_discovery(probability: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return the false-discovery rate at which each of many tests would be called significant.

@@ -11,15 +11,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.parameters import FloatArray
 
-__all__ = [
-    "ChiSquare",
-    "central_window",
-    "chi_square",
-    "noise_floor",
-    "normalised_residuals",
-    "rmse",
-]
-
 
 @dataclass(frozen=True)
 class ChiSquare:

@@ -14,17 +14,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import summarise
 
-__all__ = [
-    "FAR",
-    "LIMIT",
-    "BlockDifference",
-    "MapDifference",
-    "Reasons",
-    "compare_blocks",
-    "compare_maps",
-    "reasons_of_change",
-]
-
 #: Standard errors beyond which a statistic of all pixels counts as changed.
 LIMIT = 5.0
 #: Standard errors beyond which a single pixel counts as changed.

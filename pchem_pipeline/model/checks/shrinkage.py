@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.settings import FitSettings
 
-__all__ = ["LOOSEST", "Judged", "NoisePool", "noise_of"]
-
 FloatArray = NDArray[np.float64]
 
 #: Largest change of the logarithm of a pixel's information over one standard error of its read noise. Beyond,

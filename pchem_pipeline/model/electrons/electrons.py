@@ -19,20 +19,6 @@ from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = [
-    "LARGEST_NUMBER",
-    "NO_NUMBER",
-    "NO_PRIOR",
-    "ErrorTally",
-    "KnownPixels",
-    "NumberTables",
-    "Numbers",
-    "Outcomes",
-    "compare_electron_numbers",
-    "number_tables",
-    "number_type",
-]
-
 IntArray = NDArray[np.int64]
 
 #: Stored where a pixel has no parameters and so no electron number.

@@ -21,16 +21,6 @@ from pchem_pipeline.model.law.levels_numba import (
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN
 
-__all__ = [
-    "NO_PRIOR",
-    "convert_frames",
-    "count_errors",
-    "fill_tables",
-    "find_reach",
-    "sum_outcomes",
-    "tally_numbers",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

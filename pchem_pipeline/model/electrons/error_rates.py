@@ -12,8 +12,6 @@ from pchem_pipeline.model.ensemble.totals import EnsembleTotals
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["error_rates"]
-
 _CHUNK = 1 << 16  # pixels whose tables are held at a time
 
 

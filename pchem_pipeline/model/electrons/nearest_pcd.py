@@ -8,8 +8,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["nearest_pcd"]
-
 
 def nearest_pcd(parameters: Parameters, model: SampleLaw) -> tuple[FloatArray, ...]:
     """Return (H, g, mu, sigma) of the PCD whose peaks lie and widen as the extended law's do near k = H.

@@ -17,8 +17,6 @@ from pchem_pipeline.model.electrons.electrons import LARGEST_NUMBER, Outcomes
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels
 
-__all__ = ["numbers_by_thresholds"]
-
 
 def numbers_by_thresholds(
     counts: NDArray[np.integer[Any]], origin: NDArray[np.integer[Any]], pixels: UsablePixels, n_k: int

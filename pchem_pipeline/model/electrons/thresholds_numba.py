@@ -15,8 +15,6 @@ from pchem_pipeline.model.law.normal_numba import NARROW, REACH, normal_mass
 from pchem_pipeline.model.law.simd_math_numba import simd_tail
 from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, simd_load, simd_store
 
-__all__ = ["sum_by_thresholds"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -13,17 +13,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
-__all__ = [
-    "COMPONENT_CASES",
-    "Components",
-    "EnsembleMoments",
-    "MomentErrors",
-    "component_widths",
-    "moment_errors",
-    "predicted_moments",
-    "sample_moments",
-]
-
 _SYMBOLS = ("H", "g", "mu", "sigma2")
 
 #: Parameters held constant in each of the sixteen cases of Appendix B, from none to all four.

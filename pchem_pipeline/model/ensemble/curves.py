@@ -31,8 +31,6 @@ from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
-__all__ = ["components", "curves", "electron_numbers"]
-
 #: Components are shown up to the electron number whose mass is above this.
 _SMALLEST_COMPONENT = 1e-4
 _WAYS = ("exact", "dependent", "independent")

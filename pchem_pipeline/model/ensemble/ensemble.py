@@ -18,19 +18,6 @@ from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
-__all__ = [
-    "DnAxis",
-    "EnsembleSums",
-    "NucedAxis",
-    "Tally",
-    "curve_errors",
-    "electron_pmf",
-    "ensemble_sums",
-    "mass_sums",
-    "nuced_axis",
-    "tally",
-]
-
 IntArray = NDArray[np.int64]
 
 

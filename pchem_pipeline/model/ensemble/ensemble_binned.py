@@ -23,17 +23,6 @@ from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_p
 from pchem_pipeline.model.law.normal_numba import NARROW, REACH
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
-__all__ = [
-    "Cells",
-    "HistogramChoice",
-    "electron_pmf_binned",
-    "epcd_dependent",
-    "epcd_independent",
-    "joint_cells",
-    "nuced_dependent",
-    "nuced_independent",
-]
-
 #: Analog noise (DN) to which narrower cells are widened in the inversion.
 _NARROWEST = 0.05
 #: Longest signal (DN) that the inversion keeps from wrapping round; only a pixel of absurd gain is beyond.

@@ -16,19 +16,6 @@ from pchem_pipeline.model.law.normal_numba import NARROW, REACH, add_component, 
 from pchem_pipeline.model.law.simd_math_numba import simd_exp
 from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, counting, fused, most, simd_load, simd_store
 
-__all__ = [
-    "capacity",
-    "curve_variance",
-    "poisson_weights",
-    "sort_masses",
-    "sum_nuced_cells",
-    "sum_nuced_product",
-    "sum_pcd_cells",
-    "sum_pcd_pixels",
-    "sum_poisson",
-    "tally_counts",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -11,8 +11,6 @@ from pchem_pipeline.model.ensemble.components import EnsembleMoments, moment_err
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
 from pchem_pipeline.model.law.parameters import UsablePixels
 
-__all__ = ["moment_rows"]
-
 
 def moment_rows(
     totals: EnsembleTotals, pixels: UsablePixels, per_pixel: int | NDArray[Any]

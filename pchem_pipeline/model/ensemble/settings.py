@@ -8,8 +8,6 @@ from pydantic import Field, field_validator
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["EnsembleSettings", "MapsSettings"]
-
 
 class MapsSettings(Section):
     """How the maps are summarised, and which pixels are called misfits; no setting changes a parameter."""

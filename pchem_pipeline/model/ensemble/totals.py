@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis
 from pchem_pipeline.model.law.parameters import FloatArray
 
-__all__ = ["ERROR_SIZES", "MODEL_ERRORS", "EnsembleAxes", "EnsembleTotals"]
-
 #: Sizes of error of the electron numbers told apart; the last one is: and more.
 ERROR_SIZES = 8
 

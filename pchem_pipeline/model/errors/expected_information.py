@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln
 
-__all__ = ["COORDINATES", "expected_information", "inverse_information", "shared_information"]
-
 #: The coordinates in which the information depends on H and the read noise in electrons only.
 COORDINATES = ("quanta_exposure", "log_gain", "bias_e", "log_read_noise_dn")
 

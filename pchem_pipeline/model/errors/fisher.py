@@ -9,16 +9,6 @@ from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pcd import pcd
 
-__all__ = [
-    "CORRELATION_PAIRS",
-    "correlations",
-    "covariance_from",
-    "cramer_rao",
-    "joint_cramer_rao",
-    "observed_covariance",
-    "propagate",
-]
-
 #: Pairs of parameters, in the order of the axis ``parameter_pair``; numbers as in ``variables.PARAMETERS``.
 CORRELATION_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 

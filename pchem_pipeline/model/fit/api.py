@@ -26,8 +26,6 @@ from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likeli
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["fit_histograms", "likelihood_moments", "satellite_threshold"]
-
 FloatArray = NDArray[np.float64]
 Counts = NDArray[np.integer]
 

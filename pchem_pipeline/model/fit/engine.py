@@ -26,8 +26,6 @@ from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood, evaluation_arguments
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["cells_search", "climb", "compilations", "compile_fit", "density_search", "regression_basis"]
-
 _VECTOR = np.zeros(1)
 _OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64, numba.types.int64))
 _FOUND = numba.types.UniTuple(numba.types.int64, 3)

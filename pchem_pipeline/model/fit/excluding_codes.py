@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Interval", "electrons_of", "inside"]
-
 FloatArray = NDArray[np.float64]
 #: Limits on a pixel's comb, e-; None: no limit.
 Interval = tuple[float | None, float | None]

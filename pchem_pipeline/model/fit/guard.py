@@ -20,8 +20,6 @@ from pchem_pipeline.model.fit.search_numba import CHI2, FIT_NOT_CONVERGED, GAIN_
 from pchem_pipeline.model.fit.tile_numba import FREEDOM, STATUS, Answers, Histograms
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT
 
-__all__ = ["fit_guarded"]
-
 Pixels = NDArray[np.intp]
 
 _MOST_PASSES = 8

@@ -13,8 +13,6 @@ from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.tile_numba import Histograms
 from pchem_pipeline.model.law.cells_numba import Law
 
-__all__ = ["Moments", "moments_along_bias"]
-
 FloatArray = NDArray[np.float64]
 
 #: Standard errors between the biases that are looked at, and how many there are at most on either side; a

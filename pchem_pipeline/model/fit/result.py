@@ -14,8 +14,6 @@ from scipy.special import ndtri
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.law.parameters import FloatArray, PixelParameters
 
-__all__ = ["FitResult", "html_table"]
-
 #: What has an interval, in the order of the axis ``quantity``.
 INTERVAL_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.fit import rounding_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 
-__all__ = ["LARGEST_BIAS", "biased_by_rounding", "rounding_bias"]
-
 FloatArray = NDArray[np.float64]
 
 #: Standard errors by which rounding may bias the density's estimates before it is said (or mended).

@@ -8,8 +8,6 @@ from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["FitSettings"]
-
 
 class FitSettings(Section):
     """How the parameters of the PCD are estimated from the histogram of each pixel."""

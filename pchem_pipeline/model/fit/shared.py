@@ -24,8 +24,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["Samples", "SharedFit", "SharedProblem", "Slopes", "Tangent", "fit_shared"]
-
 FloatArray = NDArray[np.float64]
 #: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
 Law = Callable[[FloatArray, FloatArray], SampleLaw]

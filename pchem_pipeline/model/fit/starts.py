@@ -9,8 +9,6 @@ from pchem_pipeline.model.fit import starts_numba
 from pchem_pipeline.model.fit.starts_numba import regression_basis
 from pchem_pipeline.model.law.inputs import kernel_counts
 
-__all__ = ["START_METHODS", "starting_points"]
-
 #: The methods, in the order of the axis ``method`` of :func:`starting_points`.
 START_METHODS = ("regression", "side_lobe", "cumulants")
 

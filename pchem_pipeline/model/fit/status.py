@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import IntFlag
 
-__all__ = ["FAILED", "FLAGGED", "MEANINGS", "FitStatus", "describe"]
-
 
 class FitStatus(IntFlag):
     """Bits of ``fit/fit_status``; 0 means a good fit.

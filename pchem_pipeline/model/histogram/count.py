@@ -25,17 +25,6 @@ from pchem_pipeline.model.histogram.count_numba import (
     update_range,
 )
 
-__all__ = [
-    "MINIMUM_BINS",
-    "HistogramAccumulator",
-    "RowHistograms",
-    "choose_bins",
-    "counts_dtype",
-    "histogram_frames",
-    "most_bins",
-    "pixels_by_range",
-]
-
 #: Smallest number of bins.
 MINIMUM_BINS = 32
 #: A window of so many bins is always allowed (if ``max_bins`` is), for the sake of hot pixels ...

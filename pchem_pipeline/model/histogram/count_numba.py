@@ -13,16 +13,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = [
-    "count_frames",
-    "densest_origin",
-    "place_windows",
-    "recentre",
-    "shift_counts",
-    "update_extremes",
-    "update_range",
-]
-
 _Array = NDArray[Any]
 
 

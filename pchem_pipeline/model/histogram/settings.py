@@ -6,8 +6,6 @@ from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
 
-__all__ = ["HistogramSettings"]
-
 
 class HistogramSettings(Section):
     """How frames are turned into per-pixel histograms and summaries."""

@@ -17,18 +17,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.histogram.count_numba import update_range
 from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
 
-__all__ = [
-    "ROW_GROUP",
-    "BlockSums",
-    "CovarianceMaps",
-    "LineSums",
-    "OpenSums",
-    "SummaryAccumulator",
-    "block_starts",
-    "frame_statistics",
-    "line_sums",
-]
-
 #: Rows in a group: column sums are taken over it, and neighbour products stay inside.
 ROW_GROUP = 64
 

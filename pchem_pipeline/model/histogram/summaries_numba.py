@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 
-__all__ = ["add_products", "sum_lines"]
-
 _Array = NDArray[Any]
 
 

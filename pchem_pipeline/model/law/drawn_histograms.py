@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.pcd import pcd_mass
 
-__all__ = ["DrawnHistograms", "draw_histograms"]
-
 
 class DrawnHistograms(NamedTuple):
     """Counts (n, B), DN of bin 0 (n,), and the true (H, g, mu, sigma), shape (n, 4)."""

@@ -13,13 +13,6 @@ from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.parameters import Parameters
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
-__all__ = [
-    "HasSatellites",
-    "kernel_counts",
-    "pack",
-    "satellites_of",
-]
-
 FloatArray = NDArray[np.float64]
 
 _LAWS: dict[CountLaw, int] = {

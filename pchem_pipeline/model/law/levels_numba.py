@@ -33,17 +33,6 @@ from pchem_pipeline.model.law.pixel_numba import (
 from pchem_pipeline.model.law.simd_math_numba import simd_tail
 from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
 
-__all__ = [
-    "Codes",
-    "Levels",
-    "fill_level",
-    "list_levels",
-    "number_mass",
-    "number_range",
-    "place_codes",
-    "reach_of_law",
-]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -12,8 +12,6 @@ from pchem_pipeline.base.kernel import callback
 from pchem_pipeline.model.law import cells_numba, density_numba
 from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
 
-__all__ = ["cells_likelihood", "density_likelihood", "evaluation_arguments"]
-
 
 @functools.cache
 def evaluation_arguments() -> tuple[Any, ...]:

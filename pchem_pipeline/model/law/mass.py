@@ -11,8 +11,6 @@ from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.parameters import Parameters, columns_of
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["log_likelihood", "sample_mass", "sample_slopes"]
-
 FloatArray = NDArray[np.float64]
 
 

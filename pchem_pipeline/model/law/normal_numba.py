@@ -10,16 +10,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
-__all__ = [
-    "FARTHEST",
-    "NARROW",
-    "REACH",
-    "add_component",
-    "add_density",
-    "add_mass",
-    "normal_mass",
-]
-
 FloatArray = NDArray[np.float64]
 
 #: Standard deviations beyond which a tail is below all that double can hold.

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["FloatArray", "Parameters", "PixelParameters", "UsablePixels", "columns_of", "usable_pixels"]
-
 FloatArray = NDArray[np.float64]
 
 

@@ -16,16 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import pcd_numba
 
-__all__ = [
-    "PcdMoments",
-    "log_pcd",
-    "pcd",
-    "pcd_mass",
-    "pcd_moments",
-    "thresholds",
-]
-
-
 _Array = NDArray[np.float64]
 
 

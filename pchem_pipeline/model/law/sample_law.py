@@ -16,8 +16,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CountLaw", "SampleLaw"]
-
 FloatArray = NDArray[np.float64]
 CountLaw = Literal["poisson", "negative_binomial", "borel"]
 #: A number of all pixels, or one of each, shape (n,).

@@ -16,8 +16,6 @@ from scipy.special import gammaln
 
 from pchem_pipeline.model.law import telegraph_numba
 
-__all__ = ["Telegraph", "find_telegraph"]
-
 FloatArray = NDArray[np.float64]
 
 # rise of the log-likelihood, nats, that the first and the second process must bring; pixels of constant

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtrc
 
-__all__ = ["ExposureLine", "exposure_line"]
-
 FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 2

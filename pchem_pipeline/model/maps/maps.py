@@ -13,19 +13,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.parameters import FloatArray
 
-__all__ = [
-    "CAUTION",
-    "GOOD",
-    "NO_VALUE",
-    "MapSummary",
-    "derived_maps",
-    "display_transform",
-    "quality_map",
-    "status_counts",
-    "summarise",
-]
-
-
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
 
 

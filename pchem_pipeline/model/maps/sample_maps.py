@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.exposure_series import exposure_line
 
-__all__ = ["line_map_names", "line_maps", "own_variance"]
-
 FloatArray = NDArray[np.float64]
 
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.report.style.style import COLUMN_MM, Drawing, Look
 
-__all__ = ["DataTable", "Figure", "csv_text"]
-
 
 @dataclass(frozen=True)
 class DataTable:

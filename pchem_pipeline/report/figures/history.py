@@ -12,8 +12,6 @@ from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, styled
 from pchem_pipeline.report.style.wording import short, symbol
 
-__all__ = ["history_figures"]
-
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
 
 

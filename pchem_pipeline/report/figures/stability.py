@@ -20,15 +20,6 @@ from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.style import Drawing, Look, colours_of, styled
 from pchem_pipeline.report.style.wording import count, short
 
-__all__ = [
-    "frame_table",
-    "line_spectra",
-    "pattern_spectra",
-    "power_table",
-    "profile_table",
-    "stability_figures",
-]
-
 FloatArray = NDArray[np.float64]
 
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.

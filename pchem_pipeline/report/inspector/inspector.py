@@ -20,18 +20,6 @@ from pchem_pipeline.report.inspector.packing import pack_counts
 from pchem_pipeline.report.style.palette import MAP_COLOURS
 from pchem_pipeline.report.style.wording import symbol, unit_text
 
-__all__ = [
-    "PANEL_MAPS",
-    "Embedded",
-    "content_policy",
-    "embedded",
-    "json_for_html",
-    "map_facts",
-    "script",
-    "served_page",
-    "text_of",
-]
-
 #: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
 _CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.report.inspector.packing import PackedMap
 
-__all__ = ["InspectorData", "MapEntry", "PixelSample"]
-
 
 @dataclass(frozen=True)
 class MapEntry:

@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PackedMap", "Scale", "choose_scale", "pack_counts", "pack_map", "varints"]
-
 FloatArray = NDArray[np.float64]
 
 #: Codes with a meaning of their own, and the last one of the regular range.

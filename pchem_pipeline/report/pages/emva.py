@@ -14,8 +14,6 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import measured, short, unit_text
 
-__all__ = ["COLUMNS", "MAPS", "EmvaRow", "emva_rows", "emva_tables"]
-
 COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_here", "where_it_differs")
 
 FloatArray = NDArray[np.float64]

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
-__all__ = ["GLOSSARY", "Term", "explained"]
-
 
 @dataclass(frozen=True)
 class Term:

@@ -15,8 +15,6 @@ from pchem_pipeline.report.figures.figure import Figure, csv_text
 from pchem_pipeline.report.inspector.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 
-__all__ = ["figure_tables", "page_script", "render_page"]
-
 #: Numbers of a table that the page keeps.
 _LARGEST_TABLE = 6_000
 _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}

@@ -7,8 +7,6 @@ import math
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.report.style.wording import percent, short
 
-__all__ = ["check_sentence", "nothing_found", "size_text"]
-
 #: What was looked at, in the order of a reader's questions.
 _SUBJECTS = "frames, rows, columns, neighbours, successive samples and codes"
 

@@ -26,8 +26,6 @@ from pchem_pipeline.report.pages.summary import (
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import stored_unit
 
-__all__ = ["REPORT_VERSION", "report_json", "report_numbers"]
-
 #: Version of the layout of ``report.json``.
 REPORT_VERSION = 1
 

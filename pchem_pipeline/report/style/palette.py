@@ -12,8 +12,6 @@ from typing import Any
 
 from matplotlib.colors import to_hex, to_rgb
 
-__all__ = ["DARK", "DIVERGING", "LIGHT", "MAP_COLOURS", "Palette", "palette_of"]
-
 MAP_COLOURS = "viridis"
 DIVERGING = "RdBu_r"
 

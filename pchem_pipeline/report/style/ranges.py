@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DisplayRange", "finite", "histogram_edges", "robust_range"]
-
 FloatArray = NDArray[np.float64]
 
 #: A positive range that spans more than this factor is drawn on a logarithmic axis.

@@ -12,8 +12,6 @@ from pchem_pipeline.model.maps.maps import display_transform
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import short
 
-__all__ = ["STRETCH_LEVELS", "StretchedMap", "stretch_map"]
-
 FloatArray = NDArray[np.float64]
 
 #: Colour levels at which the colour bar is labelled, and the share of pixels below each.

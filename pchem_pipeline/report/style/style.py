@@ -25,21 +25,6 @@ from PIL import Image
 
 from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS, Palette, palette_of
 
-__all__ = [
-    "COLUMN_MM",
-    "PAGE_MM",
-    "Drawing",
-    "Look",
-    "colours_of",
-    "drawing_bytes",
-    "inches",
-    "note",
-    "plain",
-    "small_png",
-    "styled",
-    "without_collector",
-]
-
 #: Widths of one column and of a page of a journal, mm.
 COLUMN_MM = 88.0
 PAGE_MM = 180.0

@@ -4,19 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = [
-    "count",
-    "measured",
-    "percent",
-    "power_of_ten",
-    "scientific",
-    "short",
-    "signed",
-    "stored_unit",
-    "symbol",
-    "unit_text",
-]
-
 _UNITS = {
     "e-": "e⁻",
     "e-2": "e⁻²",

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
-__all__ = ["evidence_arrays", "path_arrays"]
-
 FloatArray = NDArray[np.float64]
 
 #: Frames in the pictures of the row and column means.

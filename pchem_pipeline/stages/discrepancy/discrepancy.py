@@ -29,8 +29,6 @@ from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["compile_kernels", "run"]
-
 _STAGE = "discrepancy"
 
 

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats
 
-__all__ = ["verdict_text"]
-
 _WIDTH = 100
 #: Longer lists end with a count.
 _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["Survey", "places_of_bands", "places_of_sums", "survey"]
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 

@@ -14,8 +14,6 @@ from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 
-__all__ = ["Window", "choose_window", "read_window"]
-
 # frames tell more than pixels about what happens in time; pixels more about what is rare
 _FRAMES_WANTED = 6000
 #: Windows tried along each edge of the sensor.

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.stages.bands import Band
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["electrons_tile", "read_tables", "run"]
-
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
 #: Bytes of a block of frames of a band.

@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["ensemble_tile", "run"]
-
 #: Frames read at a time, and bytes of histograms of a band.
 _BLOCK_FRAMES = 64
 _BAND_BYTES = 64 << 20

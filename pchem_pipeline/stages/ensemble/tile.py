@@ -19,8 +19,6 @@ from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["PixelHistograms", "ensemble_tile"]
-
 
 @dataclass(frozen=True)
 class PixelHistograms:

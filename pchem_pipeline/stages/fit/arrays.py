@@ -6,8 +6,6 @@ from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, interval_n
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.run.stage import StageContext
 
-__all__ = ["create_fit_maps"]
-
 
 def create_fit_maps(context: StageContext) -> None:
     """Make the maps that the fit will have; the words of its status are explained with them."""

@@ -32,8 +32,6 @@ from pchem_pipeline.stages.fit.together import judge_sensor
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["fit_tile", "run"]
-
 _HISTOGRAM = ("counts", "origin", "under", "over")
 #: of all that is kept of a pixel of a tile until it is written, twice
 _PIXEL_BYTES = 2 * 40 * 8

@@ -22,15 +22,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.law.sample_law import SampleLaw
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = [
-    "fitted_added_exposure",
-    "fitted_effects",
-    "fitted_law",
-    "fitted_pixels",
-    "fitted_satellites",
-    "pixel_places",
-]
-
 
 def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
     """Return the effects of the model of the stored fit, in their order; none without a fit.

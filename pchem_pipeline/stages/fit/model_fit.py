@@ -19,8 +19,6 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["fit_arrays", "fit_model"]
-
 #: Pixels of which effects are told nothing: no value, or one electron off.
 _UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
 

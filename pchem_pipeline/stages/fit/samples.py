@@ -32,8 +32,6 @@ from pchem_pipeline.store.run_store import RunStore
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["SampleFit", "fit_samples", "fit_samples_tile"]
-
 _HISTOGRAM = ("counts", "origin", "under", "over")
 _OF_SAMPLES = ("quanta_exposure", "quanta_exposure_stderr", "mean", "variance")
 _SUSPICIOUS_SHARE = 0.2  # of pixels in poor agreement, from which the samples themselves are in doubt

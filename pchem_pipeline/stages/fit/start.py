@@ -24,8 +24,6 @@ from pchem_pipeline.store.remote_path import RemotePath
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
 
-__all__ = ["drop_fit", "keep_fit", "kept_fit"]
-
 _FILE = "fit_start.npy"
 
 

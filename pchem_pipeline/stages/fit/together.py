@@ -12,8 +12,6 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["judge_sensor"]
-
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
 _LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 _GAIN, _SIGMA = 1, 3  # places in ``variables.PARAMETERS``

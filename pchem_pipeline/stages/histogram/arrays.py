@@ -6,17 +6,6 @@ from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, block_starts
 from pchem_pipeline.run.stage import StageContext, open_store
 
-__all__ = [
-    "CHUNK_BLOCKS",
-    "COLUMN_FRAMES",
-    "COVARIANCES",
-    "MAPS",
-    "ROW_FRAMES",
-    "create_arrays",
-    "extend_arrays",
-    "row_frames",
-]
-
 MAPS = ("origin", "under", "over", "minimum", "maximum")
 COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
 

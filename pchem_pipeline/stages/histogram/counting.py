@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import Block, Rows
     from pchem_pipeline.model.histogram.settings import HistogramSettings
 
-__all__ = ["CountJob", "Emit", "StackCounter", "TileCounter"]
-
 _HISTOGRAMS = ("counts", "origin", "under", "over", "minimum", "maximum")
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
 _OPEN = ("open_sums", "open_covariances")

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.frames.reader import FrameReader
 
-__all__ = ["Plan", "make_plan", "plan_lines"]
-
 #: the program with what the later stages hold, and that for each pixel
 _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
 #: bytes in the store for each pixel: histograms, fit and maps; for each byte of the summaries along time

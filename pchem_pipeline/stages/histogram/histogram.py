@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.histogram_files import HistogramInput
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["run"]
-
 #: samples that one process looks through in a second or so
 _FEW_SAMPLES = 1 << 31
 

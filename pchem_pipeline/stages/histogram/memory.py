@@ -18,12 +18,6 @@ from pchem_pipeline.store.tiles import tile_shape
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
 
-__all__ = [
-    "bytes_per_row",
-    "single_pass_bytes",
-    "single_pass_rows",
-]
-
 
 def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:
     """Return the memory that a worker needs for each row of its band."""

@@ -13,8 +13,6 @@ from pchem_pipeline.store.run_store import RunStore
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
-__all__ = ["copy_shown_sample"]
-
 _MAPS = ("origin", "under", "over", "minimum", "maximum")
 
 

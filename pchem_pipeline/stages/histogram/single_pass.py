@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.frames.stream import Rows
 
-__all__ = ["PREPARED", "count_in_one_pass", "prepared", "stream_rows", "whole_mebibytes"]
-
 #: the stages whose arrays one pass makes
 PREPARED = ("ingest", "histogram")
 

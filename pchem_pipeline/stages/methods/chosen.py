@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.methods.settings import MethodsSettings
     from pchem_pipeline.run.stage import StageContext
 
-__all__ = ["chosen_settings", "methods_settings"]
-
 
 def chosen_settings(context: StageContext) -> dict[str, Any]:
     """Return what the command line chooses, as JSON data; unasked, what it chose for the last result.

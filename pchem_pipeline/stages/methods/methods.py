@@ -32,8 +32,6 @@ from pchem_pipeline.stages.methods.result import METHODS_FILE
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["choose", "methods_tile", "run"]
-
 #: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
 _NO_REFERENCE = FAILED | FitStatus.BIAS_AMBIGUOUS
 _BAND_BYTES = 64 << 20

@@ -13,8 +13,6 @@ from pchem_pipeline.store.run_store import RunStore
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
 
-__all__ = ["open_other_runs", "other_samples"]
-
 
 def other_samples(context: StageContext) -> dict[str, Any]:
     """Return which histograms of other runs join a comparison, for its fingerprint; never raises."""

@@ -8,8 +8,6 @@ from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
-__all__ = ["METHODS_FILE", "read_methods"]
-
 #: File of the result in the folder of a run.
 METHODS_FILE = "methods.json"
 

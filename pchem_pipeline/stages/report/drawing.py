@@ -15,8 +15,6 @@ from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.progress import Reporter
 
-__all__ = ["draw_by_workers", "drawing_executor", "drawing_workers"]
-
 
 def drawing_executor(workers: int, n_figures: int) -> Executor:
     """Return who draws: processes, since drawing shares its settings within one; here, if one is enough."""

@@ -14,8 +14,6 @@ from pchem_pipeline.planning.frames import contour_data, frames_needed, precisio
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
 
-__all__ = ["plan_section"]
-
 _TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
 _DRAWN = _TARGETS[:2]
 _FINE = 14  # points along each axis of the figure
