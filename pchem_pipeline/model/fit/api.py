@@ -140,9 +140,10 @@ def likelihood_moments(
 
     The inverse information is the covariance of a likelihood that falls as a normal law does. Where the read
     noise is high, or frames are few, the likelihood falls more slowly, to one side, or has a second maximum
-    an electron away. So the moments are taken over the likelihood itself, as the posterior under a flat
-    prior: exactly along the bias, whose profile is followed, and by Laplace's approximation across it
-    (Tierney and Kadane 1986). They are about the estimate, not the mean: it is the estimate that is used.
+    an electron away. So the moments are taken over the likelihood itself, as over a posterior: along the bias
+    over its profile, and across it by Laplace's approximation (Tierney and Kadane 1986) under Jeffreys'
+    prior, whose volume cancels that of the approximation. They are about the estimate, not the mean: it is
+    the estimate that is used.
 
     Args:
         counts: histograms, shape (n, B).

@@ -67,7 +67,8 @@ def moments_along_bias(
         *(_SPACING, reach, _DEEPEST, found, across, heights),
     )
     walked = heights > -np.inf
-    weight = np.exp(np.minimum(heights, _DEEPEST)) * _volume(across, size - 2)
+    # Laplace's volume across the bias would multiply this; Jeffreys' prior of what is across divides by it
+    weight = np.exp(np.minimum(heights, _DEEPEST))
     off = np.where(walked[:, :, None], found - parameters[:, None], 0.0)
     electrons = off[:, :, size - 2] * parameters[:, None, size - 3]
     here, beside = abs(electrons) < 0.5, (electrons <= -0.5, electrons >= 0.5)
@@ -82,13 +83,3 @@ def moments_along_bias(
     covariance[~walked[:, _MOST]] = np.nan
     rivals = parameters[:, None] + np.einsum("nst,nti->nsi", np.nan_to_num(rest), off)
     return Moments(covariance, np.nan_to_num(share), rivals)
-
-
-def _volume(covariance: FloatArray, bias: int) -> FloatArray:
-    """Return the root of the determinant of covariances without the bias and what else stays."""
-    size = covariance.shape[-1]
-    stays = ~(np.diagonal(covariance, axis1=-2, axis2=-1) > 0.0)
-    stays[..., bias] = True
-    either = stays[..., :, None] | stays[..., None, :]
-    own = np.where(either, np.eye(size), np.nan_to_num(covariance))
-    return np.asarray(np.sqrt(np.maximum(np.linalg.det(own), 0.0)))

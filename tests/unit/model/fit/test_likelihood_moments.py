@@ -98,7 +98,7 @@ def test_moments_are_those_of_plain_sampling(noisy):
         weight /= weight.sum()
         assert 1 / (weight**2).sum() > 500
         plain.append(np.sqrt(weight @ (theta - noisy.fit.columns[pixel]) ** 2))
-    # what Laplace's approximation across the bias leaves out: 8 % of the error of sigma, less of the others
-    assert (abs(np.median(found[clear] / plain, axis=0) - 1) < 0.1).all()
+    # the prior is flat here, Jeffreys' across the bias there: up to a tenth less
+    assert (abs(np.median(found[clear] / plain, axis=0) - 1) < 0.15).all()
     assert (abs(found[clear] / plain - 1) < 0.3).all()
     assert (np.median(curvature[clear] / plain, axis=0) < 0.95).all()
