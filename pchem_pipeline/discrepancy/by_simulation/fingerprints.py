@@ -78,6 +78,11 @@ class Noise:
     model_error: float
     events: FloatArray | float = 0.0
 
+    def among(self, kept: NDArray[np.bool_]) -> Noise:
+        """Return the noise of some of the statistics, (m,)."""
+        events = np.broadcast_to(self.events, kept.shape)[kept]
+        return replace(self, covariance=self.covariance[np.ix_(kept, kept)], events=events)
+
     def of(self, prediction: FloatArray) -> FloatArray:
         """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
         counts = self.events * np.abs(prediction.sum(axis=0))

@@ -191,7 +191,13 @@ class Refitter:
         scatter = None
         if replicates >= _ENOUGH:
             scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
-        change, stderr = correction(parts, residual, noise, scatter)
+        # a part was chosen because it stands out: what acts everywhere would come out too strong by it
+        kept = np.array(
+            [any(not h.effect.everywhere for h in hypotheses) or "@" not in n for n in self.null.names]
+        )
+        change, stderr = correction(
+            parts[:, kept], residual[kept], noise.among(kept), None if scatter is None else scatter[:, kept]
+        )
         change = np.where(scaling, np.log1p(np.maximum(change, -0.9)), 0.0)
         found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
         allowed = noise.of(parts)

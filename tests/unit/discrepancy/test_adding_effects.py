@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +19,7 @@ from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
 
 NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
@@ -92,6 +94,26 @@ def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) 
     error = 1.5 * found.stderr[0] / TRUTH["row_noise"][1]  # six replicates scatter too
     assert abs(np.log(got / wanted)) < 3.5 * error + 0.05
     assert world.drawn <= 6 * 7
+
+
+def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It was chosen because it stands out, so its statistics are too large."""
+    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0 + np.eye(M)[1] * 30.0, 1.0))
+    factors = {}
+    for place in (None, Region(rows=((3, 8),))):
+        for chance in (0.0, 8.0):
+            world = World([effect("row_noise", 0.2)])
+            names = (NAMES[0], f"{NAMES[0]}@rows=3:8", *NAMES[2:])
+            world.null = replace(world.null, names=names)
+            world.z = replace(world.z, train=world.z.train + chance * np.eye(M)[1])
+            world.z = replace(world.z, test=world.z.test + chance * np.eye(M)[1])
+            guess = hypothesis("row_noise", 0.2)
+            found = world.refitter().refined([replace(guess, effect=guess.effect.at_place(place))])
+            factors[place is None, chance] = factor(found.effects[0]) * float(np.exp(found.change[0]))
+    assert factors[True, 8.0] == pytest.approx(factors[True, 0.0], rel=1e-6)
+    assert factors[False, 8.0] > 1.01 * factors[False, 0.0]
 
 
 def test_a_dear_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
