@@ -364,23 +364,28 @@ def _closing(found: Verdict) -> list[Flag]:
     return flags
 
 
+def _short(data: DiscrepancyData, tag: str) -> str:
+    """Return the name of an effect without its other names."""
+    return data.title(tag).partition(" (")[0]
+
+
 def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     """Say what the runner-up and the placebo of a step close in the place of the named effect."""
     own, flags = 1.0 - max(step.gap_after, 0.0) / step.gap_before if step.gap_before > 0.0 else math.nan, []
     if not own > 0.0:
         return []
-    name, runner_up, placebo = data.title(step.effect or ""), step.runner_up, step.placebo
+    name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
     if runner_up is not None:
         share = percent(max(step.closed_by(runner_up), 0.0), 1.0)
         why = f" and {runner_up.why}" if runner_up.why else ""
-        rival = f"In the place of {name} the runner-up, {data.title(runner_up.effect)}"
+        rival = f"In the place of {name} the runner-up, {_short(data, runner_up.effect)}"
         flags.append(Flag("note", f"{rival}, would close {share} of the gap{why}."))
     if placebo is None:
         return [*flags, Flag("good", f"No effect unrelated to {name} closes any of the gap in its place.")]
     of_that = step.closed_by(placebo) / own
     doubtful = of_that > CONVINCING_PLACEBO
     end = ": take the name with caution" if doubtful else ""
-    text = f"A placebo in the place of {name} ({data.title(placebo.effect)}, unrelated to it) closes"
+    text = f"A placebo in the place of {name} ({_short(data, placebo.effect)}, unrelated to it) closes"
     words = f"{text} {percent(max(of_that, 0.0), 1.0)} of what it closes{end}."
     return [*flags, Flag("caution" if doubtful else "good", words)]
 
