@@ -25,13 +25,17 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 _SHARED: tuple[Shared, ...] = ("frame", "row", "column", "sample")
+_LINES: tuple[Shared, ...] = ("row", "column")
 _FARTHEST = 3  # frames, rows and columns
 _GROUPS = 60  # of frames, whose scatter tells the error
-_CLEAR = 5.0  # standard errors that a covariance must have, among some hundred that are looked at
+_CLEAR = 4.0  # standard errors that a covariance must have; a fit to all statistics comes behind
 _CERTAIN = 3.0  # of a model's, in simulated frames: less is taken for none
 _MOST_LAGS = 64
 # of the variance of single samples, over the least: a spectrum that vanishes needs a long moving average
 _OVER_LEAST = 1.15
+_FEWEST_POINTS, _MOST_POINTS = 3, 6  # of a shape along a line
+_CLEAR_SHAPE = 8.0  # standard errors of a shape, the best of many
+_BETTER = 1.1  # by which it must be clearer than the same value everywhere, in squares
 _MOST = 0.9  # of the variance of the readout, that the noise may have
 
 
@@ -42,8 +46,23 @@ class Covariance(NamedTuple):
     error: float
 
 
-#: Of samples by what shares one value, and by distance.
-Covariances = Mapping[tuple[Shared, Lag], Covariance]
+class Line(NamedTuple):
+    """Mean products of residuals of two columns in a row (two rows in a column), and how many they are."""
+
+    products: FloatArray
+    counts: FloatArray
+
+
+class Covariances(NamedTuple):
+    """Mean products of residuals.
+
+    Attributes:
+        pairs: by what shares one value, and by distance.
+        lines: in a row, and in a column, by the places of both.
+    """
+
+    pairs: Mapping[tuple[Shared, Lag], Covariance]
+    lines: Mapping[Shared, Line]
 
 
 def residual_covariances(
@@ -60,7 +79,7 @@ def residual_covariances(
     inside = inside & maps.usable
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
-        return {}
+        return Covariances({}, {})
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     samples = Samples.of(frames, maps).without(~inside)
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,), *box)])
@@ -70,7 +89,16 @@ def residual_covariances(
         first = np.flatnonzero(numbers[later] == numbers + step)
         if first.size >= 2 * _GROUPS:
             found |= _of_step(u[first], u[later[first]], inside[box], step)
-    return found
+    whole = np.zeros((len(u), *inside.shape), np.float32)
+    whole[(slice(None), *box)] = u
+    return Covariances(found, {"row": _line(whole, inside), "column": _line(whole.swapaxes(1, 2), inside.T)})
+
+
+def _line(u: NDArray[np.float32], inside: BoolArray) -> Line:
+    """Return the mean products of two columns in the same row."""
+    products = sum(np.matmul(block.T, block) for block in u.swapaxes(0, 1))
+    counts = len(u) * (inside.T.astype(np.float64) @ inside)
+    return Line(np.asarray(products / np.maximum(counts, 1.0), np.float64), counts)
 
 
 def _of_step(
@@ -169,12 +197,22 @@ def measured_noise(
         evidence: of the frames.
         inside: pixels that were looked at, shape (y, x).
     """
-    own = {key: one for key, one in model.items() if abs(one.value) > _CERTAIN * one.error}
+    inside = inside & evidence.maps.usable
+    own = {key: one for key, one in model.pairs.items() if abs(one.value) > _CERTAIN * one.error}
     none = Covariance(0.0, 0.0)
-    left = {key: one.value - own.get(key, none).value for key, one in data.items()}
-    error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.items()}
+    left = {key: one.value - own.get(key, none).value for key, one in data.pairs.items()}
+    error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.pairs.items()}
+    response = evidence.readout_std / evidence.maps.read_noise_dn**2
+    mean_response = float(np.mean(response[inside]))
+    profiles: dict[Shared, _Profile] = {
+        of: found
+        for of in _LINES
+        if (found := _profile(of, data, model, np.where(inside, response, np.nan))) is not None
+    }
+    for of, found in profiles.items():
+        found.take_off(of, left, mean_response)
     clear = [key for key in left if abs(left[key]) > _CLEAR * error[key]]
-    modes: list[tuple[Shared, tuple[Lag, ...], tuple[float, ...]]] = []
+    modes: list[NoiseMode] = []
     powers: list[float] = []
     for shared in _SHARED:
         lags = [lag for what, lag in clear if what == shared and any(lag)]
@@ -185,18 +223,87 @@ def measured_noise(
         power = max(here, least * (_OVER_LEAST if shared == "sample" else 1.0))
         if power > 0.0:
             correlation = tuple(round(value / power, 4) for value in values)
-            modes.append((shared, tuple(lags), correlation))
-            powers.append(power)
+            modes.append(NoiseMode(of=shared, share=1.0, lags=tuple(lags), correlation=correlation))
+            powers.append(power / mean_response**2)
+    for of, found in profiles.items():
+        modes.append(NoiseMode(of=of, share=1.0, profile=tuple(np.round(found.points, 3).tolist())))
+        powers.append(found.power)
     if not modes:
         return None
-    inside = inside & evidence.maps.usable
-    # what an offset of 1 DN adds to a residual, in its standard deviation
-    response = float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[inside]))
     most = _MOST * float(np.median(evidence.maps.read_noise_dn[inside])) ** 2
     return EmpiricalNoise(
-        noise_dn=float(np.sqrt(min(sum(powers) / response**2, most))),
+        noise_dn=float(np.sqrt(min(sum(powers), most))),
         modes=tuple(
-            NoiseMode(of=of, share=round(power / sum(powers), 4), lags=lags, correlation=correlation)
-            for (of, lags, correlation), power in zip(modes, powers, strict=True)
+            mode.model_copy(update={"share": round(power / sum(powers), 4)})
+            for mode, power in zip(modes, powers, strict=True)
         ),
     )
+
+
+class _Profile(NamedTuple):
+    """A shape of lines: its values at evenly spaced points, at each place, and its power, DN^2."""
+
+    points: FloatArray
+    shape: FloatArray
+    power: float
+
+    def take_off(self, of: Shared, left: dict[tuple[Shared, Lag], float], response: float) -> None:
+        """Take it off from what lines share alike, which stands for it badly, and from near samples."""
+        alike = left[of, (0, 0, 0)]
+        for key in list(left):
+            if key[0] == of:
+                left[key] = 0.0
+        for far in range(1, _FARTHEST + 1):
+            near: Lag = (0, 0, far) if of == "row" else (0, far, 0)
+            if ("sample", near) in left:
+                made = self.power * response**2 * float(np.mean(self.shape[:-far] * self.shape[far:]))
+                left["sample", near] += alike - made
+
+
+def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatArray) -> _Profile | None:
+    """Return the shape along a line of which each line has so much; None where lines have all alike.
+
+    The covariance of two places far apart is that of a few points between which it is linear; its largest
+    principal component is the shape (Karhunen 1947, Loeve 1948).
+
+    ``response`` is that of the pixels that are looked at, NaN elsewhere, shape (y, x), 1/DN.
+    """
+    if of not in data.lines:
+        return None
+    products, counts = data.lines[of]
+    variance = 1.0 / np.maximum(counts, 1.0)
+    if of in model.lines:
+        products, variance = (
+            products - model.lines[of].products,
+            variance + 1.0 / np.maximum(model.lines[of].counts, 1.0),
+        )
+    known = np.isfinite(response)
+    axis = 0 if of == "row" else 1
+    unit = np.where(known, response, 0.0).sum(axis=axis) / np.maximum(known.sum(axis=axis), 1)
+    size = unit.size
+    n_points = min(_MOST_POINTS, size // 4)
+    one, two = np.nonzero(np.triu((counts > 0) & (np.outer(unit, unit) > 0), _FARTHEST + 1))
+    if n_points < _FEWEST_POINTS or one.size < 4 * n_points**2:
+        return None
+    scale = unit[one] * unit[two]
+    seen, weight = products[one, two] / scale, scale / np.sqrt(variance[one, two])
+    hats = np.maximum(1.0 - np.abs(np.linspace(0, n_points - 1, size)[:, None] - np.arange(n_points)), 0.0)
+    a, b = np.triu_indices(n_points)
+    design = hats[one][:, a] * hats[two][:, b] + hats[one][:, b] * hats[two][:, a] * (a != b)
+    fitted = np.linalg.lstsq(design * weight[:, None], seen * weight, rcond=None)[0]
+    between = np.zeros((n_points, n_points))
+    between[a, b] = between[b, a] = fitted
+    shape = np.linalg.eigh(hats @ between @ hats.T)[1][:, -1] * np.sqrt(size)
+
+    def power(shape: FloatArray) -> tuple[float, float]:
+        """Return the power of a shape, and by how many standard errors it is there."""
+        made = shape[one] * shape[two] * weight
+        square = float(made @ made)
+        if square == 0.0:
+            return 0.0, 0.0
+        return float(made @ (seen * weight)) / square, float(made @ (seen * weight)) / np.sqrt(square)
+
+    (found, clear), (_, alike) = power(shape), power(np.ones(size))
+    if clear < _CLEAR_SHAPE or clear**2 < _BETTER * alike**2 + _CLEAR_SHAPE**2 / 2.0:
+        return None
+    return _Profile(np.linalg.lstsq(hats, shape, rcond=None)[0], shape, found)

@@ -640,7 +640,9 @@ class FrameExplainer:
         @functools.cache
         def of(part: Part) -> Covariances:
             some = part.frames(numbers)
-            return residual_covariances(frames[some], numbers[some], maps, self._inside(part))
+            found = residual_covariances(frames[some], numbers[some], maps, self._inside(part))
+            # the shape of a line beyond the window is not known
+            return found if self.frames.window is None else found._replace(lines={})
 
         return of
 

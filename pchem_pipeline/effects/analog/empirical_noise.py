@@ -53,6 +53,12 @@ class NoiseMode(Section):
     correlation: tuple[float, ...] = Field(
         default=(), max_length=64, description="correlation of the values at each of them, no unit"
     )
+    profile: tuple[float, ...] = Field(
+        default=(),
+        max_length=32,
+        description="relative size along a row (column), at points evenly spaced from its first to its last "
+        "pixel; none: alike",
+    )
 
     @model_validator(mode="after")
     def _of_its_axes(self) -> Self:
@@ -61,6 +67,10 @@ class NoiseMode(Section):
         fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in _DIMS[self.of]]
         if any(not any(lag) or any(lag[axis] for axis in fixed) for lag in self.lags):
             raise ValueError(f"lags of a {self.of} are (frames, rows, columns), not all 0, and 0 within it")
+        if self.profile and (
+            self.of not in ("row", "column") or len(self.profile) < 2 or not any(self.profile)
+        ):
+            raise ValueError("profile: of a row or column, two points or more, not all 0")
         return self
 
     def words(self) -> str:
@@ -70,7 +80,15 @@ class NoiseMode(Section):
         apart = [f"{self.correlation[i]:.2g} {_lag_words(self.lags[i])}" for i in order]
         more = f" and {len(self.lags) - _FEW} other distances" if len(self.lags) > _FEW else ""
         shared = f"correlated by {', '.join(apart)}{more}" if apart else ""
+        if self.profile:
+            whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
         return ", ".join(part for part in (whole, shared) if part)
+
+    def along(self, position: FloatArray) -> FloatArray:
+        """Return the size at positions from 0, the first pixel of a line, to 1; its mean square is 1."""
+        points = np.linspace(0.0, 1.0, len(self.profile))
+        fine = np.interp(np.linspace(0.0, 1.0, 1001), points, self.profile)
+        return np.asarray(np.interp(position, points, self.profile) / np.sqrt(np.mean(fine**2)))
 
 
 def _lag_words(lag: Lag) -> str:
@@ -104,12 +122,19 @@ class EmpiricalNoise(Effect):
         min_length=1,
         max_length=4,
         description="its parts: `of` (what has a value of its own: sample, row, column or frame), `share` of "
-        "the power, `lags` (frames, rows, columns) and the `correlation` at each",
+        "the power, `lags` (frames, rows, columns) and the `correlation` at each; its `profile`",
     )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the noise referred to the input."""
-        total = sum(self.share_of(mode) * _field(mode, i, context) for i, mode in enumerate(self.modes))
+        total: Any = 0.0
+        for number, mode in enumerate(self.modes):
+            field = self.share_of(mode) * _field(mode, number, context)
+            if mode.profile:
+                columns = np.arange(values.shape[2]) / max(context.shape[1] - 1, 1)
+                rows = context.rows[:, None] / max(context.shape[0] - 1, 1)
+                field = field * mode.along(columns if mode.of == "row" else rows)
+            total = total + field
         return add_offset(values, total, context)
 
     def share_of(self, mode: NoiseMode) -> float:
@@ -137,7 +162,7 @@ class EmpiricalNoise(Effect):
         return 2 * max(_average(mode).reach[0] for mode in self.modes)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with its variance: exact, a Gaussian on a Gaussian."""
+        """Return the law with its variance: exact, a Gaussian on a Gaussian; with a profile its mean."""
         return model.with_variance(dn2=self.noise_dn**2)
 
     def words(self) -> str:

@@ -12,6 +12,7 @@ from pchem_pipeline.config.load import parse_config
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
     Covariance,
+    Covariances,
     measured_noise,
     residual_covariances,
 )
@@ -31,6 +32,7 @@ SHAPE = (ROWS, COLUMNS)
 AMPLITUDE, NEXT = 0.9, 0.7  # DN, and the weight of the neighbour
 POWER = AMPLITUDE**2 * (1 + NEXT**2)
 COVARIANCE = AMPLITUDE**2 * NEXT
+NOTHING = Covariances({}, {})
 
 
 def of_next_rows(rng: np.random.Generator) -> np.ndarray:
@@ -72,7 +74,7 @@ def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalN
     inside = np.ones(SHAPE, bool) if inside is None else inside
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
     found = residual_covariances(frames, numbers, evidence.maps, inside)
-    return measured_noise(found, {}, evidence, inside)
+    return measured_noise(found, NOTHING, evidence, inside)
 
 
 @pytest.mark.parametrize(
@@ -105,6 +107,32 @@ def test_nothing_is_measured_where_there_is_nothing():
         assert measured(stack(seed, nothing, read_noise, exposure)) is None
 
 
+@pytest.mark.parametrize("axis", [1, 2])
+def test_the_shape_of_what_lines_share_is_measured(axis):
+    slope = np.linspace(-1.5, 1.5, SHAPE[axis - 1])
+
+    def tilted(rng):
+        if axis == 2:
+            return rng.standard_normal((FRAMES, ROWS, 1)) * slope
+        return rng.standard_normal((FRAMES, 1, COLUMNS)) * slope[:, None]
+
+    found = measured(stack(7, tilted))
+    assert found is not None
+    (mode,) = (mode for mode in found.modes if mode.profile)
+    assert mode.of == ("row" if axis == 2 else "column")
+    shape = mode.along(np.linspace(0.0, 1.0, slope.size))
+    assert abs(np.corrcoef(shape, slope)[0, 1]) > 0.95
+    power = np.mean(slope**2)
+    assert found.share_of(mode) ** 2 == pytest.approx(power, rel=0.25)
+    # near samples share it, and nothing else
+    assert all(other.share < 0.2 for other in found.modes if other is not mode)
+    noise = simulated(EmpiricalNoise(noise_dn=1.0, modes=(mode,)))
+    size = noise.std(axis=0)
+    wanted = abs(shape) if axis == 2 else abs(shape)[:, None]
+    # a standard deviation of 600 values has an error of 2.9 %
+    np.testing.assert_allclose(size, np.broadcast_to(wanted, SHAPE), rtol=0.15, atol=0.02)
+
+
 def test_only_a_part_is_looked_at():
     def in_left_half(rng):
         noise = of_whole_rows(rng) * np.ones(SHAPE)
@@ -126,8 +154,10 @@ def test_what_a_model_makes_is_taken_off():
     inside = np.ones(SHAPE, bool)
     data = residual_covariances(frames, np.arange(FRAMES), evidence.maps, inside)
     assert measured_noise(data, data, evidence, inside) is None
-    by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.items()}
-    assert measured_noise(data, by_chance, evidence, inside) == measured_noise(data, {}, evidence, inside)
+    by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
+    assert measured_noise(data, Covariances(by_chance, {}), evidence, inside) == measured_noise(
+        data, NOTHING, evidence, inside
+    )
 
 
 def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
