@@ -178,7 +178,7 @@ def test_tiff_and_fits_hold_what_zarr_holds(lab):
                 assert about["unit"] == "e-"
                 assert about["provenance"]["run"] == "run.zarr"
         image = fits.getdata(lab.folder / "out_fits" / f"{name}.fits")
-        np.testing.assert_array_equal(np.squeeze(image), values)
+        np.testing.assert_array_equal(image, values)
     header = fits.getheader(lab.folder / "out_fits" / "electrons.fits")
     assert header["BUNIT"] == "e-"
     assert "run_digest" in "".join(header["HISTORY"])

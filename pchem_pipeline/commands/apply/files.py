@@ -47,8 +47,7 @@ def write_files(store: RunStore, folder: Path, kind: str, content: dict[str, Any
 
 def _cube(store: RunStore, variable: Variable, content: dict[str, Any], *, single: bool) -> Cube:
     array = store.array(variable.path)
-    images = array.shape[0] if len(array.shape) == 3 else 1
-    shape = images, array.shape[-2], array.shape[-1]
+    shape = array.shape if len(array.shape) == 3 or not single else (1, *array.shape)
     dtype = np.dtype(array.dtype)
     if single and dtype == np.float64:
         dtype = np.dtype(np.float32)  # the largest that ImageJ reads

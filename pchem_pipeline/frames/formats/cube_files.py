@@ -27,7 +27,7 @@ class Cube:
     Attributes:
         name: as in the store.
         blocks: arrays (any number of images, rows, columns), in order.
-        shape: (images, rows, columns) of all together.
+        shape: (images, rows, columns) of all together; FITS takes a map of (rows, columns), too.
         dtype: type of the samples.
         unit: physical unit.
         long_name: one sentence.
@@ -36,7 +36,7 @@ class Cube:
 
     name: str
     blocks: Iterable[NDArray[Any]]
-    shape: tuple[int, int, int]
+    shape: tuple[int, ...]
     dtype: np.dtype[Any]
     unit: str
     long_name: str
@@ -69,7 +69,7 @@ def write_tiff_cube(path: Path, cube: Cube) -> None:
 
 
 def write_fits_cube(path: Path, cube: Cube) -> None:
-    """Write an image of three axes, the unit in ``BUNIT``, the provenance as ``HISTORY``.
+    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``.
 
     Raises:
         StoreError: the folder cannot be written.
