@@ -26,6 +26,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from filelock import FileLock
 
+#: Variable of the environment that says: memory is short, for this process and those that it starts.
+TIGHT_MEMORY = "PCHEM_TIGHT_MEMORY"
+
 #: Called with the name of a kernel that is missing and None, then with the seconds that it took to have it.
 Listener = Callable[[str, float | None], None]
 _listeners: list[Listener] = []

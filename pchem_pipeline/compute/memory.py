@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY
 from pchem_pipeline.compute.executor import DaskPoolExecutor, Executor
 
 #: the program with its libraries and compiled kernels
@@ -37,6 +38,7 @@ def keep_memory_tight() -> None:
     names = ("MALLOC_ARENA_MAX", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
     for name, value in zip(names, (_HEAPS, _LARGE, _LARGE), strict=True):
         os.environ.setdefault(name, str(value))
+    os.environ.setdefault(TIGHT_MEMORY, "1")
     mallopt = getattr(_libc(), "mallopt", None)
     if mallopt is not None:
         for parameter, value in ((_ARENA_MAX, _HEAPS), (_MMAP_THRESHOLD, _LARGE), (_TRIM_THRESHOLD, _LARGE)):

@@ -146,8 +146,7 @@ def announced(reporter: Reporter, stage: str, limit: int | None = None) -> Itera
     finally:
         reporter.compiling(0.0, 0.0)
     if seconds:
-        done = "one kernel" if len(seconds) == 1 else f"{len(seconds)} kernels"
-        reporter.info(f"{stage}: {done} compiled in {sum(seconds):.0f} s")
+        reporter.info(f"{stage}: {_so_far(seconds, 0, 0.0)}")
         _remember(stage, len(seconds), sum(seconds))
 
 
@@ -156,7 +155,8 @@ def _so_far(seconds: Sequence[float], number: int, total: float) -> str:
     of = f" of about {number}" if len(seconds) < number else ""
     left = _left(seconds, number, total)
     words = f", about {left:.0f} s left" if left > 1 else ""
-    return f"{len(seconds)}{of} kernels compiled in {sum(seconds):.0f} s{words}"
+    done = f"{len(seconds)}{of} kernels" if of or len(seconds) > 1 else "one kernel"
+    return f"{done} compiled in {sum(seconds):.0f} s{words}"
 
 
 def _left(seconds: Sequence[float], number: int, total: float) -> float:

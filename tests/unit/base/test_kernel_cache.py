@@ -14,7 +14,7 @@ from filelock import FileLock
 import pchem_pipeline
 from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.kernel_cache import in_any_order, listening
+from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, in_any_order, listening
 from pchem_pipeline.model.electrons import electrons_numba
 
 INNER = """
@@ -131,6 +131,24 @@ def test_what_another_process_compiles_comes_last_in_a_list(tmp_path, monkeypatc
     assert begun == ["squared", "cubed"]
     assert (cubed(3), squared(3), gc.isenabled()) == (27, 9, True)
     assert len(list(tmp_path.glob("*.nbc"))) == 2
+
+
+@pytest.mark.parametrize("tight", [False, True])
+def test_garbage_is_collected_meanwhile_where_memory_is_short(tmp_path, monkeypatch, tight):
+    @kernel
+    def added(x):
+        return x + tight
+
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+    if tight:
+        monkeypatch.setenv(TIGHT_MEMORY, "1")
+    else:
+        monkeypatch.delenv(TIGHT_MEMORY, raising=False)
+    seen = []
+    with listening(lambda *_: seen.append(gc.isenabled())):
+        added(1)
+    assert seen == [tight, tight]
+    assert gc.isenabled()
 
 
 def test_where_nothing_can_be_written_kernels_are_compiled_each_time(sample):
