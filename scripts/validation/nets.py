@@ -370,7 +370,8 @@ class Comparison:
             with np.errstate(invalid="ignore"):
                 lower = change < -LOWER * np.abs(old[name])
                 rose = change > HIGHER
-            nothing = lower & np.isnan(old["maps/bias"]) & np.isnan(new["maps/bias"])
+            bias = "maps/bias" if "maps/bias" in old else "fit/bias"  # a net may end with the fit
+            nothing = lower & np.isnan(old[bias]) & np.isnan(new[bias])
             if nothing.any():
                 words = f"lower in {int(nothing.sum())} pixels without a value before and after"
                 self.say(f"{run}:{name}", f"{words}: {places(nothing)}")
