@@ -25,7 +25,7 @@ TRIED = (
     "black_clamp", "dead_time", "gain_stitch", "hysteresis", "row_swap", "block_mean",
 )  # fmt: skip
 SEALED = (
-    "mains_gain", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
+    "mains_gain", "blended_frames", "bursting_block", "row_tilt", "noisy_time",
     "empty_samples", "loud_column", "negative_ghost", *OUTSIDE,
 )  # fmt: skip
 #: effects that a stationary stack hardly tells apart: the one for the other is no invention

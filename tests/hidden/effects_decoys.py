@@ -218,22 +218,6 @@ class BlendedFrames(Hidden):
             frames[t] = (frames[t].astype(np.int64) + frames[t - 1]) // 2
 
 
-class CoarseAbove(Hidden):
-    """Above a code the converter gives every other code alone; strength: share of those samples."""
-
-    tag: ClassVar[str] = "coarse_above"
-    s95: ClassVar[float] = 0.02
-    most: ClassVar[float] = 1.0
-
-    def draw(self):
-        low, high = self.sensor.code_range
-        self.code = int(low + self.between("place", 0.4, 0.7) * (high - low))
-
-    def convert(self, t, dn, code):
-        moved = (code > self.code) & (self.rng.random(code.shape) < self.strength)
-        return np.where(moved, code & ~1, code)
-
-
 class BurstingBlock(Hidden):
     """A block of pixels whose offset jumps together in one frame of twenty; strength: DN."""
 
@@ -323,7 +307,7 @@ TRIED = (
     "black_clamp", "dead_time", "gain_stitch", "hysteresis", "row_swap", "block_mean",
 )  # fmt: skip
 SEALED = (
-    "mains_gain", "blended_frames", "coarse_above", "bursting_block", "row_tilt", "noisy_time",
+    "mains_gain", "blended_frames", "bursting_block", "row_tilt", "noisy_time",
     "empty_samples", "loud_column", "negative_ghost", "trap_limited_lag", "self_trigger_cut",
     "output_crosstalk", "checkerboard_offset",
 )  # fmt: skip
