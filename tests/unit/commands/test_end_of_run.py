@@ -64,7 +64,7 @@ def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys)
 
 def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys) -> None:
     run(target, "serious", quiet=True)
-    assert capsys.readouterr().err == "warning: To be believed? No: 60 % flagged.\n"
+    assert capsys.readouterr().err == "warning: To be believed? No: 60 % flagged: so.\n"
     for level in ("caution", "good"):
         run(target, level, quiet=True, strict=True)
         assert capsys.readouterr().err == ""
