@@ -17,9 +17,12 @@ from helpers.commands import Result, Shell
 from helpers.known_camera import KnownCamera
 
 from pchem_pipeline.cli.app import main
+from pchem_pipeline.commands.apply.characterisation import read_calibration
 from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.use.exposure import estimate_exposure
 
 SHAPE, N_NIGHT = (16, 24), 500
 N = SHAPE[0] * SHAPE[1]
@@ -270,6 +273,30 @@ def test_frames_of_another_camera_or_temperature(lab, night):
     cold = lab.ok("apply", "own.zarr", "cold.tif", "--output", "cold.zarr", "--what", "electrons")
     assert "the frames name the camera Camera Y, those of the run Camera X" in cold.stderr
     assert "°C" not in cold.stderr
+
+
+def test_errors_where_peaks_overlap_hold_what_the_likelihood_leaves_open(tmp_path, monkeypatch, capsys):
+    """A read noise of 0.45 e-: by the curvature of the characterisation they are too small by far."""
+    monkeypatch.chdir(tmp_path)
+    lab = Lab(tmp_path, {}, capsys)
+    rng = np.random.default_rng(62)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.45, 0.45), gain=(0.08, 0.12))
+    tifffile.imwrite(tmp_path / "dark.tif", camera.frames(rng, 2.0, 4000)[1])
+    electrons, frames = camera.frames(rng, 1.0, 300)
+    tifffile.imwrite(tmp_path / "night.tif", frames)
+    lab.ok("run", "dark.tif", "--store", "run.zarr", "--bit-depth", "14", "--until", "fit", "--quiet")
+    lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure,numbers")
+    found = opened(tmp_path / "out.zarr").load()
+    pulls = ((found.exposure - 1.0) / found.exposure_stderr).values
+    square = np.sqrt(np.nanmean(pulls**2))
+    assert 0.7 < square < 1.25
+    histograms = histogram_frames(frames)
+    calibration = read_calibration(RunStore.open(tmp_path / "run.zarr"))
+    curved = estimate_exposure(histograms.counts, histograms.origin, calibration)
+    np.testing.assert_allclose(curved.exposure, found.exposure, rtol=1e-6)
+    assert np.sqrt(np.nanmean(((curved.exposure - 1.0) / curved.stderr) ** 2)) > 1.2 * square
+    wrong = (found.electron_number.values != electrons).mean()
+    assert abs(wrong / (1 - found.number_probability.values.mean()) - 1) < 0.1
 
 
 ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
