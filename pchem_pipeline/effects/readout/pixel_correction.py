@@ -36,7 +36,7 @@ class PixelCorrection(Effect):
     Signature: samples equal what their neighbours predict more often than what those of the next frame do,
     and exceed it less often; the upper tail of a pixel is cut, the more so the darker its neighbours. A
     pixel's own histogram has no law of its own, since the cut is where the neighbours put it: the pixels keep
-    the parameters of their corrected samples, and the share found in frames comes out a tenth too large.
+    the parameters of their corrected samples.
     """
 
     tag: Literal["pixel_correction"] = Field(default="pixel_correction", description="name of the effect")
