@@ -20,8 +20,8 @@ prepare_environment()
 
 import numpy as np  # noqa: E402
 
+from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
-from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
 
+from pchem_pipeline.model.errors.rounding import rounding_bias
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.rounding import rounding_bias
 from pchem_pipeline.model.fit.settings import FitSettings
 
 N = 800

@@ -12,12 +12,12 @@ from scipy.special import chdtrc, chdtri
 
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import observed_covariance
+from pchem_pipeline.model.errors.rounding import biased_by_rounding
 from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 from pchem_pipeline.model.fit.guard import fit_guarded
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
-from pchem_pipeline.model.fit.rounding import biased_by_rounding
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import callback, types_of
 from pchem_pipeline.base.kernel_cache import in_any_order
+from pchem_pipeline.model.errors import rounding_numba
 from pchem_pipeline.model.fit import (
     cells_search_numba,
     climb_numba,
     guard_numba,
-    rounding_numba,
     search_numba,
     starts_numba,
     tile_numba,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, rounding_bias
+from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, rounding_bias
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings

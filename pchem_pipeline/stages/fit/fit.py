@@ -14,9 +14,9 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import PixelPlaces
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.excluding_codes import Interval
-from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure

@@ -6,8 +6,8 @@ from helpers.drawn_pixels import draw
 from scipy.optimize import minimize
 
 from pchem_pipeline.model.errors.fisher import cramer_rao
+from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass

@@ -1,4 +1,4 @@
-"""Loop of :mod:`pchem_pipeline.model.fit.rounding`."""
+"""Loop of :mod:`pchem_pipeline.model.errors.rounding`."""
 
 from __future__ import annotations
 

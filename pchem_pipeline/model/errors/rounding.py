@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.fit import rounding_numba
+from pchem_pipeline.model.errors import rounding_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 
 FloatArray = NDArray[np.float64]
