@@ -147,6 +147,8 @@ def test_result_does_not_depend_on_threads(tmp_path, frames, expected):
 class _PickledTasks(SerialExecutor):
     """Sends tasks and units through pickle, as a backend of other processes does."""
 
+    shares_memory = False
+
     def map(self, function, items, on_result):
         super().map(pickle.loads(pickle.dumps(function)), pickle.loads(pickle.dumps(list(items))), on_result)
 

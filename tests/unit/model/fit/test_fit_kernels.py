@@ -13,13 +13,12 @@ from helpers.em_trace import LIMITS, em_trace, evaluated, one_sample
 from helpers.reference_pchem import Theta, e_step, em, log_likelihood
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.errors import algebra_numba
+from pchem_pipeline.model.errors import algebra_numba, rounding_numba
 from pchem_pipeline.model.fit import api as fit_api
 from pchem_pipeline.model.fit import (
     climb_numba,
     engine,
     guard_numba,
-    rounding_numba,
     search_numba,
     starts_numba,
     tile_numba,
