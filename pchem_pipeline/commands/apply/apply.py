@@ -113,6 +113,8 @@ def apply_to_frames(
             reporter.warning(remark)
         _do(context, replace(made.job, output=store.path), made, wanted)
         if wanted.format == "zarr":
+            how = f'xarray.open_zarr("{output}", group="applied", consolidated=False)'
+            reporter.info(f"apply: open it with {how}")
             return [output]
         written = write_files(store, output, wanted.format, made.content)
     shutil.rmtree(place, ignore_errors=True)
