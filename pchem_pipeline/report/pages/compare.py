@@ -198,7 +198,7 @@ def history_table(found: Comparison) -> Table:
     """Return a row for each run: pixels, flags, effects, and what moved since the first."""
     rows = []
     for row in found.history:
-        flagged = {name: n for name, n in row.flags.items() if n}
+        flagged = {name.replace("_", " "): n for name, n in row.flags.items() if n}
         moved = {symbol(name)[1]: n for name, n in row.moved.items() if n}
         rows.append(
             (
@@ -208,7 +208,7 @@ def history_table(found: Comparison) -> Table:
                 row.run.title,
                 f"{row.run.pixels[0]:,}",
                 f"{row.hot_pixels:,}",
-                ", ".join(f"{name} {n:,}" for name, n in flagged.items()) or "none",
+                ", ".join(f"{name}: {n:,}" for name, n in flagged.items()) or "none",
                 ", ".join(row.effects) or "none",
                 f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
                 ", ".join(f"{name} {n:,}" for name, n in moved.items()),
