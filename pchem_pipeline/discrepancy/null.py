@@ -124,9 +124,30 @@ def look_elsewhere(p: float, tests: float) -> float:
     return float(-np.expm1(tests * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
-def as_matrix(names: Sequence[str], vectors: Sequence[Mapping[str, float]]) -> FloatArray:
-    """Return statistics as rows in the order of the names."""
-    return np.array([[vector[name] for name in names] for vector in vectors], np.float64)
+def as_matrix(
+    names: Sequence[str], vectors: Sequence[Mapping[str, float]], usual: FloatArray | None = None
+) -> FloatArray:
+    """Return statistics as rows in the order of the names.
+
+    One that a vector lacks, since too few of its pixels or pairs could be used, says nothing: it is the mean
+    of the others, or the usual value where none has it.
+
+    Args:
+        names: of the statistics, shape (m,).
+        vectors: by name.
+        usual: value of each, shape (m,); None: at least one vector has it.
+
+    Raises:
+        KeyError: no vector has a statistic, and nothing is usual.
+    """
+    found = np.array([[vector.get(name, np.nan) for name in names] for vector in vectors], np.float64)
+    lacking = np.array([[name not in vector for name in names] for vector in vectors], np.bool_)
+    for j in np.flatnonzero(lacking.any(axis=0)):
+        there = found[~lacking[:, j], j]
+        if not there.size and usual is None:
+            raise KeyError(names[int(j)])
+        found[lacking[:, j], j] = there.mean() if there.size else np.asarray(usual)[j]
+    return found
 
 
 def _pooled(first: FloatArray, n_first: int, second: FloatArray, n_second: int) -> FloatArray:

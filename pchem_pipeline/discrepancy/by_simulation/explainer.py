@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import ConfigError, InputError, error_words
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, Round
 from pchem_pipeline.discrepancy.by_simulation.candidates import (
@@ -567,6 +567,10 @@ class FrameExplainer:
                     if found is None:
                         raise
                     return found
+                # a defect of what is measured must not cost the verdict
+                except Exception as error:
+                    self.defects[form] = error_words(error)
+                    continue
                 if one is not None and one.score > score:
                     found, better, score = one, form, one.score
             if not better:
@@ -665,7 +669,7 @@ class FrameExplainer:
                 known[key] = (*self._mapped(model), [])
             fit, sensor, vectors = known[key]
             vectors += self._replicates(model, sensor, "grown", count - len(vectors), len(vectors))
-            return fit, as_matrix(self.first.names, vectors[:count])
+            return fit, as_matrix(self.first.names, vectors[:count], self.first.mean)
 
         events = np.asarray(self._noise(self.first, 2).events)
 

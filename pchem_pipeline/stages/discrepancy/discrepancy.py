@@ -64,10 +64,13 @@ def run(context: StageContext) -> None:
     """
     sensor, (before, roi) = context.sensor, _start(context)
     with context.reporter.phases(_STAGE) as tell:
-        if sensor.kind == "frames":
-            _run_frames(context, before, roi, tell)
-        else:
-            _run_histograms(context, before, tell)
+        try:
+            if sensor.kind == "frames":
+                _run_frames(context, before, roi, tell)
+            else:
+                _run_histograms(context, before, tell)
+        except _Ended as ended:
+            raise ended.error from ended.error.__cause__
 
 
 def _run_frames(
@@ -146,6 +149,14 @@ def _nothing_left(unit: Unit) -> None:
     """Do nothing: the work of the unit was done beforehand."""
 
 
+class _Ended(BaseException):
+    """Takes what ends the stage (a signal, a full disk) past what guards a search against strange effects."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
 @dataclass
 class _Mapper:
     """Runs replicates as units of the stage; those done before an interruption are not done again."""
@@ -157,9 +168,12 @@ class _Mapper:
         """Return the statistics of each replicate, or what it raised."""
         units = {r.key: _Unit(r) for r in replicates}
         self.total += len(units)
-        summaries = self.context.run_units(
-            list(units.values()), _simulate, unit_name="stack", by_tiles=False, total=self.total
-        )
+        try:
+            summaries = self.context.run_units(
+                list(units.values()), _simulate, unit_name="stack", by_tiles=False, total=self.total
+            )
+        except Exception as error:
+            raise _Ended(error) from error
         found: list[Mapping[str, float] | Exception] = []
         for replicate in replicates:
             reason = self.context.failed.pop(replicate.key, None)

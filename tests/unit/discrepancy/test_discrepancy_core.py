@@ -17,7 +17,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
 from pchem_pipeline.discrepancy.gap import StatisticsGap
-from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.null import NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -247,3 +247,13 @@ def test_established_is_what_is_many_errors_strong_or_counted_exactly() -> None:
     )
     assert fit.established(4.5) == (first, third)
     assert fit.established(6.0) == (third,)
+
+
+def test_a_statistic_that_a_replicate_lacks_says_nothing() -> None:
+    """A part of few pixels may have no pair that can be used, in one stack and not in another."""
+    vectors = [{"a": 1.0, "b": 4.0}, {"a": 3.0}, {"a": 2.0, "b": 8.0}]
+    np.testing.assert_allclose(as_matrix(("a", "b"), vectors), [[1, 4], [3, 6], [2, 8]])
+    usual = np.array([0.0, 0.0, 5.0])
+    np.testing.assert_allclose(as_matrix(("a", "b", "c"), vectors, usual)[:, 2], 5.0)
+    with pytest.raises(KeyError, match="c"):
+        as_matrix(("a", "c"), vectors)
