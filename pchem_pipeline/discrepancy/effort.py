@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
 # pixel, of its fit with effects by components of the law, and of what is learnt of the sensor from a pixel
-_SAMPLE, _FIT, _REFIT, _LEARN = 5.0e-8, 4.0e-5, 1.0e-4, 3.0e-4
+_SAMPLE, _FIT, _REFIT, _LEARN = 5.0e-8, 4.0e-5, 4.0e-5, 3.0e-4
 _MOST_LEARNT_FROM = 1000  # pixels
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 100.0, 3.0

@@ -107,7 +107,9 @@ class SampleLaw:
     @property
     def components(self) -> int:
         """Number of peaks that each electron number has, those that a fit tries in turn included."""
-        mixed = self.exposure_weights.size * self.added_weights.shape[-1] * self.satellite_weights.shape[-1]
+        mixed = (
+            self.exposure_weights.shape[-1] * self.added_weights.shape[-1] * self.satellite_weights.shape[-1]
+        )
         return int(mixed) + len(self.free_satellites) * len(self.free_satellite_pattern)
 
     @property

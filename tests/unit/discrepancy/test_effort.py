@@ -9,6 +9,9 @@ from helpers.plain_camera import PlainCamera
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
+from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
@@ -53,6 +56,17 @@ def test_a_fit_with_a_law_of_many_components_costs_more():
         effort.refit(10**6, law.components, [])
         spent.append(effort.spent)
     assert spent[1] > 2.9 * spent[0]
+
+
+def test_a_law_that_differs_by_pixel_costs_no_more_for_that():
+    """Flicker in some rows only: as many components a pixel, not as many as all pixels have together."""
+    shape = (12, 16)
+    maps = pixel_maps([np.full(shape, value) for value in (1.5, 0.1, 100.0, 3.0)], np.ones(shape, bool))
+    flicker = ExposureFlicker(rms=0.1)
+    everywhere = sample_law((flicker,), maps)
+    places = PixelPlaces.of_block(None, shape, np.arange(100))
+    placed = sample_law((flicker.at_place(Region(rows=((2, 5),)), None),), maps, None, places)
+    assert 1 < placed.components <= 2 * everywhere.components
 
 
 @pytest.fixture(scope="module")
