@@ -559,8 +559,7 @@ class _Batch:
                 self.limits(chosen if cells else None),
                 cells_likelihood() if cells else density_likelihood(),
                 engine.climb(),
-                found.columns[some],
-                np.nan_to_num(satellites),
+                profile_numba.Maxima(found.columns[some], np.nan_to_num(satellites)),
                 quantile_of(self.settings.interval_level),
                 part,
             )

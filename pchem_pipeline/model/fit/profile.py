@@ -63,7 +63,7 @@ def moments_along_bias(
     found, heights = np.zeros((n, nodes, size)), np.full((n, nodes), -np.inf)
     across = np.zeros((n, nodes, size, size))
     profile_numba.walk_tile(
-        *(given, law, limits, evaluate, engine.climb(), parameters, satellites),
+        *(given, law, limits, evaluate, engine.climb(), profile_numba.Maxima(parameters, satellites)),
         *(_SPACING, reach, _DEEPEST, found, across, heights),
     )
     walked = heights > -np.inf

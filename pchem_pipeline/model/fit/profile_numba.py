@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,18 @@ FloatArray = NDArray[np.float64]
 _OUTER = 30  # fixed values tried for an end
 _CLOSE = 1e-4  # of the root of the drop
 _FARTHEST = 60.0  # roots from the maximum
+
+
+class Maxima(NamedTuple):
+    """Fitted pixels.
+
+    Attributes:
+        parameters: (H_1 ... H_J, g, mu, sigma) at the maximum, shape (n, J + 3); NaN where there is none.
+        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
+    """
+
+    parameters: FloatArray
+    satellites: FloatArray
 
 
 @kernel(inline=True)
@@ -126,14 +138,28 @@ def _end(
 
 
 @kernel(inline=True)
-def _maximum(
-    pixel: Pixel, tools: Tools, weight: float, best: FloatArray, covariance: FloatArray
-) -> tuple[bool, float]:
-    """Climb to the maximum near a fit, with free satellites of that weight; fill the covariance there.
+def _tools(given: Histograms, law: Law, limits: Limits, evaluate: Any, climb: Any) -> tuple[Pixel, Tools]:
+    """Return room for a pixel, and what climbs on its likelihood."""
+    room = make_room(given, law)
+    scratch = make_scratch(given.dark.size, room.bins.shape[2] - 1, limits.cells)
+    return room, Tools(limits, evaluate, climb, np.empty((0, 0)), scratch)
+
+
+@kernel
+def _at_maximum(
+    given: Histograms, law: Law, index: int, room: Pixel, tools: Tools, fits: Maxima, covariance: FloatArray
+) -> tuple[Pixel, bool, float]:
+    """Climb to the maximum near the fit of a pixel; fill `KEPT_STARTS` of the scratch and the covariance.
 
     Returns:
-        Whether there is one, and its log-likelihood.
+        The pixel, whether there is a regular maximum, and its log-likelihood.
     """
+    pixel, best = load_pixel(given, index, room), tools.scratch.small[KEPT_STARTS]
+    if not theta_of(fits.parameters[index], pixel, tools.limits, best):
+        return pixel, False, -math.inf
+    if tools.limits.cells:
+        resolve(law, index, fits.satellites[index, 0], pixel)
+    weight = fits.satellites[index, 1]
     n, fixed = pixel.facts.shape[0], tools.scratch.flags[FIXED]
     rounding = QUANTISATION_VARIANCE if tools.limits.cells else 0.0
     best[n + LOG_VARIANCE] = math.log(max(math.exp(best[n + LOG_VARIANCE]) - rounding, 1e-12))
@@ -143,7 +169,7 @@ def _maximum(
     fixed[n + SATELLITE] = not weight > 0.0
     outcome, top, _ = climb_on(pixel, tools, _of_profile(np.bool_(False)), best, best)
     at, held = tools.scratch.evaluations[AT], tools.scratch.flags[HELD]
-    return outcome == CONVERGED and invert_arrow(at, best, held, covariance), top
+    return pixel, outcome == CONVERGED and invert_arrow(at, best, held, covariance), top
 
 
 @kernel(inline=True)
@@ -191,8 +217,7 @@ def profile_tile(
     limits: Limits,
     evaluate: Any,
     climb: Any,
-    parameters: FloatArray,
-    satellites: FloatArray,
+    fits: Maxima,
     root: float,
     out: FloatArray,
 ) -> None:
@@ -204,26 +229,19 @@ def profile_tile(
         limits: bounds and limits.
         evaluate: the likelihood.
         climb: the climb on it.
-        parameters: (H_1 ... H_J, g, mu, sigma) at the maximum, shape (n, J + 3); NaN where there is none.
-        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
+        fits: of the pixels.
         root: drop of the log-likelihood, as standard normal quantile.
         out: out, lower and upper ends of (H_1 ... H_J, g, mu, sigma, sigma g), shape (n, J + 4, 2); comes as
             NaN, which stays where the likelihood does not fall far enough.
     """
     n = given.dark.size
     size = n + N_SHARED
-    room = make_room(given, law)
-    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
-    tools = Tools(limits, evaluate, climb, np.empty((0, 0)), scratch)
+    room, tools = _tools(given, law, limits, evaluate, climb)
+    scratch = tools.scratch
     best, direction, covariance = scratch.small[KEPT_STARTS], np.empty(size), np.empty((size, size))
     rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
     for index in range(given.counts.shape[0]):
-        pixel = load_pixel(given, index, room)
-        if not theta_of(parameters[index], pixel, limits, best):
-            continue
-        if limits.cells:
-            resolve(law, index, satellites[index, 0], pixel)
-        found, top = _maximum(pixel, tools, satellites[index, 1], best, covariance)
+        pixel, found, top = _at_maximum(given, law, index, room, tools, fits, covariance)
         held = scratch.flags[HELD].copy()
         for target in range(size if found else 0):
             tied, place = target == n + 3, min(target, n + LOG_VARIANCE)
@@ -251,8 +269,7 @@ def walk_tile(
     limits: Limits,
     evaluate: Any,
     climb: Any,
-    parameters: FloatArray,
-    satellites: FloatArray,
+    fits: Maxima,
     spacing: float,
     reach: FloatArray,
     deepest: float,
@@ -268,8 +285,7 @@ def walk_tile(
         limits: bounds and limits.
         evaluate: the likelihood.
         climb: the climb on it.
-        parameters: (H_1 ... H_J, g, mu, sigma) at the maximum, shape (n, J + 3); NaN where there is none.
-        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
+        fits: of the pixels.
         spacing: of the biases, standard errors.
         reach: distance that is walked in any case, e-, shape (n,).
         deepest: fall of the log-likelihood at which the walk ends beyond there, nats.
@@ -279,20 +295,14 @@ def walk_tile(
     """
     n = given.dark.size
     size, most = n + N_SHARED, heights.shape[1] // 2
-    room = make_room(given, law)
-    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
-    tools = Tools(limits, evaluate, climb, np.empty((0, 0)), scratch)
+    room, tools = _tools(given, law, limits, evaluate, climb)
+    scratch = tools.scratch
     best, direction, covariance = scratch.small[KEPT_STARTS], np.empty(size), np.empty((size, size))
     theta, absolute, fixed = scratch.small[HERE], np.empty(size), scratch.flags[FIXED]
     rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
     goal = _of_profile(np.bool_(False))
     for index in range(given.counts.shape[0]):
-        pixel = load_pixel(given, index, room)
-        if not theta_of(parameters[index], pixel, limits, best):
-            continue
-        if limits.cells:
-            resolve(law, index, satellites[index, 0], pixel)
-        regular, top = _maximum(pixel, tools, satellites[index, 1], best, covariance)
+        pixel, regular, top = _at_maximum(given, law, index, room, tools, fits, covariance)
         if not regular:
             continue
         _direction(n + BIAS, best, covariance, rounding, direction)
