@@ -7,16 +7,14 @@ anything; what it does not show at all is not named.
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, InputError, error_words
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, Round
 from pchem_pipeline.discrepancy.by_simulation.candidates import (
@@ -26,13 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     placebo_for,
     serial,
 )
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, leaves_nothing
-from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
-from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
-    Covariances,
-    measured_noise,
-    residual_covariances,
-)
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
@@ -42,6 +34,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
     tolerance,
 )
+from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.maps import (
     MANY_MISTAKEN,
     Refit,
@@ -52,34 +45,29 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import (
-    Acquisition,
     Replicate,
     by_part,
-    simulate_frames,
 )
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
+from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT
-from pchem_pipeline.discrepancy.observe.observe import fitted_maps, observe
-from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
+from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
-from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
+from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.registry import effect_classes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-#: Measures a part of the frames, the pixels fitted with some effects, beside some of these.
-Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Effect | None]
 
 _FEWEST_PIXELS = 32
-_BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
 _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters are no ground for a verdict
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
 _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
@@ -87,7 +75,6 @@ _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no s
 # than a single one would by chance
 _ESTABLISHED = 4.5
 _DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
-_MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
 
 
@@ -134,116 +121,6 @@ def find_discrepancies(
     frames = FrameStack(stack, numbers, splits, n_run or int(numbers[-1]) + 1, bit_depth, integration_time)
     frames = replace(frames, window=window)
     return search(FrameExplainer(frames, settings, tuple(model), mapper), tell)
-
-
-@dataclass(frozen=True)
-class FrameStack:
-    """The frames that are looked at.
-
-    Attributes:
-        stack: (frame, y, x), DN.
-        numbers: of the frames in the run, shape (frame,).
-        splits: train, test and final part.
-        n_run: frames of the whole run.
-        bit_depth: bits of the ADC.
-        integration_time: s.
-        parts: of sensor and run that differ from the rest.
-        window: of the sensor that they are; None: all of it.
-    """
-
-    stack: NDArray[np.unsignedinteger]
-    numbers: IntArray
-    splits: Splits
-    n_run: int
-    bit_depth: int
-    integration_time: float
-    parts: tuple[Part, ...] = ()
-    window: SensorWindow | None = None
-
-    @property
-    def seen(self) -> IntArray:
-        """Positions of the train and test frames."""
-        return np.sort(np.concatenate([self.splits.train, self.splits.test]))
-
-    def observe(self, part: IntArray, maps: PixelMaps | None = None) -> Evidence:
-        """Observe some frames, and as replicates are observed: near known maps, and the same pixels.
-
-        A fit from nothing finds a bias that is off by an electron more often than one near the truth: then
-        frames and replicates would differ without any effect.
-        """
-        return observe(
-            self.stack[part],
-            self.numbers[part],
-            n_run=self.n_run,
-            block_frames=self.splits.block_frames,
-            exclude=None if maps is None else ~maps.usable,
-            start=maps,
-        )
-
-    def with_parts(self, parts: tuple[Part, ...]) -> FrameStack:
-        """Return it with parts, dealt in blocks so short that a range of frames is alike in all splits."""
-        shortest = min((int(p.frames(self.numbers).sum()) for p in parts if p.when is not None), default=0)
-        length = max(shortest // _BLOCKS_IN_A_RANGE // 2 * 2, _SHORTEST_BLOCK)
-        splits = self.splits
-        if shortest and length < splits.block_frames:
-            splits = split_frames(self.numbers, length)
-        window = self.window
-        if window is not None:
-            parts = tuple(Part(window.on_sensor(part.region), part.when) for part in parts)
-        return replace(self, parts=parts, splits=splits)
-
-    def effects(self, model: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the effects of a model as they act on these pixels, row 0 being the first of these."""
-        return tuple(model) if self.window is None else self.window.effects(model)
-
-    def statistics(self, part: IntArray, evidence: Evidence) -> dict[str, float]:
-        """Return the statistics of some frames, those of the parts included, as replicates have them."""
-        apart = part_statistics(
-            self.stack[part],
-            self.numbers[part],
-            evidence.maps,
-            self.parts,
-            n_run=self.n_run,
-            block_frames=self.splits.block_frames,
-            window=self.window,
-        )
-        return {**evidence.z, **apart}
-
-    def seen_apart(self, evidence: Evidence) -> list[tuple[Part, Evidence]]:
-        """Return the evidence of each part, of train and test frames together."""
-        stack, numbers = self.stack[self.seen], self.numbers[self.seen]
-        return [
-            (
-                part,
-                part_evidence(
-                    stack,
-                    numbers,
-                    evidence.maps,
-                    part,
-                    n_run=self.n_run,
-                    block_frames=self.splits.block_frames,
-                    window=self.window,
-                ),
-            )
-            for part in self.parts
-        ]
-
-    def acquisition(self, as_data: bool = False) -> Acquisition:
-        """Return how replicates of the train part are taken.
-
-        Args:
-            as_data: those of train and test part, treated as the data are from the fit on.
-        """
-        return Acquisition(
-            self.numbers[self.splits.train],
-            self.n_run,
-            self.splits.block_frames,
-            self.bit_depth,
-            self.integration_time,
-            other=self.numbers[self.splits.test] if as_data else None,
-            parts=self.parts,
-            window=self.window,
-        )
 
 
 @dataclass(frozen=True)
@@ -407,8 +284,20 @@ class FrameExplainer:
         self.effort.release()
         rounds = self.rounds
         held = tuple(h for this in rounds for h in this.added.hypotheses)
+        unexplained = Unexplained(
+            self.frames,
+            self.plain,
+            self._refitter(z, held),
+            self._refit,
+            lambda model: self._mapped(model)[1],
+            lambda found: self._established(found, z),
+            self._seed("covariances"),
+            self.settings.extended_replicates,
+            self.effort,
+            self.defects,
+        )
         for kept in [(), held] if held else [()]:
-            found = self._measured(z, kept, with_noise=kept == held)
+            found = unexplained.measured(kept, with_noise=kept == held)
             if found is None:
                 continue
             gap = self.gaps.gap(z.final, found.mean, found.vectors)
@@ -540,120 +429,6 @@ class FrameExplainer:
         covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
         events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
         return Noise(covariance, self.settings.model_error, events)
-
-    def _measured(self, z: Measured, kept: tuple[Hypothesis, ...], with_noise: bool) -> Refitted | None:
-        """Return effects with what is best measured beside them, and with the other form beside both.
-
-        Parts are looked at where what is everywhere leaves something.
-        """
-        refitter = self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses))
-        forms: dict[str, Measure] = {"empirical": self._shifts}
-        if with_noise:
-            data = self._covariances(self.frames.stack[self.frames.seen], self.plain.maps)
-            forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, {})
-        # one that the model has already is not replaced
-        forms = {tag: form for tag, form in forms.items() if tag not in {e.tag for e in refitter.present}}
-        found: Refitted | None = None
-        while forms and not (found is not None and leaves_nothing(refitter, found)):
-            beside, better, score = kept, "", -np.inf
-            if found is not None:
-                beside, score = found.hypotheses, found.score + _CONVINCING
-            for part, form in itertools.product((Part(), *self.frames.parts), tuple(forms)):
-                if part != Part() and found is not None and leaves_nothing(refitter, found):
-                    break
-                try:
-                    one = self._described(z, refitter, beside, part, forms[form])
-                except EffortSpentError:
-                    if found is None:
-                        raise
-                    return found
-                # a defect of what is measured must not cost the verdict
-                except Exception as error:
-                    self.defects[form] = error_words(error)
-                    continue
-                if one is not None and one.score > score:
-                    found, better, score = one, form, one.score
-            if not better:
-                break
-            del forms[better]
-        return found
-
-    def _described(
-        self, z: Measured, refitter: Refitter, kept: tuple[Hypothesis, ...], part: Part, measure: Measure
-    ) -> Refitted | None:
-        """Return effects with what is measured in a part beside them at their best fit, or None.
-
-        Effects of which nothing is certain beside it are left out.
-        """
-        effects, measured = tuple(h.effect for h in kept), None
-        for _ in range(_MEASUREMENTS):
-            present = refitter.model(effects if measured is None else (*effects, measured))
-            measured = measure(part, present, refitter.model(effects))
-            if measured is None:
-                return None
-            measured = measured.at_place(part.region, part.when)
-        assert measured is not None
-        refitter.allow(measured.tag)
-        _, vectors = refitter.draw((*effects, measured), self.settings.extended_replicates)
-        shift = vectors.mean(axis=0) - self.first.mean - sum(h.fingerprint for h in kept)
-        found = refitter.refined((*kept, Hypothesis(measured, shift)))
-        found = refitter.sharpened(found, self.settings.extended_replicates)
-        proven = {h.tag for h in self._established(found, z)}
-        if proven == found.tags:
-            return found
-        if measured.tag not in proven:
-            return None
-        return self._described(z, refitter, tuple(h for h in kept if h.tag in proven), part, measure)
-
-    def _shifts(self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]) -> Effect | None:
-        """Measure the shifts of the samples of a part beside effects, with the pixels as they now are."""
-        maps = self._refit(present).maps
-        own = replace(maps, usable=maps.usable & self._inside(part))
-        seen = self.frames.seen[part.frames(self.frames.numbers[self.frames.seen])]
-        return measured_shifts(self.frames.stack[seen], own, beside) if own.usable.any() else None
-
-    def _noise_of_samples(
-        self,
-        data: Callable[[Part], Covariances],
-        known: dict[str, Callable[[Part], Covariances]],
-        part: Part,
-        _: tuple[Effect, ...],
-        beside: tuple[Effect, ...],
-    ) -> Effect | None:
-        """Measure the noise that samples of a part share beyond what effects make of them."""
-        key = "|".join(e.model_dump_json() for e in beside)
-        if key not in known:
-            known[key] = self._covariances(*self._simulated(beside))
-        return measured_noise(data(part), known[key](part), self.plain, self._inside(part))
-
-    def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
-        """Simulate the frames that are seen under a model, and fit their pixels."""
-        seed = self._seed("covariances")
-        drawn = self._mapped(model)[1].usual(seed)
-        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
-        frames = simulate_frames(drawn, model, seed, taken)
-        self.effort.simulate(frames.size, drawn.usable.size, 1)
-        return frames, fitted_maps(frames, ~drawn.usable)
-
-    def _covariances(
-        self, frames: NDArray[np.unsignedinteger], maps: PixelMaps
-    ) -> Callable[[Part], Covariances]:
-        """Return what measures how the samples of a part vary together in frames like those that are seen."""
-        numbers = self.frames.numbers[self.frames.seen]
-
-        @functools.cache
-        def of(part: Part) -> Covariances:
-            some = part.frames(numbers)
-            found = residual_covariances(frames[some], numbers[some], maps, self._inside(part))
-            # the shape of a line beyond the window is not known
-            return found if self.frames.window is None else found._replace(lines={})
-
-        return of
-
-    def _inside(self, part: Part) -> NDArray[np.bool_]:
-        """Return which of the pixels lie in a part, (y, x)."""
-        window = self.frames.window or SensorWindow.whole(self.frames.stack.shape)
-        return window.mask(part.region)
 
     def _refitter(self, z: Measured, held: tuple[Hypothesis, ...]) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""

@@ -1,0 +1,135 @@
+"""The frames of a search: their split, the parts of sensor and run that differ, and their statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
+from pchem_pipeline.discrepancy.splits import Splits, split_frames
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+
+IntArray = NDArray[np.int64]
+
+_BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
+
+
+@dataclass(frozen=True)
+class FrameStack:
+    """The frames that are looked at.
+
+    Attributes:
+        stack: (frame, y, x), DN.
+        numbers: of the frames in the run, shape (frame,).
+        splits: train, test and final part.
+        n_run: frames of the whole run.
+        bit_depth: bits of the ADC.
+        integration_time: s.
+        parts: of sensor and run that differ from the rest.
+        window: of the sensor that they are; None: all of it.
+    """
+
+    stack: NDArray[np.unsignedinteger]
+    numbers: IntArray
+    splits: Splits
+    n_run: int
+    bit_depth: int
+    integration_time: float
+    parts: tuple[Part, ...] = ()
+    window: SensorWindow | None = None
+
+    @property
+    def seen(self) -> IntArray:
+        """Positions of the train and test frames."""
+        return np.sort(np.concatenate([self.splits.train, self.splits.test]))
+
+    def observe(self, part: IntArray, maps: PixelMaps | None = None) -> Evidence:
+        """Observe some frames, and as replicates are observed: near known maps, and the same pixels.
+
+        A fit from nothing finds a bias that is off by an electron more often than one near the truth: then
+        frames and replicates would differ without any effect.
+        """
+        return observe(
+            self.stack[part],
+            self.numbers[part],
+            n_run=self.n_run,
+            block_frames=self.splits.block_frames,
+            exclude=None if maps is None else ~maps.usable,
+            start=maps,
+        )
+
+    def with_parts(self, parts: tuple[Part, ...]) -> FrameStack:
+        """Return it with parts, dealt in blocks so short that a range of frames is alike in all splits."""
+        shortest = min((int(p.frames(self.numbers).sum()) for p in parts if p.when is not None), default=0)
+        length = max(shortest // _BLOCKS_IN_A_RANGE // 2 * 2, _SHORTEST_BLOCK)
+        splits = self.splits
+        if shortest and length < splits.block_frames:
+            splits = split_frames(self.numbers, length)
+        window = self.window
+        if window is not None:
+            parts = tuple(Part(window.on_sensor(part.region), part.when) for part in parts)
+        return replace(self, parts=parts, splits=splits)
+
+    def effects(self, model: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Return the effects of a model as they act on these pixels, row 0 being the first of these."""
+        return tuple(model) if self.window is None else self.window.effects(model)
+
+    def statistics(self, part: IntArray, evidence: Evidence) -> dict[str, float]:
+        """Return the statistics of some frames, those of the parts included, as replicates have them."""
+        apart = part_statistics(
+            self.stack[part],
+            self.numbers[part],
+            evidence.maps,
+            self.parts,
+            n_run=self.n_run,
+            block_frames=self.splits.block_frames,
+            window=self.window,
+        )
+        return {**evidence.z, **apart}
+
+    def seen_apart(self, evidence: Evidence) -> list[tuple[Part, Evidence]]:
+        """Return the evidence of each part, of train and test frames together."""
+        stack, numbers = self.stack[self.seen], self.numbers[self.seen]
+        return [
+            (
+                part,
+                part_evidence(
+                    stack,
+                    numbers,
+                    evidence.maps,
+                    part,
+                    n_run=self.n_run,
+                    block_frames=self.splits.block_frames,
+                    window=self.window,
+                ),
+            )
+            for part in self.parts
+        ]
+
+    def acquisition(self, as_data: bool = False) -> Acquisition:
+        """Return how replicates of the train part are taken.
+
+        Args:
+            as_data: those of train and test part, treated as the data are from the fit on.
+        """
+        return Acquisition(
+            self.numbers[self.splits.train],
+            self.n_run,
+            self.splits.block_frames,
+            self.bit_depth,
+            self.integration_time,
+            other=self.numbers[self.splits.test] if as_data else None,
+            parts=self.parts,
+            window=self.window,
+        )
+
+    def inside(self, part: Part) -> NDArray[np.bool_]:
+        """Return which of the pixels lie in a part, (y, x)."""
+        window = self.window or SensorWindow.whole(self.stack.shape)
+        return window.mask(part.region)

@@ -1,0 +1,171 @@
+"""What no known effect explains, measured in several forms: everywhere and by part, the best one first."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.by_simulation.comparison import leaves_nothing
+from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
+from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
+    Covariances,
+    measured_noise,
+    residual_covariances,
+)
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.maps import Refit, Sensor
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.observe.observe import fitted_maps
+from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+
+#: Measures a part of the frames, the pixels fitted with some effects, beside some of these.
+Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Effect | None]
+
+_CONVINCING = 6.0  # nats that a form must add
+_MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
+
+
+@dataclass
+class Unexplained:
+    """Measures frames beside effects.
+
+    Attributes:
+        frames: all that there are; train and test frames are measured.
+        plain: evidence of these.
+        refitter: fits effects to their statistics.
+        refit: fits the pixels with a model.
+        sensor: learns the sensors to simulate with a model.
+        proven: effects of a set of which the data have certainly some.
+        seed: of the simulated frames.
+        replicates: of what is measured.
+        effort: counts what is simulated.
+        defects: forms that failed, and why.
+    """
+
+    frames: FrameStack
+    plain: Evidence
+    refitter: Refitter
+    refit: Callable[[tuple[Effect, ...]], Refit]
+    sensor: Callable[[tuple[Effect, ...]], Sensor]
+    proven: Callable[[Refitted], Sequence[Hypothesis]]
+    seed: int
+    replicates: int
+    effort: Effort
+    defects: dict[str, str] = field(default_factory=dict)
+
+    def measured(self, kept: tuple[Hypothesis, ...], with_noise: bool) -> Refitted | None:
+        """Return effects with what is best measured beside them, and with the other form beside both.
+
+        Parts are looked at where what is everywhere leaves something.
+        """
+        refitter = self.refitter
+        forms: dict[str, Measure] = {"empirical": self._shifts}
+        if with_noise:
+            data = self._covariances(self.frames.stack[self.frames.seen], self.plain.maps)
+            forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, {})
+        # one that the model has already is not replaced
+        forms = {tag: form for tag, form in forms.items() if tag not in {e.tag for e in refitter.present}}
+        found: Refitted | None = None
+        while forms and not (found is not None and leaves_nothing(refitter, found)):
+            beside, better, score = kept, "", -np.inf
+            if found is not None:
+                beside, score = found.hypotheses, found.score + _CONVINCING
+            for part, form in itertools.product((Part(), *self.frames.parts), tuple(forms)):
+                if part != Part() and found is not None and leaves_nothing(refitter, found):
+                    break
+                try:
+                    one = self._described(beside, part, forms[form])
+                except EffortSpentError:
+                    if found is None:
+                        raise
+                    return found
+                # a defect of what is measured must not cost the verdict
+                except Exception as error:
+                    self.defects[form] = error_words(error)
+                    continue
+                if one is not None and one.score > score:
+                    found, better, score = one, form, one.score
+            if not better:
+                break
+            del forms[better]
+        return found
+
+    def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Refitted | None:
+        """Return effects with what is measured in a part beside them at their best fit, or None.
+
+        Effects of which nothing is certain beside it are left out.
+        """
+        refitter, effects, measured = self.refitter, tuple(h.effect for h in kept), None
+        for _ in range(_MEASUREMENTS):
+            present = refitter.model(effects if measured is None else (*effects, measured))
+            measured = measure(part, present, refitter.model(effects))
+            if measured is None:
+                return None
+            measured = measured.at_place(part.region, part.when)
+        assert measured is not None
+        refitter.allow(measured.tag)
+        _, vectors = refitter.draw((*effects, measured), self.replicates)
+        shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
+        found = refitter.refined((*kept, Hypothesis(measured, shift)))
+        found = refitter.sharpened(found, self.replicates)
+        proven = {h.tag for h in self.proven(found)}
+        if proven == found.tags:
+            return found
+        if measured.tag not in proven:
+            return None
+        return self._described(tuple(h for h in kept if h.tag in proven), part, measure)
+
+    def _shifts(self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]) -> Effect | None:
+        """Measure the shifts of the samples of a part beside effects, with the pixels as they now are."""
+        maps = self.refit(present).maps
+        own = replace(maps, usable=maps.usable & self.frames.inside(part))
+        seen = self.frames.seen[part.frames(self.frames.numbers[self.frames.seen])]
+        return measured_shifts(self.frames.stack[seen], own, beside) if own.usable.any() else None
+
+    def _noise_of_samples(
+        self,
+        data: Callable[[Part], Covariances],
+        known: dict[str, Callable[[Part], Covariances]],
+        part: Part,
+        _: tuple[Effect, ...],
+        beside: tuple[Effect, ...],
+    ) -> Effect | None:
+        """Measure the noise that samples of a part share beyond what effects make of them."""
+        key = "|".join(e.model_dump_json() for e in beside)
+        if key not in known:
+            known[key] = self._covariances(*self._simulated(beside))
+        return measured_noise(data(part), known[key](part), self.plain, self.frames.inside(part))
+
+    def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
+        """Simulate the frames that are seen under a model, and fit their pixels."""
+        drawn = self.sensor(model).usual(self.seed)
+        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
+        frames = simulate_frames(drawn, model, self.seed, taken)
+        self.effort.simulate(frames.size, drawn.usable.size, 1)
+        return frames, fitted_maps(frames, ~drawn.usable)
+
+    def _covariances(
+        self, frames: NDArray[np.unsignedinteger], maps: PixelMaps
+    ) -> Callable[[Part], Covariances]:
+        """Return what measures how the samples of a part vary together in frames like those that are seen."""
+        numbers = self.frames.numbers[self.frames.seen]
+
+        @functools.cache
+        def of(part: Part) -> Covariances:
+            some = part.frames(numbers)
+            found = residual_covariances(frames[some], numbers[some], maps, self.frames.inside(part))
+            # the shape of a line beyond the window is not known
+            return found if self.frames.window is None else found._replace(lines={})
+
+        return of
