@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
-# pixel, of its fit with effects by components of the law, and of what is learnt of the sensor from a pixel
-_SAMPLE, _FIT, _REFIT, _LEARN = 5.0e-8, 4.0e-5, 4.0e-5, 3.0e-4
+# pixel, of its fit with effects by components of the law, of what is learnt of the sensor from a pixel,
+# and of the mass of a code under one component
+_SAMPLE, _FIT, _REFIT, _LEARN, _MASS = 5.0e-8, 4.0e-5, 4.0e-5, 3.0e-4, 1.0e-7
 _MOST_LEARNT_FROM = 1000  # pixels
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 100.0, 3.0
@@ -72,6 +73,11 @@ class Effort:
     def refit(self, pixels: int, components: int, tags: Iterable[str]) -> None:
         """Count a fit of all pixels with effects, whose law has so many components, and what it teaches."""
         self.spent += _REFIT * pixels * components + _LEARN * min(pixels, _MOST_LEARNT_FROM)
+        self.tried |= set(tags)
+
+    def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:
+        """Count the masses of so many codes under effects, whose law has so many components."""
+        self.spent += _MASS * masses * components
         self.tried |= set(tags)
 
     def check(self, doing: str) -> None:

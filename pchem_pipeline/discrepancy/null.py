@@ -3,6 +3,10 @@
 Replicates are simulated from the fitted model and refitted (parametric bootstrap), so whatever the fit
 absorbs is absorbed in them too. Data disagree with the model where a statistic deviates beyond chance, among
 all that were looked at, and alike in two parts of the samples.
+
+Tails are not those of the normal law: sums of squares over the pixels are skewed by the few pixels whose law
+has rare samples, and a number of pixels or samples is a count of hardly any. The skewness comes from the
+replicates, statistics of a kind together; counts have the tail that they are made to have.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
+from pchem_pipeline.discrepancy.observe.laws import without_skew
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +32,9 @@ _SHRINKAGE = 0.6
 # many fewer than this number of earlier ones
 _PRIOR_WEIGHT = 10.0
 _SMALLEST_STD = 0.6
+# last words of the names of statistics that are normal quantiles of a count: of few events their scatter is
+# far below 1, but their tail is that of the normal law all the same
+_COUNTS = ("cnt", "count", "pixels", "clusters")
 # errors of its mean by which a statistic must move to count as moved
 _MOVED = 4.0
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
@@ -44,6 +52,7 @@ class NullModel:
         std: standard deviations, shape (m,).
         covariance: shrunk towards its diagonal, shape (m, m).
         replicates: the vectors, shape (b, m).
+        skewness: of the statistics of one split, shape (m,).
         effective_tests: number of independent statistics that the largest of them is worth.
     """
 
@@ -52,6 +61,7 @@ class NullModel:
     std: FloatArray
     covariance: FloatArray
     replicates: FloatArray
+    skewness: FloatArray
     effective_tests: float
 
     @classmethod
@@ -67,13 +77,14 @@ class NullModel:
                 scatter as they did, which few new replicates need not show again.
         """
         mean, std, covariance = moments(vectors)
-        tests = _effective_tests(vectors)
+        skewness = _skewness(names, vectors)
+        tests = _effective_tests(names, vectors, skewness)
         if before is not None:
             moved = np.abs(mean - before.mean) > _MOVED * before.std * np.sqrt(1.0 / len(vectors))
             pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
             covariance *= np.outer(pooled / std, pooled / std)
-            std, tests = pooled, before.effective_tests
-        return cls(names, mean, std, covariance, vectors, tests)
+            std, skewness, tests = pooled, before.skewness, before.effective_tests
+        return cls(names, mean, std, covariance, vectors, skewness, tests)
 
     def shifted(self, shift: FloatArray) -> NullModel:
         """Return the null of a model that gives ``shift`` more, shape (m,)."""
@@ -95,8 +106,17 @@ class NullModel:
         return np.asarray((z - self.mean) / (self.std * scale))
 
     def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
-        """Return two-sided p-values (Student's t: the standard deviation comes from few replicates)."""
-        return two_sided(self.pulls(z, splits), self.freedom)
+        """Return two-sided p-values of the mean of ``splits`` vectors."""
+        return self.p_of(self.pulls(z, splits), splits)
+
+    def p_of(self, pulls: FloatArray, splits: int = 1) -> FloatArray:
+        """Return two-sided p-values of pulls of the mean of ``splits`` vectors.
+
+        Student's t, since the standard deviation comes from few replicates, of the pulls without their skew
+        (Wilson and Hilferty 1931).
+        """
+        straight = _straight(self.names, pulls, self.std, self.skewness / np.sqrt(splits))
+        return two_sided(straight, self.freedom)
 
     def global_p(self, z: FloatArray, splits: int = 1) -> float:
         """Return the probability that any statistic deviates as much as the most deviating one."""
@@ -155,12 +175,51 @@ def _pooled(first: FloatArray, n_first: int, second: FloatArray, n_second: int) 
 
 
 def _std(deviations: FloatArray) -> FloatArray:
-    n = deviations.shape[0]
-    variance = (np.sum(deviations**2, axis=0) + _PRIOR_WEIGHT) / (n - 1 + _PRIOR_WEIGHT)
+    return _std_of(np.sum(deviations**2, axis=0), deviations.shape[0] - 1)
+
+
+def _std_of(squares: FloatArray, freedom: float) -> FloatArray:
+    """Return standard deviations of sums of squares; 1 is what is known beforehand.
+
+    That may not make a statistic that scatters more look quieter than it is.
+    """
+    own = np.maximum(squares, 0.0)
+    variance = np.maximum((own + _PRIOR_WEIGHT) / (freedom + _PRIOR_WEIGHT), own / freedom)
     return np.asarray(np.maximum(np.sqrt(variance), _SMALLEST_STD))
 
 
-def _effective_tests(vectors: FloatArray) -> float:
+def _kind(name: str) -> str:
+    """Return the last word of the name of a statistic, without the part that it is of."""
+    return name.partition("@")[0].rpartition(".")[2]
+
+
+def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
+    """Return the skewness of statistics, shape (m,).
+
+    From few replicates it is noise, or misses what is rare: each is drawn to the mean of its kind as far as
+    those of a kind do not differ by more than chance (empirical Bayes).
+    """
+    n = vectors.shape[0]
+    off = vectors - vectors.mean(axis=0)
+    own = np.mean(off**3, axis=0) / _std(off) ** 3
+    chance = 6.0 / n
+    kinds, found = np.array([_kind(name) for name in names]), np.zeros(own.size)
+    for kind in np.unique(kinds):
+        some = kinds == kind
+        # one more that has none, so that a kind of one is not believed
+        usual = own[some].sum() / (some.sum() + 1.0)
+        real = max(float(np.mean((own[some] - usual) ** 2)) - chance, 0.0)
+        found[some] = usual + real / (real + chance) * (own[some] - usual)
+    return np.where(np.isin(kinds, _COUNTS), 0.0, found)
+
+
+def _straight(names: Sequence[str], pulls: FloatArray, std: FloatArray, skewness: FloatArray) -> FloatArray:
+    """Return pulls as normal quantiles: counts at no less than their own scale, the others without skew."""
+    counts = np.isin([_kind(name) for name in names], _COUNTS)
+    return without_skew(pulls * np.where(counts, np.minimum(std, 1.0), 1.0), skewness)
+
+
+def _effective_tests(names: Sequence[str], vectors: FloatArray, skewness: FloatArray) -> float:
     """Return the m for which the smallest of m independent p-values is spread like that of the replicates.
 
     Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 -
@@ -169,10 +228,9 @@ def _effective_tests(vectors: FloatArray) -> float:
     n, m = vectors.shape
     total, squares = vectors.sum(axis=0), (vectors**2).sum(axis=0)
     mean = (total - vectors) / (n - 1)
-    variance = (squares - vectors**2) - (n - 1) * mean**2
-    std = np.sqrt((np.maximum(variance, 0.0) + _PRIOR_WEIGHT) / (n - 2 + _PRIOR_WEIGHT))
-    pulls = (vectors - mean) / (np.maximum(std, _SMALLEST_STD) * np.sqrt(1.0 + 1.0 / (n - 1)))
-    smallest = two_sided(pulls, n - 2 + _PRIOR_WEIGHT).min(axis=1)
+    std = _std_of((squares - vectors**2) - (n - 1) * mean**2, n - 2)
+    pulls = (vectors - mean) / (std * np.sqrt(1.0 + 1.0 / (n - 1)))
+    smallest = two_sided(_straight(names, pulls, std, skewness), n - 2 + _PRIOR_WEIGHT).min(axis=1)
     return float(np.clip(-1.0 / np.mean(np.log1p(-smallest)), 1.0, 4.0 * m))
 
 
@@ -224,7 +282,7 @@ def disagrees(
     p = _p_values(null, z, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
     pulls = [_pulls(null, part, tolerance, 1) for part in (z.train, z.test)]
-    alone = [two_sided(pull, null.freedom) < _REPLICATION for pull in pulls]
+    alone = [null.p_of(pull) < _REPLICATION for pull in pulls]
     same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
     return bool(np.any(same & (p < limit)))
@@ -236,7 +294,7 @@ def suspicious(null: NullModel, z: Measured) -> bool:
     An effect moves many statistics a little: where none is beyond chance by itself, all in the direction that
     the effect asks for may be.
     """
-    p = two_sided(null.pulls(z.both, 2), null.freedom)
+    p = null.p_values(z.both, 2)
     same = (z.train - null.mean) * (z.test - null.mean) > 0
     return bool(same.any()) and look_elsewhere(float(p[same].min()), null.effective_tests) < _SUSPICION
 
@@ -262,7 +320,7 @@ def misfits(
 
 
 def _p_values(null: NullModel, z: Measured, tolerance: FloatArray | float) -> FloatArray:
-    return two_sided(_pulls(null, z.both, tolerance, 2), null.freedom)
+    return null.p_of(_pulls(null, z.both, tolerance, 2), 2)
 
 
 def _pulls(null: NullModel, z: FloatArray, tolerance: FloatArray | float, splits: int) -> FloatArray:

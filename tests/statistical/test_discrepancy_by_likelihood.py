@@ -87,6 +87,17 @@ def test_what_is_hidden_is_named(hidden, strength, name):
     assert found.set_aside == ()
 
 
+def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried():
+    short = SETTINGS.model_copy(update={"effort": 1e-5})
+    sample = histograms(7, hidden="branching_counts", strength=0.08)
+    found = find_in_histograms([sample], short).verdict
+    assert found.verdict == "unexplained"
+    assert found.effects == ()
+    assert "ended at its limit" in found.limit
+    assert "branching_counts" in found.limit
+    assert find_in_histograms([sample], short).verdict == found
+
+
 def test_a_near_twin_is_told_apart_or_listed_beside_the_right_name():
     found = find_in_histograms(
         [histograms(7, hidden="overdispersed_counts", strength=0.06)], SETTINGS

@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
 from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, split_samples
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -138,6 +139,7 @@ class HistogramExplainer:
         """Refuse unknown candidates before anything is done."""
         self.classes = candidate_classes(self.settings)
         self.rng = np.random.default_rng(self.settings.seed)
+        self.effort = Effort(self.settings.effort)
         self.present = self.model
         self.layout = Samples(tuple(sample.bias for sample in self.data))
         self.n_pixels = self.data[0].counts.shape[0]
@@ -189,6 +191,7 @@ class HistogramExplainer:
         z = Measured(*(as_matrix(names, [row])[0] for row in own))
         self.plain = self.sets.fit((), plain.fit.parameters, self.parts[0] + self.parts[1])
         self.first = NullModel.from_replicates(names, as_matrix(names, vectors))
+        self.effort.begin()
         return self.first, z
 
     def doubt(self) -> str:
@@ -206,8 +209,17 @@ class HistogramExplainer:
         return self.joint and not self.before.at_floor
 
     def explain(self, null: NullModel, z: Measured, disagrees: bool) -> Explanation | None:
-        """Find the set of effects that best predicts the test part, on the codes that are understood."""
-        found = explain(self.sets, self.members, self._count, self.rng)
+        """Find the set of effects that best predicts the test part, on the codes that are understood.
+
+        Raises:
+            EffortSpentError: the work is at its limit; nothing was found.
+        """
+        self.effort.tried.clear()
+        try:
+            found = explain(self.sets, self.members, self._count, self.rng)
+        except EffortSpentError as spent:
+            tags = dict.fromkeys(m.tag for m in self.members)
+            raise EffortSpentError(spent.doing, (t for t in tags if t not in self.effort.tried)) from spent
         self.defects |= self.sets.failed | found.sets.failed
         if not disagrees:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
@@ -258,7 +270,8 @@ class HistogramExplainer:
         """Return what fits the chosen rows, begun at the fit that they were observed with."""
         train, test, _ = self.parts
         every = np.ones(train.shape, np.bool_)
-        return SetComparison(train, test, self.origin, every, self.present, self.start, layout)
+        found = SetComparison(train, test, self.origin, every, self.present, self.start, layout)
+        return replace(found, effort=self.effort)
 
     def _fitted_together(self, counts: IntArray, origin: IntArray) -> FloatArray:
         """Fit the PCD to all samples of each pixel; return (H, g, mu, sigma) of the rows, NaN if unusable."""
@@ -306,6 +319,7 @@ class HistogramExplainer:
         total = self.parts[0].sum(axis=1)
         count = self.settings.replicates
         self.n_replicates += count
+        self.effort.simulate(0, total.size, count)
         return [self._observed(self.rng.multinomial(total, mass)) for _ in range(count)]
 
     def _with_effects(self, found: Explanation) -> FloatArray:

@@ -17,6 +17,7 @@ from scipy import special
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -131,6 +132,7 @@ class SetComparison:
         start: (H, g, mu, sigma), shape (n, 4).
         samples: which rows are of one pixel.
         failed: candidates that could not be fitted, and why.
+        effort: counts the masses, and ends the search at its limit.
     """
 
     train: IntArray
@@ -141,6 +143,7 @@ class SetComparison:
     start: FloatArray
     samples: Samples = field(default_factory=Samples)
     failed: dict[str, str] = field(default_factory=dict)
+    effort: Effort = field(default_factory=lambda: Effort(None))
     _known: dict[frozenset[str], FittedSet] = field(default_factory=dict)
 
     def on(self, kept: NDArray[np.bool_], start: FloatArray) -> SetComparison:
@@ -159,9 +162,12 @@ class SetComparison:
 
     def problem(self, members: Sequence[Member], counts: IntArray | None = None) -> SharedProblem:
         """Return what a set is fitted to: the train part, or other histograms."""
+        tags = [m.tag for m in members]
 
         def law(shared: FloatArray, own: FloatArray) -> SampleLaw:
-            return law_of(self.present, members, shared, own, self.samples)
+            found = law_of(self.present, members, shared, own, self.samples)
+            self.effort.evaluate(self.train.size, found.components, tags)
+            return found
 
         coordinates = [c for m in members for c in m.coordinates]
         return SharedProblem(
@@ -201,10 +207,15 @@ class SetComparison:
         return FittedSet(tuple(moved), fit, log_masses, float((self.test * log_masses).sum()))
 
     def attempt(self, members: Sequence[Member], start: FloatArray | None = None) -> FittedSet | None:
-        """Fit a set, unless that was done; None where the last of its members cannot be fitted."""
+        """Fit a set, unless that was done; None where the last of its members cannot be fitted.
+
+        Raises:
+            EffortSpentError: the work is at its limit.
+        """
         kinds = frozenset(m.kind for m in members)
         if kinds in self._known:
             return self._known[kinds]
+        self.effort.check(f"{' with '.join(m.tag for m in members) or 'the model'} was fitted")
         # whatever a stranger's effect raises must not stop the others
         try:
             return self._known.setdefault(kinds, self.fit(members, start))

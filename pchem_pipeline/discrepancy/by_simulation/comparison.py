@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import look_elsewhere, two_sided
+from pchem_pipeline.discrepancy.null import look_elsewhere
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -177,7 +177,7 @@ def _placebo(
 
 def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
     """Tell whether a set leaves no statistic beyond chance."""
-    p = float(two_sided(one.rest, refitter.null.freedom).min())
+    p = float(refitter.null.p_of(one.rest, 2).min())
     return look_elsewhere(p, refitter.null.effective_tests) > _LEFT
 
 

@@ -103,22 +103,29 @@ class Posterior:
         return replace(self, population=population, theta=self.theta + change)
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
-        """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error."""
+        """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error.
+
+        The mean ``mu + H / g`` of the samples is known far better than its parts: mu follows the exponentials
+        of the others, not their slopes, which far from the maximum would lead to samples below 0 DN.
+        """
         j, n = self.weight.shape
         chosen = (rng.random(n) > np.cumsum(self.weight, axis=0)[: j - 1]).sum(axis=0)
         every = np.arange(n)
         covariance = self.covariance[chosen, every]
         root = np.linalg.cholesky(covariance)
         theta = self.theta[chosen, every].copy()
-        # mu is free: what is far from Gaussian where hardly anything is known are the logarithms
+        # what is far from Gaussian where hardly anything is known are the logarithms
         widest = np.array([_WIDEST_DRAW, 0.2 * _WIDEST_DRAW, np.inf, _WIDEST_DRAW])
         off = np.einsum("nab,nb->na", root, rng.standard_normal((n, 4)))
         sizes, axes = np.linalg.eigh(self.population.uncertainty)
         moved = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * rng.standard_normal(4))
         # each pixel follows the centre by as much as its own samples leave open
         off += covariance @ np.linalg.solve(self.population.scatter, moved)
-        theta += np.clip(off, -widest, widest)
-        return to_parameters(_inside(theta))
+        step = np.exp(theta[:, 0] + theta[:, 1])
+        mean = theta[:, 2] + step + off[:, 2] + step * (off[:, 0] + off[:, 1])
+        theta = _inside(theta + np.clip(off, -widest, widest))
+        theta[:, 2] = mean - np.exp(theta[:, 0] + theta[:, 1])
+        return to_parameters(theta)
 
 
 def to_parameters(theta: FloatArray) -> FloatArray:

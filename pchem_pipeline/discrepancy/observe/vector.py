@@ -22,7 +22,6 @@ FloatArray = NDArray[np.float64]
 STANDS_OUT = 3.5
 _TAIL = 2.3262907903552504e-4  # of the normal distribution, above STANDS_OUT
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
-_SHORT_END = 0.25
 _LOW, _HIGH = [column.SEEN_LOW, column.EXPECTED_LOW], [column.SEEN_HIGH, column.EXPECTED_HIGH]
 _FAR_LOW = [column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW]
 _FAR_HIGH = [column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH]
@@ -38,16 +37,6 @@ def outliers(z: FloatArray, *, two_sided: bool) -> float:
     """Return the statistic of how many pixels stand out, z being N(0, 1) otherwise."""
     count = int(np.sum((np.abs(z) if two_sided else z) > STANDS_OUT))
     return laws.poisson(count, _TAIL * z.size * (2.0 if two_sided else 1.0))
-
-
-def without_skew(z: FloatArray, skewness: FloatArray) -> FloatArray:
-    """Return standardised sums with a known skewness as normal quantiles (Wilson and Hilferty 1931).
-
-    The gamma law behind it ends on its short side, where the cubic root is steep; real sums do not quite end.
-    """
-    skew = np.where(np.abs(skewness) < 1e-6, 1e-6, skewness)
-    root = np.cbrt(np.maximum(1.0 + 0.5 * skew * z, _SHORT_END))
-    return np.asarray(6.0 / skew * (root - 1.0) + skew / 6.0)
 
 
 def goodness_of(moments: FloatArray, chi_square: int = column.CHI2) -> FloatArray:
@@ -109,7 +98,7 @@ def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str,
         n = int(z.size)
         if n == 0:
             continue
-        normal = without_skew(z, skewness)
+        normal = laws.without_skew(z, skewness)
         found[f"shape.{name}.mean"] = float(z.sum() / np.sqrt(n))
         found[f"shape.{name}.chi"] = float((z @ z - n) / np.sqrt(np.sum(np.maximum(2.0 + kurtosis, 1.0))))
         found[f"shape.{name}.cnt"] = outliers(normal, two_sided=True)

@@ -1,0 +1,77 @@
+"""Tails of the null: skewed sums of squares, counts of hardly any event, and sensors drawn to simulate."""
+
+import numpy as np
+import pytest
+from scipy import special
+
+from pchem_pipeline.discrepancy.by_simulation.population import Population, Posterior
+from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.observe import laws
+
+REPLICATES, SETS, DATA = 40, 300, 50
+SUMS = tuple(f"shape.{score}.chi" for score in ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1"))
+COUNTS = ("time.lag1.charge.cnt", "time.lag1.readout.cnt", "shape.C3.cnt", "shape.He3.cnt")
+
+
+def sums(rng, n):
+    """Sums of squares that few pixels carry: gamma laws of skewness 1, standardised."""
+    return (rng.gamma(4.0, 1.0, (n, len(SUMS))) - 4.0) / 2.0
+
+
+def counts(rng, n):
+    """Counts of which 0.15 are expected, as the statistics of outlying pixels have them."""
+    seen = rng.poisson(0.15, (n, len(COUNTS)))
+    table = np.array([laws.poisson(k, 0.15) for k in range(20)])
+    return table[seen]
+
+
+def drawn_p_values(draw, names, seed):
+    """Draw p-values of the mean of two parts of clean data, and those by a symmetric tail."""
+    rng, found, before = np.random.default_rng(seed), [], []
+    for _ in range(SETS):
+        null = NullModel.from_replicates(names, draw(rng, REPLICATES))
+        both = draw(rng, 2 * DATA).reshape(2, DATA, -1).mean(axis=0)
+        found.append(null.p_values(both, 2))
+        plain = null.pulls(both, 2)
+        before.append(2.0 * special.stdtr(null.freedom, -np.abs(plain)))
+    return np.array(found), np.array(before)
+
+
+@pytest.mark.parametrize(("draw", "names", "level"), [(sums, SUMS, 1e-3), (counts, COUNTS, 1e-4)])
+def test_small_p_values_of_skewed_sums_and_rare_counts_are_as_rare_as_they_say(draw, names, level):
+    found, before = drawn_p_values(draw, names, 5)
+    error = np.sqrt(level / found.size)
+    assert np.mean(found < level) < level + 5.0 * error
+    # symmetric tails are wrong by far, so the check can fail
+    assert np.mean(before < level) > 2.0 * level + 5.0 * error
+
+
+def test_a_strong_deviation_of_a_skewed_sum_or_a_rare_count_is_none_by_chance():
+    rng = np.random.default_rng(6)
+    for draw, names, far in ((sums, SUMS, 12.0), (counts, COUNTS, laws.poisson(8, 0.15))):
+        null = NullModel.from_replicates(names, draw(rng, REPLICATES))
+        assert null.p_values(np.full(len(names), far), 2).max() < 1e-6
+
+
+def test_what_scatters_more_than_it_should_is_not_taken_for_quieter():
+    rng = np.random.default_rng(7)
+    stds = [NullModel.from_replicates(SUMS, 3.0 * sums(rng, REPLICATES)).std.mean() for _ in range(200)]
+    # 3 within the bias and the error of a standard deviation from 40 (2.7 with what was expected before)
+    assert np.mean(stds) == pytest.approx(3.0, abs=0.12)
+
+
+def test_drawn_pixels_keep_the_mean_of_their_samples_however_little_is_known_of_its_parts():
+    n = 2000
+    # H = 5 at 7 DN per electron: log H and log 1/g are known to 0.5 and 0.25, the mean to 0.1 DN
+    theta = np.tile([np.log(5.0), np.log(7.0), 80.0, np.log(6.0)], (1, n, 1))
+    slope = np.array([35.0, 35.0, 1.0, 0.0])
+    basis = np.array(
+        [[0.5, -0.25, 0.0, 0.0], [0.0, 0.0, 0.1, 0.0], [0.0, 0.0, 0.0, 0.3], [0.1, 0.0, 0.0, 0.0]]
+    )
+    basis[:, 2] -= basis[:, :2] @ slope[:2]
+    covariance = np.tile(basis.T @ basis, (1, n, 1, 1))
+    posterior = Posterior(Population(theta[0, 0], np.eye(4)), theta, covariance, np.ones((1, n)))
+    exposure, gain, bias, _ = posterior.draw(np.random.default_rng(8)).T
+    assert exposure.std() > 2.0
+    assert (exposure / gain + bias).std() == pytest.approx(0.1, rel=5.0 / np.sqrt(2.0 * n))
+    assert (exposure / gain + bias).mean() == pytest.approx(115.0, abs=5 * 0.1 / np.sqrt(n))
