@@ -35,8 +35,9 @@ _SMALLEST_STD = 0.6
 # last words of the names of statistics that are normal quantiles of a count: of few events their scatter is
 # far below 1, but their tail is that of the normal law all the same
 _COUNTS = ("cnt", "count", "pixels", "clusters")
-# errors of its mean by which a statistic must move to count as moved
+# errors of its mean by which a statistic must move to count as moved, and the chance of as much more scatter
 _MOVED = 4.0
+_WIDER = 0.01
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
 _SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
@@ -73,14 +74,17 @@ class NullModel:
         Args:
             names: of the statistics.
             vectors: the replicates.
-            before: null of the model to which effects were added: statistics that they leave where they were
-                scatter as they did, which few new replicates need not show again.
+            before: null of the model to which effects were added: statistics that they leave where they were,
+                and do not widen, scatter as they did, which few new replicates need not show again.
         """
         mean, std, covariance = moments(vectors)
         skewness = _skewness(names, vectors)
         tests = _effective_tests(names, vectors, skewness)
         if before is not None:
             moved = np.abs(mean - before.mean) > _MOVED * before.std * np.sqrt(1.0 / len(vectors))
+            # a common mode scatters trends and lags without moving them
+            wider = (std / before.std) ** 2
+            moved |= special.fdtrc(len(vectors) - 1, before.n_replicates - 1, wider) < _WIDER
             pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
             covariance *= np.outer(pooled / std, pooled / std)
             std, skewness, tests = pooled, before.skewness, before.effective_tests

@@ -105,6 +105,22 @@ def test_effective_tests_of_copies_are_those_of_one() -> None:
     assert copies.effective_tests == pytest.approx(1.0, abs=0.3)
 
 
+def test_an_effect_that_only_widens_a_statistic_makes_no_false_deviation() -> None:
+    rng = np.random.default_rng(17)
+    tests, low, unaware = 400, 0, 0
+    for _ in range(tests):
+        before = _null(rng)
+        wide = np.where(np.arange(40) == 7, 4.0, 1.0)
+        after = NullModel.from_replicates(NAMES[:40], rng.normal(0.3, wide, (16, 40)), before)
+        z = rng.normal(0.3, wide)
+        low += bool(after.p_values(z)[7] < 0.01)
+        unaware += bool(before.p_values(z)[7] < 0.01)
+        # what it leaves alone scatters as before, known from all replicates
+        assert np.median(after.std[8:]) == pytest.approx(1.0, abs=0.1)
+    assert low <= stats.binom.ppf(0.999, tests, 0.03)
+    assert unaware > 0.3 * tests
+
+
 def test_sidak() -> None:
     assert look_elsewhere(0.01, 10) == pytest.approx(1 - 0.99**10)
 
