@@ -81,14 +81,21 @@ class NullModel:
         skewness = _skewness(names, vectors)
         tests = _effective_tests(names, vectors, skewness)
         if before is not None:
-            moved = np.abs(mean - before.mean) > _MOVED * before.std * np.sqrt(1.0 / len(vectors))
-            # a common mode scatters trends and lags without moving them
-            wider = (std / before.std) ** 2
-            moved |= special.fdtrc(len(vectors) - 1, before.n_replicates - 1, wider) < _WIDER
+            moved = before.moved_by(vectors)
             pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
             covariance *= np.outer(pooled / std, pooled / std)
             std, skewness, tests = pooled, before.skewness, before.effective_tests
         return cls(names, mean, std, covariance, vectors, skewness, tests)
+
+    def moved_by(self, vectors: FloatArray) -> NDArray[np.bool_]:
+        """Tell which statistics effects move or widen, shape (m,), from replicates with them, shape (b, m).
+
+        A common mode scatters trends and correlations in time without moving them.
+        """
+        n = len(vectors)
+        moved = np.abs(vectors.mean(axis=0) - self.mean) > _MOVED * self.std / np.sqrt(n)
+        wider = special.fdtrc(n - 1, self.freedom, vectors.var(axis=0, ddof=1) / self.std**2)
+        return np.asarray(moved | (wider < _WIDER))
 
     def shifted(self, shift: FloatArray) -> NullModel:
         """Return the null of a model that gives ``shift`` more, shape (m,)."""

@@ -31,7 +31,6 @@ _LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
 _SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
 _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
-_MOVED = 4.0  # errors of its mean by which a statistic must move to count as moved
 # nats by which a set must promise to come near the best one, beside a tenth of what that explains
 _REACH, _REACH_SHARE = 30.0, 0.1
 _LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the next ones bring less
@@ -246,11 +245,11 @@ class Refitter:
     def _covariance(self, vectors: FloatArray) -> FloatArray:
         """Return the covariance of the statistics: that of the null, and more where they scatter more.
 
-        Statistics that the effects leave where they were scatter as they did.
+        Statistics that the effects neither move nor widen scatter as they did.
         """
-        null, n = self.null, len(vectors)
-        moved = np.abs(vectors.mean(axis=0) - null.mean) > _MOVED * null.std / np.sqrt(n)
-        ratio = np.where(moved, np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0), 1.0)
+        null = self.null
+        ratio = np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0)
+        ratio[~null.moved_by(vectors)] = 1.0
         return np.asarray(null.covariance * np.outer(ratio, ratio))
 
 
