@@ -75,8 +75,8 @@ def _of_channels(pattern: str, sentence: str) -> list[Statistic]:
 
 def _time() -> list[Statistic]:
     found: list[Statistic] = []
-    for lag in (1, 2, 3):
-        found += _of_channels(f"time.lag{lag}.{{}}.mean", f"{{}} {lag} frames apart are alike, in all pixels")
+    for lag, frames in (1, "successive frames"), (2, "every second frame"), (3, "every third frame"):
+        found += _of_channels(f"time.lag{lag}.{{}}.mean", f"{{}} of {frames} are alike, in all pixels")
     found += _of_channels("time.lag1.{}.chi", "{} of successive frames are correlated, differently by pixel")
     found += _of_channels(
         "time.lag1.{}.cnt", "{} of successive frames are correlated, in few pixels strongly"

@@ -252,7 +252,8 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not extended:
         return [KeyFact("distance of data and model", words, (chance,))]
     more = (words, chance + _interval(gap))
-    return [KeyFact("of the gap closed", percent(max(gap.closed_fraction, 0.0), 1.0), more)]
+    nearest = " by what is most like it, not named" if found.verdict == "unexplained" else ""
+    return [KeyFact(f"of the gap closed{nearest}", percent(max(gap.closed_fraction, 0.0), 1.0), more)]
 
 
 def _interval(gap: GapChange) -> str:

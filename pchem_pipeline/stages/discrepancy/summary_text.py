@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Sequence
 
 from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats
+from pchem_pipeline.report.style.wording import measured
 
 _WIDTH = 100
 #: Longer lists end with a count.
@@ -77,12 +78,12 @@ def _sd(z: float) -> str:
 
 
 def _step(step: Step, number: int, found: Verdict) -> list[str]:
-    """Return what was named in a step and why its rivals lost; where nothing was, the candidates' table."""
+    """Return what was named in a step and why its rivals lost, or the table of those not told apart."""
     lines = []
     title = f"step {number}" if number else "candidate"
     if step.effect:
         lines += [line for rival in step.rivals for line in _beaten(step.effect, rival)]
-    elif step.candidates:
+    elif step.candidates and found.verdict == "ambiguous":
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
             row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
@@ -90,7 +91,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         more = len(step.candidates) - _MOST_CANDIDATES
         lines += [f"  and {more} more"] if more > 0 else []
     if step.effect and step.parameters:
-        values = [_value(name, p.value, p.stderr, p.unit) for name, p in step.parameters.items()]
+        values = [f"{name} = {measured(p.value, p.stderr, p.unit)}" for name, p in step.parameters.items()]
         lines += _listed(f"{step.effect} in {step.place}" if step.place else step.effect, values, 0)
     if not step.effect and found.verdict == "ambiguous":
         lines += [
@@ -112,11 +113,6 @@ def _beaten(effect: str, rival: Rival) -> list[str]:
 
 def _number(value: float, digits: int = 1) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
-
-
-def _value(name: str, value: float, stderr: float, unit: str) -> str:
-    error = f" +- {stderr:.2g}" if math.isfinite(stderr) else ""
-    return f"{name} = {value:.4g}{error}{f' {unit}' if unit else ''}"
 
 
 def _gap(found: Verdict) -> list[str]:
