@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds
-from pchem_pipeline.config.memory import allowed_bytes
+from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
@@ -148,7 +148,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
         )
     bins = context.store.array("histogram/counts").shape[2]
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
-    if need > allowed_bytes(context.config, context.executor.workers):
+    if need > allowed_bytes(context.config, worker_count(context.config)):
         raise StoreError(
             f"{place}: appending needs {need >> 20} MiB; allow them (--max-memory), or do all again: "
             f"pchem run {quoted(place)}"
@@ -157,7 +157,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
 
 def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> dict[str, Any]:
     """Count the new frames; return the identity of their files."""
-    config, store, workers = context.config, context.store, context.executor.workers
+    config, store, workers = context.config, context.store, worker_count(context.config)
     bins = store.array("histogram/counts").shape[2]
     copies = config.input.mode == "copy"
     job = CountJob(store.path, frames.shape, bins, config.histogram, copies)

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Kill commands at random moments (SIGKILL, with their workers), resume them, compare with undisturbed ones.
+"""Stop commands at random moments, with their workers, resume them, and compare with undisturbed ones.
 
 ``.venv/bin/python scripts/validation/kills.py --kills 200`` kills `run`, `discrepancy`, `joint`, `electrons`,
-`report` and `ingest --append` in turn, each of a small sensor, up to three times before it may end, and
-compares every array of the store bit by bit, the verdict, and the numbers of the report (but for times and
-paths). It prints a line for each command that was killed, and ends with 1 where one of them differs or cannot
-go on.
+`report`, `ingest --append` and `apply` in turn, each of a small sensor, up to three times before it may end,
+and compares every array of the store bit by bit, the verdict, and the numbers of the report (but for times
+and paths). ``--signals INT,TERM`` sends what Ctrl-C and a batch system send: the command must end within
+`PATIENCE` seconds, with the code of the signal and one line. It prints a line for each command that was
+stopped, and ends with 1 where one of them differs, cannot go on, or did not end well.
 """
 
 import argparse
@@ -53,6 +54,9 @@ input: {samples: [{run: a.yaml}, {run: b.yaml}]}
 report: {figure_formats: [], dpi: 72}
 """
 
+#: seconds that a command may take to end after a signal that it hears
+PATIENCE = 60.0
+
 #: numbers that tell when and how long, or where
 _PASSING = re.compile(
     r"second|time|date|made|rss|cpu|started|path|version|elapsed|host|base_dir|config$|memory", re.I
@@ -83,6 +87,12 @@ WORKS = (
     Work("electrons", ("electrons", "a.yaml"), (("run", "a.yaml", "--until", "ensemble"),), "a.zarr"),
     Work("report", ("report", "a.yaml"), (("run", "a.yaml", "--until", "ensemble"),), "a.zarr"),
     Work("append", ("ingest", "a.yaml", "--append"), (("run", "part.yaml", "--until", "maps"),), "a.zarr"),
+    Work(
+        "apply",
+        ("apply", "a.yaml", "b_frames", "--output", "out.zarr"),
+        (("simulate", "b.yaml"), ("run", "a.yaml", "--until", "ensemble")),
+        "out.zarr",
+    ),
 )
 
 
@@ -182,10 +192,24 @@ def differences(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
     return sorted(names)
 
 
-def kill(process: subprocess.Popen[str]) -> None:
-    """Kill a command with its workers."""
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
+def stop(process: subprocess.Popen[str], number: int) -> str:
+    """Send a signal to a command and its workers; return what is wrong with how it ended, or nothing."""
+    os.killpg(process.pid, number)
+    start = time.perf_counter()
+    try:
+        _, words = process.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return f"went on for {PATIENCE:g} s after {signal.Signals(number).name}"
+    name, seconds = signal.Signals(number).name, time.perf_counter() - start
+    # 0 and 3: it had ended; a negative code: before it, or its interpreter, listened
+    if number == signal.SIGKILL or process.returncode in (0, 3, -number):
+        return ""
+    ours = words.strip().splitlines()[-1:]
+    if process.returncode != 128 + number or "Traceback" in words or not ours[0].startswith("pchem: "):
+        return f"{name}: code {process.returncode} after {seconds:.1f} s: {words[-2000:]}"
+    return ""
 
 
 def main() -> int:
@@ -194,32 +218,41 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--backend", default="threads", choices=["threads", "processes"])
     parser.add_argument("--only", help="names of commands, with commas")
+    parser.add_argument("--signals", default="KILL", help="KILL, INT, TERM, with commas: one is drawn a time")
     options = parser.parse_args()
+    signals = [signal.Signals[f"SIG{name}"] for name in options.signals.split(",")]
     rng = random.Random(options.seed)
     bench = Bench(Path(tempfile.mkdtemp(prefix="kills_")), options.backend)
     works = [work for work in WORKS if options.only is None or work.name in options.only.split(",")]
     expected, seconds = {}, {}
+    kills: Counter[str] = Counter()
+    wrong: list[str] = []
     for work in works:
         bench.begin(work)
-        seconds[work.name] = bench.ok(*work.command)
+        bench.ok(*work.command)  # compiles
         expected[work.name] = results(bench.case / work.store)
+        bench.begin(work)
+        seconds[work.name] = bench.ok(*work.command)
+        if other := differences(results(bench.case / work.store), expected[work.name]):
+            wrong.append(f"{work.name} in peace differs")
+            print(f"{work.name}: twice in peace, {len(other)} results differ: {', '.join(other[:8])}")
         print(
             f"{work.name}: {seconds[work.name]:.1f} s in peace, {len(expected[work.name])} results",
             flush=True,
         )
-    kills: Counter[str] = Counter()
-    wrong: list[str] = []
     while sum(kills.values()) < options.kills:
         work = works[sum(kills.values()) % len(works)]
         bench.begin(work)
-        moments = []
+        moments: list[str] = []
+        ends: list[str] = []
         for _ in range(rng.randint(1, 3)):
             process = bench.pchem(*work.command)
-            moments.append(rng.uniform(0.0, seconds[work.name]))
+            moment, number = rng.uniform(0.0, seconds[work.name]), rng.choice(signals)
+            moments.append(f"{moment:.2f}")
             try:
-                process.wait(timeout=moments[-1])
+                process.wait(timeout=moment)
             except subprocess.TimeoutExpired:
-                kill(process)
+                ends.append(stop(process, number))
                 kills[work.name] += 1
                 continue
             process.communicate()
@@ -230,11 +263,11 @@ def main() -> int:
             words = f"differs: {len(other)}: {', '.join(other[:8])}" if other else "same"
         except AssertionError as error:
             words = f"cannot go on: {error}"
+        words = "; ".join(filter(None, ends)) or words
         if words != "same":
             wrong.append(f"{work.name} {words}")
             shutil.copytree(bench.case, bench.folder / f"wrong{len(wrong)}")
-        shown = " ".join(f"{moment:.2f}" for moment in moments)
-        print(f"{sum(kills.values()):4d} {work.name}: stopped at {shown} s: {words}", flush=True)
+        print(f"{sum(kills.values()):4d} {work.name}: stopped at {' '.join(moments)} s: {words}", flush=True)
     print(f"{sum(kills.values())} kills ({dict(kills)}), {len(wrong)} wrong; in {bench.folder}")
     return 1 if wrong else 0
 

@@ -1,5 +1,6 @@
 """A dask cluster of real processes that are killed: the work goes on, or stops with one line."""
 
+import contextlib
 import functools
 import os
 import shutil
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,30 +29,48 @@ def slow_square(folder, number):
     return number**2
 
 
-@pytest.fixture
-def processes(tmp_path):
-    """A scheduler and two workers, each a process; ended afterwards."""
-    file = tmp_path / "scheduler.json"
+@contextmanager
+def cluster_processes(folder, n_workers, *options, environment=None):
+    """A scheduler and workers, each a process with its own group; ended afterwards."""
+    file = folder / "scheduler.json"
     started = []
 
     def start(kind, *options):
         command = [sys.executable, "-m", "dask", kind, "--no-dashboard", "--scheduler-file", str(file)]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         folders = [str(each) for each in Path(__file__).parents[:2]]
-        here = os.pathsep.join([*folders, os.environ.get("PYTHONPATH", "")])
-        environment = {**os.environ, "PYTHONPATH": here}  # the workers import this module
-        started.append(subprocess.Popen([*command, *options], cwd=tmp_path, env=environment, **quiet))
+        base = environment or os.environ
+        here = os.pathsep.join([*folders, base.get("PYTHONPATH", "")])
+        own = {**base, "PYTHONPATH": here}  # the workers import this module
+        started.append(
+            subprocess.Popen([*command, *options], cwd=folder, env=own, start_new_session=True, **quiet)
+        )
 
     start("scheduler", "--host", "127.0.0.1", "--port", "0")
-    for _ in range(2):
-        start("worker", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1")
+    for _ in range(n_workers):
+        start("worker", "--nthreads", "1", "--host", "127.0.0.1", *options)
     deadline = time.monotonic() + 60
     while not file.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    yield file, started
-    for process in started:
-        process.kill()
-        process.wait()
+    try:
+        yield file, started
+    finally:
+        for process in started:
+            signal_group(process, signal.SIGKILL)
+            process.wait()
+
+
+def signal_group(process, number):
+    """Send a signal to a worker with the process that watches over it."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, number)
+
+
+@pytest.fixture
+def processes(tmp_path):
+    """A scheduler and two workers."""
+    with cluster_processes(tmp_path, 2, "--no-nanny") as made:
+        yield made
 
 
 @pytest.fixture
@@ -127,6 +147,90 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     assert "Traceback" not in killed.stderr
     shell.ok("fit", "run.yaml")
     assert_same_results(store, finished)
+
+
+#: counts what a Python process reads of the frames: bytes, by `os.preadv` and by files that it opens
+COUNTING = """
+import io, os
+open_, preadv = io.open, os.preadv
+log = os.open(os.environ["READS"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+
+def note(name, count):
+    if str(name).endswith("night.npy"):
+        os.write(log, f"{count}\\n".encode())
+    return count
+
+class Counted(io.FileIO):
+    def readinto(self, buffer):
+        return note(self.name, super().readinto(buffer))
+
+def opened(file, mode="r", buffering=-1, *more, **options):
+    if str(file).endswith("night.npy") and mode == "rb":
+        raw = Counted(file)
+        return raw if buffering == 0 else io.BufferedReader(raw)
+    return open_(file, mode, buffering, *more, **options)
+
+io.open = opened
+os.preadv = lambda file, *rest: note(os.readlink(f"/proc/self/fd/{file}"), preadv(file, *rest))
+"""
+
+NIGHT = """
+run: {store: NAME.zarr, tile: 8}
+input: {files: [night.npy], integration_time: 1.0, bit_depth: 14, mode: reference}
+"""
+
+
+def wait_for_marks(store, stage, many):
+    """Wait until a stage has set some markers."""
+    deadline = time.monotonic() + 300
+    while len(list((store / ".pchem" / "done" / stage).rglob("*.json"))) < many:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("by_bands", [False, True], ids=["one pass", "bands"])
+def test_four_workers_of_which_two_are_killed_and_one_is_paused(shell, tmp_path, by_bands):
+    rng = np.random.default_rng(14)
+    electrons = rng.poisson(1.5, (6000, 64, 64)) + 0.3 * rng.standard_normal((6000, 64, 64))
+    np.save(shell.folder / "night.npy", np.rint(100 + 8 * electrons).astype(np.uint16))
+    (tmp_path / "counting").mkdir()
+    (tmp_path / "counting" / "sitecustomize.py").write_text(COUNTING)
+    for name in ("quiet", "night"):
+        (shell.folder / f"{name}.yaml").write_text(NIGHT.replace("NAME", name))
+    shell.ok("run", "quiet.yaml", "--until", "ensemble")
+    reads = tmp_path / "reads"
+    shell.environment |= {
+        "READS": str(reads),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path / "counting"), os.environ.get("PYTHONPATH", "")]),
+        "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "20s",
+    }
+    limit = ("--memory-limit", "2GB")
+    store = shell.folder / "night.zarr"
+    with cluster_processes(tmp_path, 4, *limit, environment=shell.environment) as (file, started):
+        _, first, second, third, _ = started
+        text = (shell.folder / "night.yaml").read_text()
+        text += f"compute: {{backend: distributed, scheduler: '{file}', workers: 2}}\n"
+        (shell.folder / "night.yaml").write_text(text)
+        if by_bands:  # as without the memory for the histograms of the whole sensor
+            shell.ok("ingest", "night.yaml")
+        with shell.start("run", "night.yaml", "--until", "ensemble", "--quiet") as process:
+            wait_for_marks(store, "fit", 6)
+            signal_group(first, signal.SIGKILL)
+            signal_group(third, signal.SIGSTOP)
+            wait_for_marks(store, "fit", 30)
+            signal_group(second, signal.SIGKILL)
+            _, words = process.communicate(timeout=900)
+        assert process.returncode == 0, words
+        assert_same_results(shell.folder / "quiet.zarr", store)
+        signal_group(third, signal.SIGCONT)  # it may still do what it had begun
+        time.sleep(5)
+        assert_same_results(shell.folder / "quiet.zarr", store)
+    size = (shell.folder / "night.npy").stat().st_size
+    # once, hash and all; or for the hash, and by workers, each its own rows
+    times = sum(map(int, reads.read_text().split())) / size
+    assert abs(times - (2.0 if by_bands else 1.0)) < 0.15, times
 
 
 class Counted:

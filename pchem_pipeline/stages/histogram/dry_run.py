@@ -118,7 +118,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     bins, reading, sample = _first_frames(config, frames)
     whole = single_pass_bytes(config, frames.shape, frames.dtype, bins)
     allowed = allowed_bytes(config, workers)
-    single_pass = whole <= allowed and config.compute.backend != "distributed"
+    single_pass = whole <= allowed
     bands = BASE_BYTES + min(whole - BASE_BYTES, workers * band_bytes(config, workers))
     report = _REPORT_BYTES + _REPORT_PIXEL_BYTES * ny * nx
     first = min(config.histogram.window_frames, n) / n

@@ -3,8 +3,8 @@
 What the stages ``ingest`` and ``histogram`` do one after the other, with two or three readings of all bytes,
 is done here in one. The results are the same to the bit; both stages afterwards find their
 arrays made and have but to mark them. It needs memory for the histograms of the whole sensor; where that is
-not there, where something is known of the input already, or where the work is done on other machines, nothing
-is done here and the stages run by themselves.
+not there, or where something is known of the input already, nothing is done here and the stages run by
+themselves. Also a command whose tiles go to other machines counts here: it reads all bytes for the hash.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.compute.executor import call_all
-from pchem_pipeline.config.memory import allowed_bytes
+from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.open import open_frames
@@ -72,7 +72,7 @@ def count_in_one_pass(context: StageContext) -> None:
             stream_rows(context, frames),
             context.config.histogram.window_frames,
             files=paths,
-            threads=context.executor.workers,
+            threads=worker_count(context.config),
             advance=whole_mebibytes(advance),
         ) as stream,
     ):
@@ -94,16 +94,15 @@ def prepared(frames: FrameSequence, clock: tuple[float, float]) -> dict[str, Pre
 def stream_rows(context: StageContext, frames: FrameSequence) -> list[Rows]:
     """Return the bands of rows that the workers share."""
     step = single_pass_rows(context.config, frames.shape, frames.dtype)
-    return cut_rows(frames.shape[1], step, context.executor.workers)
+    return cut_rows(frames.shape[1], step, worker_count(context.config))
 
 
 def _is_wanted(context: StageContext) -> bool:
-    """Tell whether both stages are to be done from the start, by threads of this process."""
+    """Tell whether both stages are to be done from the start."""
     options, config = context.options, context.config
     records = context.store.records
     return (
-        config.compute.backend != "distributed"
-        and options.tiles is None
+        options.tiles is None
         and options.roi is None
         and all(records.read(name) is None for name in PREPARED)
         and not is_histogram_input(config.input, context.base_dir)
@@ -121,7 +120,7 @@ def _blocks_are_chunks(context: StageContext, frames: FrameSequence) -> bool:
 def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
     """Tell whether the memory allowed is enough."""
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
-    return need <= allowed_bytes(context.config, context.executor.workers)
+    return need <= allowed_bytes(context.config, worker_count(context.config))
 
 
 def whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
@@ -140,7 +139,7 @@ def whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
 
 def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStream) -> bool:
     """Count all frames; tell whether memory was enough for the bins that the first ones show."""
-    config, workers = context.config, context.executor.workers
+    config, workers = context.config, worker_count(context.config)
     blocks = iter(stream)
     first = next(blocks)
     context.stop.check()
@@ -159,7 +158,7 @@ def _choose_bins(context: StageContext, parts: Sequence[NDArray[Any]]) -> int:
     """Return the number of bins of the sensor, from its first frames."""
     limit = most_bins(context.config.histogram.max_bins, parts[0].dtype)
     tasks = [functools.partial(pixels_by_range, part, limit) for part in parts]
-    found = call_all(tasks, context.executor.workers)
+    found = call_all(tasks, worker_count(context.config))
     return choose_bins(np.sum(found, axis=0), limit)
 
 
