@@ -71,6 +71,13 @@ def sync_folder(path: Path) -> None:
         os.close(handle)
 
 
+def sync_all(path: Path) -> None:
+    """Wait until a file, or a folder with all that is in it, is on the disk."""
+    below = list(path.rglob("*")) if path.is_dir() else []
+    _each(sync_file, [part for part in (path, *below) if part.is_file()])
+    _each(sync_folder, [part for part in (path, *below) if part.is_dir()])
+
+
 def put(path: Path, data: Data, *, sync: bool = False) -> list[Path]:
     """Write a file, so that whoever reads it finds the old or the new one, whole.
 

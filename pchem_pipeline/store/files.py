@@ -72,7 +72,7 @@ def write_atomic(path: Path, data: bytes, *, sync: bool | Callable[[Path], None]
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write a large file or a folder to, then rename it to ``path``.
+    """Yield a path beside ``path`` to write a large file or a folder to, sync it, then rename it to ``path``.
 
     If something is raised inside, nothing is left of it. What a killed process left goes with the next
     writing, so only one process may write a file. The name aside keeps the suffix, since some libraries look
@@ -81,7 +81,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         StoreError: the file system refused.
     """
-    with _put_in_place(path, path.with_name(f".partial-{path.name}")) as part:
+    aside = path.with_name(f".partial-{path.name}")
+    with _put_in_place(path, aside, disk.sync_all, disk.sync_folder) as part:
         yield part
 
 

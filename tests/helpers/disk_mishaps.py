@@ -39,6 +39,7 @@ class ForgetfulDisk:
 
     def __init__(self, monkeypatch):
         self.log = []
+        self._known = set()
         for name in (*CHANGES, *SYNCS):
             monkeypatch.setattr(disk, name, self._noted(name, getattr(disk, name)))
 
@@ -50,21 +51,28 @@ class ForgetfulDisk:
                 entry = (*entry, [folder for folder in above if not folder.exists()])
             elif name == "write":
                 entry = (name, arguments[0], bytes(arguments[1]))
+                self._known.add(arguments[0])
+            elif name == "sync_file" and arguments[0] not in self._known:  # a library wrote it
+                self.log.append(("write", arguments[0], arguments[0].read_bytes()))
+            elif name == "replace":
+                self._known.add(arguments[1])
             result = None if name in SYNCS else operation(*arguments)
             self.log.append(entry)
             return result
 
         return call
 
-    def after_power_cut(self, end, rng, honest=True):
+    def after_power_cut(self, end, rng, honest=True, before=None):
         """Return the files (path -> content) where the power is cut behind ``end`` operations.
+
+        ``before`` are those that were on the disk already.
 
         Each change of names in a folder that was not synced later is there or not, in any order; so is what
         lies in a new folder whose own name was not. A content that was not synced is whole, cut, or empty. A
         disk that is not ``honest`` forgets what it was told to keep.
         """
         log = self.log[:end]
-        files, kept = {}, self._kept(log) if honest else set()
+        files, kept = dict(before or {}), self._kept(log) if honest else set()
         lost = []
         for i, (name, *arguments) in enumerate(log):
             path = arguments[0]

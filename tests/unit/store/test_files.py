@@ -40,6 +40,30 @@ def test_what_is_not_on_the_disk_does_not_take_the_place(tmp_path, monkeypatch):
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"progress")]
 
 
+@pytest.mark.parametrize("names", [["a.fits"], ["a.zarr/zarr.json", "a.zarr/c/0/0"]])
+def test_a_large_file_or_folder_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch, names):
+    def written(content):
+        with whole_file(tmp_path / names[0].split("/")[0]) as part:
+            for name in names:
+                place = part.joinpath(*name.split("/")[1:])
+                place.parent.mkdir(parents=True, exist_ok=True)
+                place.write_bytes(content)
+
+    synced = []
+    with monkeypatch.context() as patch:
+        patch.setattr(disk, "sync_file", lambda path: synced.append((path.name, path.read_bytes())))
+        patch.setattr(disk, "sync_folder", synced.append)
+        written(b"old")
+    assert sorted(each for each in synced[: len(names)]) == sorted(
+        (".partial-a.fits" if name == "a.fits" else name.split("/")[-1], b"old") for name in names
+    )
+    assert synced[-1] == tmp_path
+    monkeypatch.setattr(os, "fsync", _fail)
+    with pytest.raises(StoreError, match="disk is full"):
+        written(b"new")
+    assert [(tmp_path / name).read_bytes() for name in names] == [b"old"] * len(names)
+
+
 def test_files_follow_the_umask_and_folders_are_made(tmp_path):
     before = os.umask(0o027)
     try:
