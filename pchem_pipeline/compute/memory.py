@@ -57,17 +57,23 @@ def resident_bytes() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def check_limit(limit: int) -> None:
-    """Refuse less memory than the program takes before it does anything.
+def keep_to_limit(limit: int | None) -> None:
+    """Keep this process, and those that it starts from now on, to a limit, where there is one.
+
+    Args:
+        limit: ``compute.max_memory``, MiB.
 
     Raises:
-        ConfigError: with what it takes.
+        ConfigError: it is less than the program takes before it does anything; with what it takes.
     """
-    if limit < BASE_BYTES:
+    if limit is None:
+        return
+    if limit << 20 < BASE_BYTES:
         raise ConfigError(
-            f"compute.max_memory (--max-memory): {limit >> 20} MiB are less than the {BASE_BYTES >> 20} that "
+            f"compute.max_memory (--max-memory): {limit} MiB are less than the {BASE_BYTES >> 20} that "
             "the program takes with its libraries; raise it"
         )
+    keep_memory_tight()
 
 
 def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Executor:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
-from pchem_pipeline.compute.memory import check_limit, keep_memory_tight
+from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.run.compilation import announced, compilation_lines, compiled_ahead
 from pchem_pipeline.run.declaration import imported
@@ -149,10 +149,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         store.write_config(dump_config(target.config))
         keep_in_force(store, model_in_force(store, target.config.model))
         write_json(store.path / ".pchem" / "location.json", _location(target))
-        limit = target.config.compute.max_memory
-        if limit is not None:
-            check_limit(limit << 20)
-            keep_memory_tight()
+        keep_to_limit(target.config.compute.max_memory)
         executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
         stack.callback(executor.close)
         yield StageContext(

@@ -20,7 +20,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -65,20 +65,22 @@ class RunStore:
             StoreError: something else is at that path, or it cannot be written.
         """
         import zarr
+        from zarr.errors import ContainsGroupError
 
         from pchem_pipeline.store.zarr_store import zarr_store
 
         path = place_of(path)
-        _remove_stillborn(path)
-        if (path / "zarr.json").exists():
+        _remove_blank(path)
+        strangers = _strangers(path)  # looked for first: another process may be making the same store
+        if (path / _DESCRIPTION).exists():
             return cls.open(path, writable=True)
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        if strangers:
             raise StoreError(f"{path} exists and is not a run; choose another --store or remove it")
-        with _one_line(path, path):
+        with _one_line(path, path), suppress(ContainsGroupError):
             disk.make_folder(path)
             attributes = {"pchem_schema": SCHEMA_VERSION}
-            root = zarr.create_group(zarr_store(path, writable=True), zarr_format=3, attributes=attributes)
-        store = cls(path, root)
+            zarr.create_group(zarr_store(path, writable=True), zarr_format=3, attributes=attributes)
+        store = cls.open(path, writable=True)
         store.sync()
         return store
 
@@ -352,15 +354,20 @@ class RunStore:
             ) from error
 
 
-def _remove_stillborn(path: Path) -> None:
+def _remove_blank(path: Path) -> None:
     """Remove the empty beginning of a store that a power cut may leave, before anything is in it."""
     if isinstance(path, RemotePath) or not path.is_dir():
         return
-    held = list(path.iterdir())
-    ours = [path / _DESCRIPTION, *path.glob(f".{_DESCRIPTION}.*.partial")]
-    if set(held) <= set(ours) and (path / _DESCRIPTION not in held or is_blank(path / _DESCRIPTION)):
-        for each in held:
-            remove_file(each)
+    if is_blank(path / _DESCRIPTION) and not _strangers(path):
+        remove_file(path / _DESCRIPTION)
+
+
+def _strangers(path: Path) -> bool:
+    """Tell whether there is more at a path than a store that has just begun, or is being made."""
+    if not path.is_dir():
+        return path.exists()
+    names = (each.name for each in path.iterdir())
+    return any(name != _DESCRIPTION and not name.startswith(f".{_DESCRIPTION}.") for name in names)
 
 
 @contextmanager

@@ -126,6 +126,13 @@ def test_calibrated_frames_have_the_truth_within_their_errors(lab, night):
     assert "too_few_bins" in found.quality.attrs["flag_meanings"]
 
 
+def test_too_little_memory_is_refused_before_anything_is_written(lab):
+    refused = lab("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--max-memory", "64")
+    assert refused.code == 2
+    assert "64 MiB are less than the 260 that the program takes" in refused.stderr
+    assert not (lab.folder / "out.zarr").exists()
+
+
 def test_nothing_is_overwritten_without_force(lab):
     lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure")
     again = lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure")

@@ -74,3 +74,20 @@ def test_a_second_process_on_the_same_run_is_refused(run, finished):
     assert "in use by another pchem process" in result.last
     run.ok("run", "run.yaml", *UNTIL)
     assert_same_results(finished, run.folder / "run.zarr")
+
+
+def test_the_same_new_run_from_two_shells_while_a_third_looks_on(run, finished):
+    seen = []
+    with (
+        run.start("run", "run.yaml", *UNTIL, "--quiet") as one,
+        run.start("run", "run.yaml", *UNTIL, "--quiet") as other,
+    ):
+        while None in (one.poll(), other.poll()):
+            seen.append(run("status", "run.yaml"))
+        words = {process.returncode: process.communicate()[1] for process in (one, other)}
+    assert set(words) == {0, 75}
+    assert words[75].count("\n") == 1
+    assert "in use by another pchem process" in words[75]
+    assert {result.code for result in seen} == {0}
+    assert {result.stderr for result in seen} == {""}
+    assert_same_results(finished, run.folder / "run.zarr")

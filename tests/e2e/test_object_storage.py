@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 from filelock import FileLock
-from helpers.commands import RUN, arrays_of
+from helpers.commands import RUN, Shell, arrays_of
 from helpers.flaky_proxy import FlakyProxy
 
 from pchem_pipeline.store.remote_path import lock_folder, place_of
@@ -206,6 +206,21 @@ def test_a_store_on_s3_is_locked_for_all_machines(cloud, server, frames):
     cloud.ok("ingest", "run.yaml")
     with pytest.raises(urllib.error.HTTPError, match="404"):
         ask(lock)
+
+
+@pytest.mark.long
+def test_two_machines_begin_the_same_run_on_s3(cloud, server, frames, finished, tmp_path):
+    """Each with a cache of its own, so that only the object is a lock for both."""
+    (cloud.folder / "run.yaml").write_text(STORED)
+    other = Shell(cloud.folder, {**cloud.environment, "XDG_CACHE_HOME": str(tmp_path / "far")})
+    command = ("run", "run.yaml", "--until", "histogram", "--quiet")
+    with cloud.start(*command) as first, other.start(*command) as second:
+        words = {process.communicate()[1]: process.returncode for process in (first, second)}
+    assert sorted(words.values()) == [0, 75]
+    (refused,) = (each for each, code in words.items() if code == 75)
+    assert refused.count("\n") == 1
+    assert "s3://lab/night/run.zarr is in use by pchem on" in refused
+    assert_same(fetched(server, tmp_path / "fetched"), finished, ("histogram", "summary"))
 
 
 def one_in_seven(number, method, path):

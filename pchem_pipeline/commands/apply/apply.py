@@ -33,6 +33,7 @@ from pchem_pipeline.commands.apply.tasks import (
     offsets_piece,
 )
 from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.formats.map_files import read_image
@@ -89,6 +90,7 @@ def apply_to_frames(
         ConfigError: the output exists with other settings.
     """
     target = with_overrides(target, command)
+    keep_to_limit(target.config.compute.max_memory)
     run = RunStore.open(target.store)
     reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
     with contextlib.ExitStack() as stack:
@@ -436,8 +438,14 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     job = replace(job, bins=_bins(context, made.frames, job.parts), window=min(job.window, n))
     _create_counted(context, job)
     bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
-    pieces = [Piece("count", *band, 0, n) for band in _bands(ny, _rows_of_band(context, job, bytes_of_pixel))]
-    context.run_units(pieces, functools.partial(count_piece, job=job), unit_name="band", by_tiles=False)
+    step = _rows_of_band(context, job, bytes_of_pixel)
+    context.run_units(
+        [Piece("count", *band, 0, n) for band in _bands(ny, step)],
+        functools.partial(count_piece, job=job),
+        unit_name="band",
+        by_tiles=False,
+        unit_bytes=bytes_of_pixel * step * job.source.shape[2],
+    )
     if context.failed or "numbers" not in job.kinds:
         return job
     top = context.store.read("applied_parts/range", (slice(1, 2), slice(None), slice(None)))[0]
@@ -481,4 +489,10 @@ def _converted(context: StageContext, job: Job) -> None:
         for number, t0 in enumerate(starts)
         for band in _bands(ny, step)
     ]
-    context.run_units(pieces, functools.partial(convert_piece, job=job), unit_name="piece", by_tiles=False)
+    context.run_units(
+        pieces,
+        functools.partial(convert_piece, job=job),
+        unit_name="piece",
+        by_tiles=False,
+        unit_bytes=bytes_of_pixel * step * nx,
+    )

@@ -8,7 +8,7 @@ import pytest
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
 from pchem_pipeline.compute.executor import Stop, make_executor
-from pchem_pipeline.compute.memory import BASE_BYTES, affordable, check_limit, resident_bytes
+from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
@@ -122,6 +122,6 @@ def test_workers_are_as_many_as_memory_is_enough_for():
 
 
 def test_too_little_memory_for_the_program_is_refused():
-    check_limit(BASE_BYTES)
+    keep_to_limit(None)
     with pytest.raises(ConfigError, match="64 MiB are less than the"):
-        check_limit(64 << 20)
+        keep_to_limit(64)

@@ -93,6 +93,31 @@ def test_missing_store_names_the_cure(tmp_path):
         RunStore.open(tmp_path / "nothing.zarr")
 
 
+def test_several_processes_that_make_the_same_store_at_once_have_it_all(tmp_path):
+    program = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from pchem_pipeline.store.run_store import RunStore\n"
+        "import zarr\n"
+        "print(flush=True)\n"
+        "sys.stdin.readline()\n"
+        "for number in range(40):\n"
+        "    RunStore.create(Path(sys.argv[1]) / f'{number}.zarr').write_config('')\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    makers = [subprocess.Popen(command, text=True, **pipes) for _ in range(3)]
+    for maker in makers:
+        maker.stdout.readline()
+    for maker in makers:
+        maker.stdin.write("\n")
+        maker.stdin.flush()
+    for maker in makers:
+        _, words = maker.communicate(timeout=120)
+        assert maker.returncode == 0, words
+    assert len(list(tmp_path.glob("*.zarr/zarr.json"))) == 40
+
+
 def test_second_process_finds_the_run_locked_and_a_killed_one_frees_it(store):
     code = (
         "import sys, time; from pathlib import Path; from pchem_pipeline.store.run_store import RunStore\n"
