@@ -225,9 +225,14 @@ def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
 
 
 def _straight(names: Sequence[str], pulls: FloatArray, std: FloatArray, skewness: FloatArray) -> FloatArray:
-    """Return pulls as normal quantiles: counts at no less than their own scale, the others without skew."""
+    """Return pulls as normal quantiles: counts at no less than their own scale, the others without skew.
+
+    Not on their short side: a skewness by rare samples does not say that it ends.
+    """
     counts = np.isin([_kind(name) for name in names], _COUNTS)
-    return without_skew(pulls * np.where(counts, np.minimum(std, 1.0), 1.0), skewness)
+    scaled = pulls * np.where(counts, np.minimum(std, 1.0), 1.0)
+    straight = without_skew(scaled, skewness)
+    return np.where(np.abs(straight) < np.abs(scaled), straight, scaled)
 
 
 def _effective_tests(names: Sequence[str], vectors: FloatArray, skewness: FloatArray) -> float:

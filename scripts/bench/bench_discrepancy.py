@@ -10,6 +10,7 @@ longer one takes over what is there. Every beginning of the study is balanced.
     python scripts/bench/bench_discrepancy.py FOLDER --table --minutes 60    # all rows of the table in turn
     python scripts/bench/bench_discrepancy.py FOLDER --command 3     # the installed command, with its cost
     python scripts/bench/bench_discrepancy.py FOLDER --null-range --minutes 30    # nothing hidden, any sensor
+    python scripts/bench/bench_discrepancy.py FOLDER --null-tails --minutes 15    # only its p-values
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from discrepancy_command import run_commands
 from discrepancy_figures import Answer, print_figures
 from discrepancy_null import MOST_SAMPLES, run_null_range
 from discrepancy_table import print_table
+from discrepancy_tails import run_null_tails
 from discrepancy_worker import run_case
 
 from pchem_pipeline.compute.environment import prepare_environment
@@ -149,6 +151,9 @@ def parse() -> argparse.Namespace:
         "--null-range", action="store_true", help="nothing hidden, sensors of the whole range, in one process"
     )
     parser.add_argument(
+        "--null-tails", action="store_true", help="the same small, and only how rare its p-values are"
+    )
+    parser.add_argument(
         "--most-samples", type=float, default=MOST_SAMPLES, help="frames x pixels of a stack of --null-range"
     )
     return parser.parse_args()
@@ -163,6 +168,9 @@ def main() -> None:
     if options.null_range:
         results = options.folder / "null_range.jsonl"
         run_null_range(results, options.first, options.minutes, options.most_samples)
+        return
+    if options.null_tails:
+        run_null_tails(options.folder, options.first, options.minutes)
         return
     if options.command:
         run_commands(options.command, options.first, shape, options.folder, options.processes)
