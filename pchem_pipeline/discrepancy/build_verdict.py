@@ -44,6 +44,7 @@ LARGEST_REST = 0.2
 _MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
+_RARE = 0.02  # a chance that is worth telling though it is no disagreement
 
 
 @dataclass(frozen=True)
@@ -300,12 +301,26 @@ def _gap_change(before: Gap, added: Added) -> GapChange:
     )
 
 
+def _nearly(found: Findings) -> str:
+    """Return what comes near to a disagreement without being one; empty where nothing does."""
+    words = []
+    p = found.first.global_p(found.z.both, 2)
+    if p < _RARE:
+        name = found.first.names[int(np.argmin(found.first.p_values(found.z.both, 2)))]
+        words.append(
+            f"{Place.of(name, z=0.0).sentence or name}, by chance in one of {1.0 / p:,.0f} such runs"
+        )
+    if not found.before.at_floor:
+        words.append("all statistics together are farther from it than chance makes in 19 of 20 such runs")
+    return f"; near the limit: {'; '.join(words)}; more frames would tell" if words else ""
+
+
 def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     """Return the verdict in one sentence: what, how large, and what it closes beside its rivals."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
     if state == "consistent":
-        return f"The {data} agree with the model in every statistic tested."
+        return f"The {data} agree with the model in every statistic tested{_nearly(found)}."
     if state == "cannot_tell":
         return (
             f"Nothing in the order of the {data}, between pixels or in the codes disagrees with the model; "

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.build_verdict import Added, Findings, _sentence
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Hypothesis,
     Noise,
@@ -16,8 +17,8 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     score_set,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
-from pchem_pipeline.discrepancy.gap import StatisticsGap
-from pchem_pipeline.discrepancy.null import NullModel, as_matrix, look_elsewhere
+from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
+from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -273,3 +274,22 @@ def test_a_statistic_that_a_replicate_lacks_says_nothing() -> None:
     np.testing.assert_allclose(as_matrix(("a", "b", "c"), vectors, usual)[:, 2], 5.0)
     with pytest.raises(KeyError, match="c"):
         as_matrix(("a", "c"), vectors)
+
+
+def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
+    null, calm, high = _null(np.random.default_rng(31)), np.full(40, 0.3), np.full(40, 0.3)
+    high[5] += 4.2
+    near, far = Gap(1e-4, 2e-4, (0.0, 0.0), {}), Gap(3e-4, 2e-4, (0.0, 0.0), {})
+    nothing = Added((), near)
+    words = {
+        (quiet, gap.at_floor): _sentence(
+            Findings("frames", Measured(z, z, z), null, null, gap, [], False, nothing), {}
+        )
+        for quiet, z in ((True, calm), (False, high))
+        for gap in (near, far)
+    }
+    assert words[True, True] == "The frames agree with the model in every statistic tested."
+    assert "by chance in one of" in words[False, True]
+    assert "more frames would tell" in words[True, False]
+    assert "all statistics together" in words[True, False]
+    assert "all statistics together" not in words[False, True]
