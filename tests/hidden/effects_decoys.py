@@ -1,6 +1,6 @@
 """Effects that the package's library leaves out on purpose: whatever gets a name there is invented.
 
-``TRIED`` were looked at while the naming was made; ``SEALED`` only once, when it stood.
+Which of them may be looked at, and which only once, at the end: ``scripts/bench/discrepancy_cases.py``.
 """
 
 from __future__ import annotations
@@ -30,22 +30,6 @@ class TemporalFilter(Hidden):
             found = np.where(chosen, (code + self.before) // 2, code)
         self.before = found
         return found
-
-
-class CornerGlow(Hidden):
-    """Light in a corner that bursts in one frame of fifty; strength: e- at the corner."""
-
-    tag: ClassVar[str] = "corner_glow"
-    s95: ClassVar[float] = 0.15
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
-
-    def draw(self):
-        y, x = np.indices(self.sensor.shape)
-        reach = max(self.sensor.shape) / 5
-        self.shape = np.exp(-np.hypot(y, x) / reach)
-
-    def exposure(self, t, h):
-        return h + self.strength * self.shape * (self.rng.random() < 0.02)
 
 
 class ShiftedRows(Hidden):
@@ -88,19 +72,6 @@ class TapGain(Hidden):
         return v
 
 
-class BlackClamp(Hidden):
-    """The black level follows the mean of the frame's left eighth; strength: part of it that is taken off."""
-
-    tag: ClassVar[str] = "black_clamp"
-    s95: ClassVar[float] = 0.05
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
-
-    def voltage(self, t, dn):
-        left = dn[:, : max(dn.shape[1] // 8, 1)] - self.sensor.bias[:, : max(dn.shape[1] // 8, 1)]
-        self.level = left.mean() if not hasattr(self, "level") else 0.9 * self.level + 0.1 * left.mean()
-        return dn - self.strength * (left.mean() - self.level)
-
-
 class DeadTime(Hidden):
     """Electrons that come soon after another are lost; strength: part lost per electron already there."""
 
@@ -110,20 +81,6 @@ class DeadTime(Hidden):
 
     def electrons(self, t, k):
         return k - self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
-
-
-class GainStitch(Hidden):
-    """Above a code the gain is another; strength: relative change."""
-
-    tag: ClassVar[str] = "gain_stitch"
-    s95: ClassVar[float] = 3e-3
-
-    def draw(self):
-        low, high = self.sensor.code_range
-        self.code = low + self.between("place", 0.5, 0.8) * (high - low)
-
-    def voltage(self, t, dn):
-        return np.where(dn > self.code, self.code + (1 + self.strength) * (dn - self.code), dn)
 
 
 class Hysteresis(Hidden):
@@ -188,6 +145,47 @@ class BlockMean(Hidden):
         found = code.copy()
         found[: 2 * ny, : 2 * nx] = np.where(lost, mean, blocks).reshape(2 * ny, 2 * nx)
         return found
+
+
+class RowGain(Hidden):
+    """The gain of each row is drawn anew in every frame; strength: relative, rms."""
+
+    tag: ClassVar[str] = "row_gain"
+    s95: ClassVar[float] = 0.01
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+
+    def signal(self, t, v):
+        return v * (1 + self.strength * self.rng.standard_normal((v.shape[0], 1)))
+
+
+class Afterpulses(Hidden):
+    """Each electron brings others into the next frame of its pixel; strength: their mean number."""
+
+    tag: ClassVar[str] = "afterpulses"
+    s95: ClassVar[float] = 2e-3
+    most: ClassVar[float] = 0.5
+    warmup: ClassVar[int] = 20
+
+    def draw(self):
+        self.before = np.zeros(self.sensor.shape, np.int64)
+
+    def electrons(self, t, k):
+        self.before = k + self.rng.poisson(self.strength * self.before)
+        return self.before
+
+
+class RepelledCharge(Hidden):
+    """Electrons that come to others go to the pixel on the right; strength: part per electron there."""
+
+    tag: ClassVar[str] = "repelled_charge"
+    s95: ClassVar[float] = 1.5e-3
+    most: ClassVar[float] = 0.1
+
+    def electrons(self, t, k):
+        gone = self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
+        arrived = np.zeros_like(k)
+        arrived[:, 1:] = gone[:, :-1]
+        return k - gone + arrived
 
 
 class MainsGain(Hidden):
@@ -300,14 +298,3 @@ class NegativeGhost(Hidden):
         shifted = v - self.strength / np.median(self.sensor.step) * np.maximum(self.before - 4, 0)
         self.before = v
         return shifted
-
-
-TRIED = (
-    "temporal_filter", "corner_glow", "slipped_rows", "shifted_rows", "settling_rows", "tap_gain",
-    "black_clamp", "dead_time", "gain_stitch", "hysteresis", "row_swap", "block_mean",
-)  # fmt: skip
-SEALED = (
-    "mains_gain", "blended_frames", "bursting_block", "row_tilt", "noisy_time",
-    "empty_samples", "loud_column", "negative_ghost", "trap_limited_lag", "self_trigger_cut",
-    "output_crosstalk", "checkerboard_offset",
-)  # fmt: skip

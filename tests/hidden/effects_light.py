@@ -194,3 +194,32 @@ class CosmicRays(Hidden):
         for _ in range(self.hits[t] if t >= 0 else 0):
             k = k + self.rng.poisson(self._deposit())
         return k
+
+
+class Glow(Hidden):
+    """Light from a corner or an edge, in one frame of fifty or growing; strength: e- there."""
+
+    tag: ClassVar[str] = "glow"
+    s95: ClassVar[float] = 0.25
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+
+    def draw(self):
+        (ny, nx), n = self.sensor.shape, self.sensor.n_frames
+        y, x = np.indices((ny, nx))
+        corner = self.pick("from", "corner", "edge")
+        cy = 0.0 if corner == "corner" else self.between("row", 0.2, 0.8) * ny
+        away = np.hypot(y - cy, x)
+        reach = max(ny, nx) / 5
+        if self.pick("falloff", "exponential", "gaussian", p=(0.7, 0.3)) == "exponential":
+            self.shape = np.exp(-away / reach)
+        else:
+            self.shape = np.exp(-0.5 * (away / reach) ** 2)
+        self.affected = self.shape > 0.1
+        if self.pick("course", "bursts", "grows", p=(0.7, 0.3)) == "bursts":
+            self.size = self.rng.random(n) < 0.02
+            self.parameters["bursts"] = int(self.size.sum())
+        else:
+            self.size, self.strength = np.arange(n) / n, self.strength / 4
+
+    def exposure(self, t, h):
+        return h + self.strength * self.shape * self.size[max(t, 0)]

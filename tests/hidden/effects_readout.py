@@ -307,3 +307,79 @@ class RepeatedLines(Hidden):
         for y in np.flatnonzero(self.rng.random(len(lines) - 1) < self.strength) + 1:
             found[y] = lines[y - 1]
         return np.moveaxis(found, 0, self.axis)
+
+
+class GainStitch(Hidden):
+    """Above a code the gain is another; strength: relative change.
+
+    Both gains agree at that code, or at the black level: then there is a step.
+    """
+
+    tag: ClassVar[str] = "gain_stitch"
+    s95: ClassVar[float] = 3e-3
+    most: ClassVar[float] = 0.4
+
+    def draw(self):
+        low, high = self.sensor.code_range
+        self.code = low + self.between("place", 0.5, 0.8) * (high - low)
+        self.origin = self.code
+        if self.pick("agree", "there", "black") == "black":
+            # a step is seen far sooner than a kink
+            self.origin, self.strength = self.sensor.bias.mean(), self.strength / 6
+        self.change = self.sign() * self.strength
+
+    def voltage(self, t, dn):
+        return np.where(dn > self.code, dn + self.change * (dn - self.origin), dn)
+
+
+class BlackClamp(Hidden):
+    """The black level of a frame is taken from some of its pixels; strength: part of their mean taken off.
+
+    They are the left eighth of the columns, the upper eighth of the rows, or all.
+    """
+
+    tag: ClassVar[str] = "black_clamp"
+    s95: ClassVar[float] = 0.018
+    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.5)
+    most: ClassVar[float] = 1.0
+
+    def draw(self):
+        (ny, nx), s = self.sensor.shape, self.sensor
+        where = self.pick("where", "columns", "rows", "all")
+        rows = slice(max(ny // 8, 1)) if where == "rows" else slice(None)
+        self.part = (rows, slice(max(nx // 8, 1)) if where == "columns" else slice(None))
+        self.usual = (s.bias + s.step * s.exposure)[self.part].mean()
+
+    def voltage(self, t, dn):
+        return dn - self.strength * (dn[self.part].mean() - self.usual)
+
+
+class ReadOrderNoise(Hidden):
+    """Noise of 1/f in the order of reading, of one tap or of four blocks of columns; strength: DN rms.
+
+    Without what changes more slowly than once a frame, which an amplifier's clamp takes away.
+    """
+
+    tag: ClassVar[str] = "read_order_noise"
+    s95: ClassVar[float] = 0.13
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+
+    def draw(self):
+        ny, nx = self.sensor.shape
+        self.taps = int(self.pick("taps", 1, 4, p=(0.7, 0.3)))
+        n = ny * (nx // self.taps)
+        # one record goes on through the frames
+        f = np.fft.rfftfreq(n * self.sensor.n_frames)
+        spectrum = np.where(f * n >= 1, 1 / np.sqrt(np.maximum(f, 1e-12)), 0.0)
+        self.record_of = []
+        for _ in range(self.taps):
+            phase = self.rng.standard_normal(f.size) + 1j * self.rng.standard_normal(f.size)
+            noise = np.fft.irfft(spectrum * phase, n * self.sensor.n_frames)
+            self.record_of.append((noise / noise.std()).astype(np.float32).reshape(-1, ny, nx // self.taps))
+
+    def voltage(self, t, dn):
+        dn = dn.copy()
+        for i, record in enumerate(self.record_of):
+            width = record.shape[2]
+            dn[:, i * width : (i + 1) * width] += self.strength * record[max(t, 0)]
+        return dn

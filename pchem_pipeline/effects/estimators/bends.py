@@ -1,9 +1,9 @@
-"""Find a smooth bend of the ADC's transfer curve in the counts per code.
+"""Find a smooth bend, or a break, of the ADC's transfer curve in the counts per code.
 
 A deviation ``delta(x)`` of the transfer curve moves the code edges by ``-delta``. The pixels' own fits take
 up what looks like a change of their H, g, mu or sigma; what they leave is computed here to first order, for
 a sample of pixels (the same projection as of an efficient score), summed over the codes and compared with
-the residuals for sines of many periods.
+the residuals for sines of many periods and for breaks at many places.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ _PIXELS = 256
 _PERIODS = 48
 _MOST_CODES = 1500
 _SHORTEST = 8.0
+# places of a break that are tried, and the share of the samples on either side that it needs
+_LEVELS = 80
+_END = 0.002
 # fall of chi2 by two coefficients at one of some 20 independent periods: p about 0.02
 _LEAST_GAIN = 14.0
 
@@ -55,29 +58,94 @@ class SampledPixels:
     tangents: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Stitch:
+    """A deviation ``slope (x - level) + step`` above a level, none below: DN per DN, DN, DN."""
+
+    level: float
+    slope: float
+    step: float
+
+
+@dataclass(frozen=True)
+class CurveResponse:
+    """What a small deviation of the transfer curve leaves in the counts per code.
+
+    Attributes:
+        edges: lower edges of the codes and the upper one of the last, DN, (codes + 1,).
+        response: standard errors per DN of deviation at each edge, (codes, codes + 1).
+        residuals: those seen, standard errors, (codes,).
+        expected: counts per code, (codes,).
+    """
+
+    edges: NDArray[np.float64]
+    response: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    expected: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> CurveResponse | None:
+        """Return that of the evidence; None of too few codes or without a usable pixel."""
+        codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
+        pixels = sampled_tangents(evidence.maps)
+        if codes.size < 16 or pixels is None:
+            return None
+        samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
+        response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
+        return cls(np.append(codes, codes[-1] + 1) - 0.5, response, residuals * np.sqrt(expected), expected)
+
+    def fits(self, deviations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
+        found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
+        return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
+
+    def worth(self, gains: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which gains are more than what chance, and what else is amiss with the codes, brings."""
+        total = float((self.residuals**2).sum())
+        left = np.maximum(1.0, (total - gains) / max(self.residuals.size - 6, 1))
+        return np.asarray(gains > _LEAST_GAIN * left)
+
+
 def best_bend(evidence: Evidence) -> list[Bend]:
-    """Return the bends that explain the residuals of the codes, the best first; none if none stands out."""
-    codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
-    pixels = sampled_tangents(evidence.maps)
-    if codes.size < 16 or pixels is None:
+    """Return the sines that explain the residuals of the codes, the best first; none if none stands out."""
+    curve = CurveResponse.of(evidence)
+    if curve is None:
         return []
-    samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
-    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(expected), 4.0 * _SHORTEST), _PERIODS)
-    turned = np.outer(np.append(codes, codes[-1] + 1) - 0.5, 2.0 * np.pi / periods)
-    # per code and period what a sine and a cosine of 1 DN would leave, in standard errors
-    response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
-    designs = np.stack([response @ np.sin(turned), response @ np.cos(turned)], axis=2)
-    fits = [_fit(designs[:, i], residuals * np.sqrt(expected)) for i in range(_PERIODS)]
-    gains = np.array([gain for gain, _ in fits])
-    total = float((residuals**2 * expected).sum())
+    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(curve.expected), 4.0 * _SHORTEST), _PERIODS)
+    turned = np.outer(2.0 * np.pi / periods, curve.edges)
+    gains, factors = curve.fits(np.stack([np.sin(turned), np.cos(turned)], axis=1))
+    worth = curve.worth(gains)
     found = []
     for place in np.argsort(-gains):
-        left = max(1.0, (total - gains[place]) / max(codes.size - 6, 1))
-        peak = gains[place] >= gains[max(place - 2, 0) : place + 3].max()
-        if gains[place] > _LEAST_GAIN * left and peak:
-            a, b = fits[place][1]
+        if worth[place] and gains[place] >= gains[max(place - 2, 0) : place + 3].max():
+            a, b = factors[place]
             found.append(Bend(float(np.hypot(a, b)), float(periods[place]), float(np.arctan2(b, a))))
     return found[:2]
+
+
+def best_stitch(evidence: Evidence) -> list[Stitch]:
+    """Return the break of the curve that explains the residuals of the codes best; none if none does.
+
+    A kink alone first, then with a step at the level, where that explains more.
+    """
+    curve = CurveResponse.of(evidence)
+    if curve is None:
+        return []
+    share = np.cumsum(curve.expected) / curve.expected.sum()
+    inside = np.flatnonzero((share > _END) & (share < 1.0 - _END))
+    levels = curve.edges[inside[:: max(1, inside.size // _LEVELS)]]
+    if not levels.size:
+        return []
+    beyond = curve.edges - levels[:, None]
+    step = np.where(beyond >= 0.0, 1.0, 0.0)
+    kink = beyond * step
+    found: list[tuple[float, Stitch]] = []
+    for pairs in (np.stack([kink, 0.0 * step], axis=1), np.stack([kink, step], axis=1)):
+        gains, factors = curve.fits(pairs)
+        best = int(gains.argmax())
+        if curve.worth(gains)[best] and (not found or gains[best] > found[0][0] + _LEAST_GAIN / 2):
+            found.insert(0, (gains[best], Stitch(float(levels[best]), *map(float, factors[best]))))
+    return [stitch for _, stitch in found]
 
 
 def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:

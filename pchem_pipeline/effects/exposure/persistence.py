@@ -16,8 +16,10 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_nodes
 from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_of
+from pchem_pipeline.effects.estimators.spots import best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.spot import spot_image
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,17 +98,15 @@ class Persistence(Effect):
 
     def pattern(self, rows: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.float64]:
         """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""
-        y, x = (rows + 0.5) / shape[0], (np.arange(shape[1]) + 0.5) / shape[1]
+        columns = np.arange(shape[1])
         if self.image:
             grid = np.asarray(self.image)
+            y, x = (rows + 0.5) / shape[0], (columns + 0.5) / shape[1]
             result: NDArray[np.float64] = (
                 _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
             )
             return result
-        side = max(shape)
-        dy, dx = (y - self.centre_y) * shape[0] / side, (x - self.centre_x) * shape[1] / side
-        spot: NDArray[np.float64] = np.exp(-0.5 * (dy[:, None] ** 2 + dx**2) / self.radius**2)
-        return spot
+        return spot_image(rows, columns, shape, (self.centre_y, self.centre_x), self.radius)
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
@@ -175,36 +175,10 @@ class Persistence(Effect):
         if peak > 0:
             rows = tuple(tuple(float(round(v / peak, 3)) for v in row) for row in bright)
             found.append(cls(peak_e=peak * fading.scale, image=rows, **fields))
-        spot = _spot(finer, exposure.shape)
-        if spot.pop("worth") > 0:
-            peak = spot.pop("peak_e")
-            found.append(cls(peak_e=peak * fading.scale, **spot, **fields))
+        spot = best_spot(finer.amplitude, finer.noise, finer.exposure, exposure.shape)
+        if spot is not None:
+            found.append(cls(peak_e=spot.peak * fading.scale, **(fields | spot.place)))
         return found
-
-
-def _spot(cells: FadingCells, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return the Gaussian spot that fits the cells best, with a part of H as background."""
-    rows, columns = cells.amplitude.shape
-    y, x = (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns
-    side = max(shape)
-    inverse = cells.noise**-2.0
-    background = cells.exposure
-    power = float(np.sum(inverse * background**2))
-    target = cells.amplitude - background * (float(np.sum(inverse * background * cells.amplitude)) / power)
-    best = (0.0, 0.0, 0.5, 0.5, 0.2)
-    for radius in (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6):
-        for cy in np.linspace(0.0, 1.0, 17):
-            dy = ((y - cy) * shape[0] / side)[:, None]
-            dx = ((x - np.linspace(0.0, 1.0, 17)[:, None]) * shape[1] / side)[:, None, :]
-            spots = np.exp(-0.5 * (dy**2 + dx**2) / radius**2)
-            spots = spots - background * (np.sum(inverse * background * spots, (1, 2)) / power)[:, None, None]
-            overlap, size = np.sum(inverse * spots * target, (1, 2)), np.sum(inverse * spots**2, (1, 2))
-            gain = np.where(overlap > 0, overlap**2 / np.maximum(size, 1e-300), 0.0)
-            i = int(np.argmax(gain))
-            if gain[i] > best[0]:
-                best = (float(gain[i]), float(overlap[i] / size[i]), float(cy), i / 16.0, radius)
-    worth, peak, centre_y, centre_x, radius = best
-    return {"worth": worth, "peak_e": peak, "centre_y": centre_y, "centre_x": centre_x, "radius": radius}
 
 
 def _hats(position: NDArray[np.float64], n: int) -> NDArray[np.float64]:

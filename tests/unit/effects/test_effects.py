@@ -18,10 +18,10 @@ from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effe
 from pchem_pipeline.simulate.settings import SimulateSettings
 
 
-class Glow(Effect):
+class Shine(Effect):
     """An effect of somebody else."""
 
-    tag: Literal["glow"] = "glow"
+    tag: Literal["shine"] = "shine"
     plane: ClassVar[Plane] = Plane.EXPOSURE
     extra: float = 0.5
 
@@ -97,13 +97,13 @@ def test_every_effect_is_documented():
 
 
 def test_a_plugin_is_found_and_used(installed):
-    installed(entry("Glow"))
-    assert registry.effect_class("glow") is Glow
-    settings = SimulateSettings(effects=[{"tag": "glow", "extra": 0.25}])
-    assert settings.effects == (Glow(extra=0.25),)
-    assert settings.model_dump(mode="json")["effects"] == [{"tag": "glow", "extra": 0.25}]
+    installed(entry("Shine"))
+    assert registry.effect_class("shine") is Shine
+    settings = SimulateSettings(effects=[{"tag": "shine", "extra": 0.25}])
+    assert settings.effects == (Shine(extra=0.25),)
+    assert settings.model_dump(mode="json")["effects"] == [{"tag": "shine", "extra": 0.25}]
     with pytest.raises(ValidationError, match="extar"):
-        SimulateSettings(effects=[{"tag": "glow", "extar": 0.25}])
+        SimulateSettings(effects=[{"tag": "shine", "extar": 0.25}])
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ def test_a_plugin_is_found_and_used(installed):
     ],
 )
 def test_a_broken_plugin_is_named_and_left_out(installed, caplog, point, reason):
-    installed(point, entry("Glow"))
+    installed(point, entry("Shine"))
     with caplog.at_level(logging.WARNING):
-        assert registry.effect_class("glow") is Glow
+        assert registry.effect_class("shine") is Shine
     assert list(registry.broken_plugins()) == [point.name]
     assert reason in registry.broken_plugins()[point.name]
     assert point.name in caplog.text
@@ -135,8 +135,8 @@ def test_asking_for_a_broken_plugin_says_why_it_is_missing(installed):
 
 
 def test_two_plugins_with_one_tag(installed):
-    installed(entry("Glow"), entry("other", f"{__name__}:Glow"))
-    assert registry.effect_class("glow") is Glow
+    installed(entry("Shine"), entry("other", f"{__name__}:Shine"))
+    assert registry.effect_class("shine") is Shine
     assert "taken" in registry.broken_plugins()["other"]
 
 
@@ -149,10 +149,10 @@ def test_our_own_tags_cannot_be_taken_twice():
 
 
 def test_effects_are_frozen_and_have_no_reach_by_default():
-    glow = Glow()
-    assert (glow.halo(), glow.history(), tag_of(Glow)) == (0, 0, "glow")
+    shine = Shine()
+    assert (shine.halo(), shine.history(), tag_of(Shine)) == (0, 0, "shine")
     with pytest.raises(ValidationError):
-        glow.extra = 2.0
+        shine.extra = 2.0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,106 @@
+"""Black-level clamp: the offset of every frame follows the mean of some of its pixels.
+
+Cameras hold their black level by subtracting, frame by frame, what dark reference pixels or the frame itself
+show (EMCCD baseline clamp, black-level clamp of CMOS sensors). The mean of few pixels has noise, and where
+they collect charge it has their shot noise too: all pixels of the frame then move against them together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from pchem_pipeline.effects.estimators.clamps import best_clamp
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import SampleLaw
+
+_WHOLE_SENSOR = 1 << 30  # rows: as far as there are any
+
+
+@register_effect
+class BlackClamp(Effect):
+    """A part of what the clamp's pixels deviate in a frame, in the mean, is taken from all of its pixels.
+
+    Signature: frame means of the readout residual scatter, against the charge of the clamp's pixels: where
+    those got more, the frame is lower. Noise of frames is as common to the pixels, but follows no charge.
+    """
+
+    tag: Literal["black_clamp"] = Field(default="black_clamp", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ADC
+    title: ClassVar[str] = "black-level clamp that follows the frame"
+    source: ClassVar[str] = "Andor iXon manual (baseline clamp); Janesick 2001 (optically black pixels)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "frame.covariance",
+        "frame.readout.variance",
+        "frame.charge.variance",
+        "space.x.rk",
+    )
+    strength: ClassVar[str] = "follow"
+    attained: ClassVar[tuple[str, ...]] = ("follow",)
+    separate: ClassVar[Mapping[str, str]] = {
+        "frame_noise": "the camera's clamp switched off; noise of frames does not follow their charge",
+        "exposure_flicker": "the camera's clamp switched off, or covered pixels: they follow the light",
+        "interpixel_capacitance": "pixels far apart: a clamp couples all of the frame alike",
+    }
+    follow: float = Field(
+        ge=0, le=1, description="part of the clamp's deviation that is taken off, no unit; 1: all of it"
+    )
+    rows: tuple[int, int] | None = Field(
+        default=None, description="rows of the clamp: first, and behind the last; null: all"
+    )
+    columns: tuple[int, int] | None = Field(
+        default=None, description="columns of the clamp: first, and behind the last; null: all"
+    )
+    pixels: int | None = Field(
+        default=None, ge=1, description="number of these pixels, for the law of a sample; null: left as it is"
+    )
+
+    @field_validator("rows", "columns")
+    @classmethod
+    def _some(cls, span: tuple[int, int] | None) -> tuple[int, int] | None:
+        if span is not None and not 0 <= span[0] < span[1]:
+            raise ValueError(f"black_clamp: {list(span)} holds no line; give [first, behind the last]")
+        return span
+
+    def halo(self) -> int:
+        """Return more rows than there are: the clamp may be anywhere."""
+        return _WHOLE_SENSOR
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal at the ADC (frame, y, x), DN, less what the clamp sees; draws nothing."""
+        truth = context.truth
+        usual = truth["bias"] + truth["quanta_exposure"] / truth["conversion_gain"]
+        place = (slice(*(self.rows or (None,))), slice(*(self.columns or (None,))))
+        deviation = (values[:, *place] - usual[place]).mean(axis=(1, 2), keepdims=True)
+        # a sensor without these rows or columns has no clamp
+        return np.asarray(values - self.follow * np.nan_to_num(deviation))
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return clamps that take off a tenth of the mean of the frame, and of eight columns and rows."""
+        return cls(follow=0.1), cls(follow=0.1, columns=(0, 8)), cls(follow=0.1, rows=(0, 8))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the rows, columns or the whole frame whose content the frames' offsets follow best."""
+        found = best_clamp(evidence)
+        if found is None:
+            return ()
+        return (cls(follow=found.follow, rows=found.rows, columns=found.columns, pixels=found.pixels),)
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law with the variance of the clamp's mean, its pixels taken to be like these."""
+        if self.pixels is None:
+            return model
+        variance = maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2
+        mean = float(np.nanmean(variance)) if np.isfinite(variance).any() else 0.0
+        return model.with_variance(dn2=self.follow**2 * mean / self.pixels)

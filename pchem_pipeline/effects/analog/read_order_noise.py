@@ -1,0 +1,92 @@
+"""Noise that is correlated in the order of reading: 1/f noise of an output amplifier.
+
+Where pixels leave the sensor one after the other through one amplifier (CCD, EMCCD, skipper) or few of them,
+the slow part of that amplifier's noise is common to samples that follow each other: stripes along the rows
+that are soft at their ends, of all widths. Each tap reads a block of columns, row by row, with noise of its
+own (correlated pink noise of near-infrared arrays: Rauscher 2015; Pyxel ``correlated_pink_noise_cmos``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.estimators.common_modes import add_offset
+from pchem_pipeline.effects.estimators.read_order import pink_amplitudes, pink_noise_of
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import SampleLaw
+
+
+@register_effect
+class ReadOrderNoise(Effect):
+    """Noise with a spectrum of ``1 / f`` along the samples of a tap, from one cycle per frame on.
+
+    Signature: row means of the readout residual scatter, those of adjacent rows alike, and neighbours along
+    the row are correlated more than pixels far apart in it. A pixel's own histogram only broadens.
+    """
+
+    tag: Literal["read_order_noise"] = Field(default="read_order_noise", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "1/f noise in the order of reading"
+    source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
+    signature: ClassVar[tuple[str, ...]] = (
+        "space.row.readout.lag1",
+        "space.row.readout.variance",
+        "space.x.rr",
+        "space.y.rr",
+        "frame.readout.quadrants",
+    )
+    strength: ClassVar[str] = "noise_dn"
+    power: ClassVar[float] = 2.0
+    separate: ClassVar[Mapping[str, str]] = {
+        "row_noise": "pixels far apart in a row: here they are less alike than neighbours",
+        "frame_noise": "rows far apart in a frame: here they are not alike",
+        "interpixel_capacitance": "dark frames: noise of an amplifier stays, coupled charge is gone",
+        "periodic_pickup": "a spectrum in the order of reading: pickup is a line, 1/f noise falls",
+        "bias_jumps": "successive frames: 1/f noise is new in each",
+    }
+    noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of this noise, DN")
+    taps: int = Field(
+        default=1, ge=1, le=4096, description="blocks of columns read at the same time, noise of their own"
+    )
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with the noise of the taps referred to the input."""
+        if self.noise_dn == 0:
+            return values.copy()
+        rows, columns = context.shape
+        taps = min(self.taps, columns)
+        width = -(-columns // taps)
+        amplitudes = pink_amplitudes(rows * width)
+        noise = np.empty((values.shape[0], context.rows.size, columns))
+        for t, frame in enumerate(context.frames):
+            random = context.random.generator(frame=int(frame))
+            white = np.fft.rfft(random.standard_normal((taps, rows * width)))
+            series = np.fft.irfft(amplitudes * white, rows * width).reshape(taps, rows, width)
+            noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
+        noise *= self.noise_dn
+        return add_offset(values, noise, context)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return it at 0.5 DN, of one tap and of four."""
+        return cls(noise_dn=0.5), cls(noise_dn=0.5, taps=4)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the noise that the covariances of rows and of neighbours show, for the likeliest taps."""
+        found = pink_noise_of(evidence)
+        return [cls(noise_dn=noise, taps=taps) for noise, taps in found]
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law with the variance of the noise: exact, a Gaussian on a Gaussian."""
+        return model.with_variance(dn2=self.noise_dn**2)

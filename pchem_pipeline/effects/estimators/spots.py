@@ -1,0 +1,236 @@
+"""Spots of light: in maps of amplitudes, and in frames of which only rows and columns are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pchem_pipeline.effects.framework.spot import Falloff, spot_image
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.evidence import Evidence
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+
+_RADII = (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6)
+_CENTRES = 17  # along either side
+_CELLS = 32  # groups of lines along either side
+# of a mixture of frames with and without a burst: shares, and heights in standard deviations
+_SHARES = np.array([0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4])
+_HEIGHTS = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0])
+_CLOSER = 12  # spots whose mixture is looked at
+_LEAST_GAIN = 12.0  # of the log-likelihood, best of some 1,000 spots with two parameters
+_MOST = 0.6  # share of the frames beyond which a burst is the rule
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A spot, its largest value, and by how much it lowers chi2."""
+
+    peak: float
+    centre: tuple[float, float]
+    radius: float
+    worth: float
+    falloff: Falloff = "gaussian"
+
+    @property
+    def place(self) -> dict[str, float]:
+        """Centre and radius as the fields of an effect."""
+        return {"centre_y": self.centre[0], "centre_x": self.centre[1], "radius": self.radius}
+
+
+@dataclass(frozen=True)
+class Bursts:
+    """A spot that is bright in a share of the frames."""
+
+    spot: Spot
+    share: float
+
+
+def best_spot(
+    amplitude: FloatArray,
+    noise: FloatArray,
+    background: FloatArray,
+    shape: tuple[int, ...],
+    falloffs: tuple[Falloff, ...] = ("gaussian",),
+) -> Spot | None:
+    """Return the spot that fits amplitudes in the cells of a grid best; None if none is positive.
+
+    Args:
+        amplitude: (rows, columns) of a grid over the sensor.
+        noise: standard errors, infinite without pixels.
+        background: what may be there in any proportion beside the spot.
+        shape: rows and columns of the sensor.
+        falloffs: forms that are tried.
+    """
+    y, x = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip(amplitude.shape, shape, strict=True))
+    inverse = noise**-2.0
+    power = float(np.sum(inverse * background**2))
+
+    def beside(values: FloatArray) -> FloatArray:
+        part = np.sum(inverse * background * values, axis=(-2, -1), keepdims=True) / power
+        return np.asarray(values - background * part)
+
+    target, best = beside(amplitude), None
+    grid = np.linspace(0.0, 1.0, _CENTRES)
+    for falloff in falloffs:
+        for radius in _RADII:
+            for cy in grid:
+                spots = beside(
+                    np.stack([spot_image(y, x, shape, (float(cy), cx), radius, falloff) for cx in grid])
+                )
+                overlap, size = np.sum(inverse * spots * target, (1, 2)), np.sum(inverse * spots**2, (1, 2))
+                gain = np.where(overlap > 0, overlap**2 / np.maximum(size, 1e-300), 0.0)
+                i = int(np.argmax(gain))
+                if gain[i] > (best.worth if best is not None else 0.0):
+                    centre = float(cy), float(grid[i])
+                    best = Spot(float(overlap[i] / size[i]), centre, radius, float(gain[i]), falloff)
+    return best
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Charge of groups of rows and of columns along the run.
+
+    Attributes:
+        charge: sums of k - H of the row groups, then of the column groups, e-, (n, r + c).
+        y, x: mean row and column of the groups, (r,) and (c,).
+        response: sum over the pixels of a cell of dE[k]/dH, (r, c).
+        variance: sum of Var(k), e-^2, which is also what a flicker of all pixels adds, (r, c).
+    """
+
+    charge: FloatArray
+    y: FloatArray
+    x: FloatArray
+    response: FloatArray
+    variance: FloatArray
+
+    def lines(self, cells: FloatArray) -> FloatArray:
+        """Return the sums over rows and columns of what is in the cells, (..., r + c)."""
+        return np.concatenate([cells.sum(axis=-1), cells.sum(axis=-2)], axis=-1)
+
+
+def best_bursts(evidence: Evidence) -> Bursts | None:
+    """Return the spot whose light comes in some frames only; None where none stands out.
+
+    A spot's light in a frame shows in its rows and columns. For each spot of a family the frames' light,
+    less what all pixels have in proportion to H, is compared with a mixture of two normal laws of unit
+    variance; the frames that the best mixture takes for bursts then give the spot's form.
+    """
+    lines = _lines(evidence)
+    if lines is None:
+        return None
+    shape = evidence.maps.usable.shape
+    weights = _weights(lines, shape)
+    heights = lines.charge @ weights.T
+    sharp = np.maximum((heights**3).mean(axis=0) / np.sqrt(15.0), ((heights**2).mean(axis=0) - 1.0) / 2**0.5)
+    chosen = np.argsort(-sharp)[:_CLOSER]
+    found = [_mixture(heights[:, i]) for i in chosen]
+    gain, share, burst = max(found, key=lambda each: each[0])
+    if gain < _LEAST_GAIN or share > _MOST:
+        return None
+    spot = _form(lines, burst, shape)
+    return None if spot is None else Bursts(spot, share)
+
+
+def _lines(evidence: Evidence) -> _Lines | None:
+    time, maps = evidence.time, evidence.maps
+    if time is None:
+        return None
+    good = maps.usable & (evidence.charge_std > 0) & (maps.quanta_exposure > 0)
+    if good.sum() < 16 or min(good.shape) < 2:
+        return None
+    variance = np.where(good, evidence.charge_std, 0.0) ** 2
+    response = np.where(good, variance / np.where(good, maps.quanta_exposure, 1.0), 0.0)
+    groups = [np.arange(n) * min(n, _CELLS) // n for n in good.shape]
+    first = [np.flatnonzero(np.diff(group, prepend=-1)) for group in groups]
+
+    def cells(values: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(np.add.reduceat(values, first[0], axis=0), first[1], axis=1))
+
+    charge = []
+    for series, axis in ((time.row_charge, 1), (time.column_charge, 0)):
+        sums = np.nan_to_num(series) * maps.usable.sum(axis=axis)
+        sums = np.add.reduceat(sums.astype(np.float64), first[1 - axis], axis=1)
+        # what changes slowly is no burst
+        charge.append(sums - _by_blocks(sums, time.frames, time.block_start))
+    y, x = (np.bincount(g, np.arange(g.size)) / np.bincount(g) for g in groups)
+    return _Lines(np.concatenate(charge, axis=1), y, x, cells(response), cells(variance))
+
+
+def _by_blocks(sums: FloatArray, frames: NDArray[np.int64], start: NDArray[np.int64]) -> FloatArray:
+    """Return the mean over the block of each frame, (n, lines)."""
+    first = np.searchsorted(frames, start)
+    length = np.diff(np.append(first, len(sums)))
+    means = np.add.reduceat(sums, first, axis=0) / length[:, None]
+    return np.asarray(np.repeat(means, length, axis=0))
+
+
+def _weights(lines: _Lines, shape: tuple[int, ...]) -> FloatArray:
+    """Return weights of the lines for each spot's light in a frame, of unit variance, (spots, r + c)."""
+    grid, found = np.linspace(0.0, 1.0, 9), []
+    for radius in _RADII[1::2]:
+        for cy in grid:
+            for cx in grid:
+                spot = spot_image(lines.y, lines.x, shape, (float(cy), float(cx)), radius)
+                cells = spot.mean(axis=1, keepdims=True) + spot.mean(axis=0)
+                # neither a flicker of all pixels, which adds Var(k) to each, nor a constant is a spot
+                cells = cells - (cells * lines.variance).sum() / lines.variance.sum()
+                scale = np.sqrt((cells**2 * lines.variance).sum())
+                row = cells.mean(axis=1) - 0.5 * cells.mean()
+                found.append(np.append(row, cells.mean(axis=0) - 0.5 * cells.mean()) / scale)
+    return np.array(found)
+
+
+def _mixture(height: FloatArray) -> tuple[float, float, FloatArray]:
+    """Return the gain in log-likelihood, the share, and the probability of a burst of each frame.
+
+    From the best of a grid by expectation and maximisation; the part without bursts stays standard normal.
+    """
+
+    def log_odds(share: float, top: float, middle: float = 0.0) -> FloatArray:
+        return np.asarray(np.log(share) + top * (height - middle) - top**2 / 2)
+
+    def log_mean(share: float, odds: FloatArray) -> FloatArray:
+        return np.asarray(np.logaddexp(np.log1p(-share), odds))
+
+    share, top = max(
+        ((float(share), float(top)) for share in _SHARES for top in _HEIGHTS),
+        key=lambda each: float(log_mean(each[0], log_odds(*each)).sum()),
+    )
+    middle = 0.0
+    for _ in range(60):
+        odds = log_odds(share, top, middle)
+        burst = np.exp(odds - log_mean(share, odds))
+        share = float(np.clip(burst.mean(), 1e-6, 1.0 - 1e-6))
+        middle = float((height * (1.0 - burst)).sum() / max((1.0 - burst).sum(), 1e-9))
+        top = float((height * burst).sum() / max(burst.sum(), 1e-9)) - middle
+    log = log_mean(share, log_odds(share, top, middle))
+    gain = float((log - 0.5 * (height - middle) ** 2 + 0.5 * height**2).sum())
+    return gain, share, burst
+
+
+def _form(lines: _Lines, burst: FloatArray, shape: tuple[int, ...]) -> Spot | None:
+    """Return the spot that fits rows and columns of the bursts, less those of other frames, best."""
+    mean = burst @ lines.charge / burst.sum() - (1.0 - burst) @ lines.charge / (1.0 - burst).sum()
+    inverse = 1.0 / np.maximum(lines.lines(lines.variance), 1e-12)
+    grid, best = np.linspace(0.0, 1.0, _CENTRES), None
+    falloffs: tuple[Falloff, ...] = ("gaussian", "exponential")
+    for falloff in falloffs:
+        for radius in _RADII:
+            for cy in grid:
+                spots = np.stack(
+                    [spot_image(lines.y, lines.x, shape, (float(cy), cx), radius, falloff) for cx in grid]
+                )
+                seen = lines.lines(spots * lines.response)
+                overlap, size = (inverse * seen * mean).sum(axis=1), (inverse * seen**2).sum(axis=1)
+                gain = np.where(overlap > 0, overlap**2 / np.maximum(size, 1e-300), 0.0)
+                i = int(gain.argmax())
+                if best is None or gain[i] > best.worth:
+                    centre = float(cy), float(grid[i])
+                    best = Spot(float(overlap[i] / size[i]), centre, radius, float(gain[i]), falloff)
+    return best if best is not None and best.peak > 0 else None

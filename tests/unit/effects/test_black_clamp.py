@@ -1,0 +1,89 @@
+"""Black-level clamp: the forward model, its moments, and what the estimator makes of it and of relatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import drawn_truth, seen, taken
+from hidden.chain import hide
+from pydantic import ValidationError
+
+from pchem_pipeline.effects.adc.black_clamp import BlackClamp
+from pchem_pipeline.effects.analog.frame_noise import FrameNoise
+from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+
+@pytest.mark.parametrize("place", [{}, {"columns": (0, 3)}, {"rows": (9, 12)}])
+def test_frames_move_against_the_clamp_s_pixels(place):
+    truth, effect = drawn_truth((12, 8)), BlackClamp(follow=0.8, **place)
+    plain, clamped = taken(truth, n_frames=300), taken(truth, effect, n_frames=300)
+    part = np.s_[:, slice(*effect.rows or (None,)), slice(*effect.columns or (None,))]
+    usual = truth.bias + truth.quanta_exposure / truth.conversion_gain
+    deviation = plain[part].mean(axis=(1, 2)) - usual[part[1:]].mean()
+    moved = (clamped - plain.astype(float)).mean(axis=(1, 2))
+    np.testing.assert_allclose(moved, -0.8 * deviation, atol=5 * 0.8 / np.sqrt(12 * 3))
+    assert moved.std() > 1.0
+
+
+def test_bands_are_parts_of_the_whole():
+    truth = drawn_truth((12, 8))
+    settings = SimulateSettings(
+        shape=truth.shape, n_frames=20, seed=1, effects=(BlackClamp(follow=1.0, rows=(0, 2)),)
+    )
+    whole = simulate_block(truth, settings, (0, 20), electron_frames=0)[0]
+    band = simulate_block(truth, settings, (5, 15), (7, 12), electron_frames=0)[0]
+    np.testing.assert_array_equal(band, whole[5:15, 7:12])
+
+
+def test_ranges_without_lines_are_refused():
+    with pytest.raises(ValidationError, match="holds no line"):
+        BlackClamp(follow=0.1, rows=(3, 3))
+
+
+def test_the_law_has_the_variance_of_the_clamp():
+    maps = PixelMaps(np.array([2.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]), np.ones(1, bool))
+    law = BlackClamp(follow=0.5, pixels=20).sample_law(SampleLaw(), maps)
+    assert law.extra_variance_dn2[0] == pytest.approx(0.25 * (9.0 + 200.0) / 20)
+    assert BlackClamp(follow=0.5).sample_law(SampleLaw(), maps).neutral
+
+
+# of the whole frame, of columns, of rows
+@pytest.mark.parametrize("seed", [180100, 180101, 180104])
+@pytest.mark.parametrize("level", [4.0, 30.0])
+def test_an_independent_camera_s_clamp_is_found(seed, level):
+    hiding = hide(("black_clamp",), level, seed, (24, 24), 1500)
+    (hidden,) = hiding.effects
+    [found] = BlackClamp.estimate(seen(hiding.frames))
+    where = hidden.parameters["where"]
+    # of a normal sample: the correlation with the clamp's pixels
+    sensor = hiding.sensor
+    signal = np.sqrt((sensor.exposure * sensor.step**2).mean())
+    error = 1.5 * (sensor.noise * sensor.step).mean() / signal / np.sqrt(1500)
+    assert abs(found.follow - hidden.strength) < 4 * error + 0.05 * hidden.strength
+    assert error < 0.3 * hidden.strength
+    if where != "all" and level > 10:
+        assert getattr(found, where) == (0, 3)
+        assert 70 <= found.pixels <= 72  # without a pixel that has no fit
+    if where == "all":
+        assert found.pixels > 400
+
+
+def test_relatives_are_no_clamp():
+    truth = drawn_truth((24, 24))
+    for number, hidden in enumerate(
+        (
+            (),
+            (FrameNoise(frame_noise_dn=0.5),),
+            (ExposureFlicker(rms=0.05),),
+            (FrameNoise(frame_noise_dn=2.0),),
+        )
+    ):
+        evidence = seen(taken(truth, *hidden, n_frames=1500, seed=11 + number))
+        assert BlackClamp.estimate(evidence) == ()
+    assert BlackClamp.estimate(replace(evidence, time=None)) == ()

@@ -1,0 +1,81 @@
+"""Glow at a place: the forward model, the law of what it adds, and what the estimator makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from hidden.chain import hide
+
+from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
+from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
+from pchem_pipeline.effects.exposure.glow import Glow
+from pchem_pipeline.effects.framework.spot import spot_image
+
+SHAPE = (10, 14)
+
+
+def light(effect, n_frames=400, **place):
+    context = context_of(SHAPE, n_frames, **place)
+    return effect.apply(np.ones((context.frames.size, context.rows.size, SHAPE[1])), context) - 1.0
+
+
+def test_bursts_are_a_share_of_the_frames_and_a_growth_is_straight():
+    effect = Glow(peak_e=2.0, burst_share=0.1, centre_y=0.5, centre_x=0.0, radius=0.3)
+    added = light(effect)
+    on = added.any(axis=(1, 2))
+    assert abs(on.sum() - 40) < 5 * 6
+    np.testing.assert_allclose(added[on], np.broadcast_to(added[on][0], added[on].shape))
+    assert added[on][0].max() == pytest.approx(2.0)
+    band = light(effect, frames=range(50, 90), rows=np.arange(3, 7))
+    np.testing.assert_array_equal(band, added[50:90, 3:7])
+    grown = light(Glow(peak_e=2.0))
+    np.testing.assert_allclose(grown[:, 0, 0], 2.0 * np.arange(400) / 399, atol=1e-12)
+
+
+def test_a_spot_is_1_in_its_brightest_pixel_and_falls_with_the_distance():
+    for falloff in ("gaussian", "exponential"):
+        for centre in ((0.0, 0.0), (0.43, 0.9), (1.0, 0.5)):
+            spot = spot_image(np.arange(10), np.arange(14), SHAPE, centre, 0.2, falloff)
+            assert spot.max() == pytest.approx(1.0)
+    spot = spot_image(np.arange(9), np.arange(9), (9, 9), (0.5, 0.5), 0.2, "exponential")
+    assert spot[4, 4 + 3] == pytest.approx(np.exp(-3 / (0.2 * 9)))
+
+
+def test_what_it_adds_has_the_moments_of_the_frames():
+    maps = seen(taken(drawn_truth(SHAPE), n_frames=300)).maps
+    for effect in (Glow(peak_e=2.0, burst_share=0.1), Glow(peak_e=2.0)):
+        shown = light(effect, 20_000)
+        added = effect.added_exposure(np.zeros((1, *SHAPE), np.uint16), np.arange(1), maps)
+        np.testing.assert_allclose(added.weight.sum(axis=0), 1.0)
+        for power in (1, 2):
+            moment = (added.weight * added.exposure_e**power).sum(axis=0)
+            assert np.abs(moment - (shown**power).mean(axis=0)).max() < 5 * 2.0**power * 0.3 / np.sqrt(20_000)
+
+
+# in bursts: from a corner, from an edge; growing: from an edge, from a corner
+@pytest.mark.parametrize("seed", [180100, 180103, 180101, 180104])
+def test_an_independent_camera_s_glow_is_found(seed):
+    hiding = hide(("glow",), 4.0, seed, (24, 24), 1500)
+    (hidden,) = hiding.effects
+    found = Glow.estimate(seen(hiding.frames))[0]
+    bursts = hidden.parameters["course"] == "bursts"
+    assert (found.burst_share is not None) == bursts
+    if bursts:
+        assert abs(1500 * found.burst_share - hidden.parameters["bursts"]) < 0.3 * hidden.parameters["bursts"]
+    image = found.peak_e * found.pattern(np.arange(24), (24, 24))
+    true = hidden.strength * hidden.shape
+    assert np.corrcoef(image.ravel(), true.ravel())[0, 1] > 0.9
+    assert image.sum() == pytest.approx(true.sum(), rel=0.25)
+
+
+def test_relatives_glow_nowhere():
+    truth = drawn_truth((24, 24))
+    for number, hidden in enumerate(
+        ((), (ExposureFlicker(rms=0.05),), (OpticalCrosstalk(probability=0.02),))
+    ):
+        evidence = seen(taken(truth, *hidden, n_frames=1500, seed=31 + number))
+        assert Glow.estimate(evidence) == []
+    assert Glow.estimate(replace(evidence, time=None)) == []

@@ -1,0 +1,58 @@
+"""Noise in read order: the forward model, and what the estimator makes of it and of relatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import context_of, drawn_truth, offsets, seen, taken
+from hidden.chain import hide
+
+from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.analog.read_order_noise import ReadOrderNoise
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+
+SHAPE = (16, 12)
+
+
+@pytest.mark.parametrize("taps", [1, 4])
+def test_its_spectrum_falls_along_the_samples_of_a_tap(taps):
+    noise = offsets(ReadOrderNoise(noise_dn=2.0, taps=taps), context_of(SHAPE, 600))
+    width = SHAPE[1] // taps
+    first = noise[:, :, :width].reshape(600, -1)
+    power = (np.abs(np.fft.rfft(first)) ** 2).mean(axis=0)
+    frequency = np.arange(power.size)
+    expected = power[1] / np.maximum(frequency, 1)
+    assert power[0] < 1e-9 * power[1]
+    np.testing.assert_allclose(power[1:-1] / expected[1:-1], 1.0, atol=5 * np.sqrt(2 / 600))
+    assert noise.var() == pytest.approx(4.0, rel=5 * np.sqrt(2 / 600))
+    if taps > 1:
+        other = noise[:, :, width : 2 * width].reshape(600, -1)
+        assert abs(np.mean(first * other)) < 5 * 4.0 / np.sqrt(600)
+
+
+def test_bands_and_blocks_are_parts_of_the_whole():
+    effect = ReadOrderNoise(noise_dn=1.0, taps=2)
+    whole = offsets(effect, context_of(SHAPE, 20))
+    part = offsets(effect, context_of(SHAPE, 20, frames=range(5, 9), rows=np.arange(3, 7)))
+    np.testing.assert_array_equal(part, whole[5:9, 3:7])
+
+
+# one tap, one tap, four
+@pytest.mark.parametrize("seed", [180000, 180001, 180003])
+def test_an_independent_camera_s_noise_is_found(seed):
+    hiding = hide(("read_order_noise",), 5.0, seed, (32, 32), 1200)
+    (hidden,) = hiding.effects
+    [found] = ReadOrderNoise.estimate(seen(hiding.frames))
+    assert found.taps == hidden.parameters["taps"]
+    assert found.noise_dn == pytest.approx(hidden.strength, rel=0.25)
+
+
+def test_relatives_have_another_order():
+    truth = drawn_truth((24, 24))
+    effects = ((), (RowNoise(row_noise_dn=0.8),), (InterpixelCapacitance(coupling=0.01),))
+    for number, hidden in enumerate(effects):
+        evidence = seen(taken(truth, *hidden, n_frames=1200, seed=41 + number))
+        assert ReadOrderNoise.estimate(evidence) == []
+    assert ReadOrderNoise.estimate(replace(evidence, time=None)) == []
