@@ -22,7 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
-from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -140,15 +140,16 @@ class ReplicateSimulator:
         the sensor or run gives hypotheses that act there only.
         """
         found: list[Effect] = []
+        window = self.acquisition.window or SensorWindow.whole(self.maps.bias.shape)
         for tag, effect in classes.items():
             if tag in {present.tag for present in self.model} | self.defects.keys():
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(one)) for one in evidence)), [])
-                found += guessed[:_MOST_HYPOTHESES]
+                found += [window.found(each) for each in guessed[:_MOST_HYPOTHESES]]
                 for part, own in parts:
                     placed = list(effect.estimate(own))[:_MOST_IN_A_PART]
-                    found += [each.at_place(part.region, part.when) for each in placed]
+                    found += [window.found(each, part) for each in placed]
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
                 self._note_defect(tag, error)

@@ -54,13 +54,23 @@ class SensorWindow:
     def effects(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         """Return effects as they act on the window, for itself a sensor; those that do not are left out."""
         found = []
-        for effect in effects:
+        for effect in (each.seen_in(self.rows, self.columns, self.shape) for each in effects):
             mask = self.mask(effect.region)
             if effect.region is None or mask.all():
                 found.append(effect.at_place(None, effect.when))
             elif mask.any():
                 found.append(effect.at_place(Region.of_mask(mask), effect.when))
         return tuple(found)
+
+    def found(self, effect: Effect, part: Part | None = None) -> Effect:
+        """Return as one of the sensor an effect that was found in the window, or in a part of it."""
+        rows, columns = self.rows, self.columns
+        if part is not None and part.region is not None:
+            inside = np.argwhere(self.mask(part.region))
+            (y0, x0), (y1, x1) = inside.min(axis=0).tolist(), (inside.max(axis=0) + 1).tolist()
+            rows, columns = (rows[0] + y0, rows[0] + y1), (columns[0] + x0, columns[0] + x1)
+        effect = effect.found_in(rows, columns, self.shape)
+        return effect if part is None else effect.at_place(part.region, part.when)
 
     def on_sensor(self, region: Region | None) -> Region | None:
         """Return a region of the window as one of the sensor; without ends here it has none there."""

@@ -15,6 +15,7 @@ from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.estimators.clamps import best_clamp
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.region import Span
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,10 +55,10 @@ class BlackClamp(Effect):
     follow: float = Field(
         ge=0, le=1, description="part of the clamp's deviation that is taken off, no unit; 1: all of it"
     )
-    rows: tuple[int, int] | None = Field(
+    rows: Span | None = Field(
         default=None, description="rows of the clamp: first, and behind the last; null: all"
     )
-    columns: tuple[int, int] | None = Field(
+    columns: Span | None = Field(
         default=None, description="columns of the clamp: first, and behind the last; null: all"
     )
     pixels: int | None = Field(
@@ -66,10 +67,33 @@ class BlackClamp(Effect):
 
     @field_validator("rows", "columns")
     @classmethod
-    def _some(cls, span: tuple[int, int] | None) -> tuple[int, int] | None:
+    def _some(cls, span: Span | None) -> Span | None:
         if span is not None and not 0 <= span[0] < span[1]:
             raise ValueError(f"black_clamp: {list(span)} holds no line; give [first, behind the last]")
         return span
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with what lies of its clamp in these rows and columns; without any it does nothing."""
+        spans = [
+            (max(first, low) - low, min(last, high) - low)
+            for (first, last), (low, high) in zip(self._spans(shape), (rows, columns), strict=True)
+        ]
+        if any(first >= last for first, last in spans):
+            return self.model_copy(update={"follow": 0.0, "rows": None, "columns": None})
+        return self.model_copy(update={"rows": spans[0], "columns": spans[1]})
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with its rows and columns counted on the sensor."""
+        size = (rows[1] - rows[0], columns[1] - columns[0])
+        moved = [
+            (first + low, last + low)
+            for (first, last), (low, _) in zip(self._spans(size), (rows, columns), strict=True)
+        ]
+        kept = [None if span == (0, n) else span for span, n in zip(moved, shape, strict=True)]
+        return self.model_copy(update={"rows": kept[0], "columns": kept[1]})
+
+    def _spans(self, shape: tuple[int, int]) -> tuple[Span, Span]:
+        return self.rows or (0, shape[0]), self.columns or (0, shape[1])
 
     def halo(self) -> int:
         """Return more rows than there are: the clamp may be anywhere."""
@@ -79,10 +103,11 @@ class BlackClamp(Effect):
         """Return the signal at the ADC (frame, y, x), DN, less what the clamp sees; draws nothing."""
         truth = context.truth
         usual = truth["bias"] + truth["quanta_exposure"] / truth["conversion_gain"]
-        place = (slice(*(self.rows or (None,))), slice(*(self.columns or (None,))))
+        place = tuple(slice(*span) for span in self._spans(context.shape))
+        if not usual[place].size:  # a sensor without these rows or columns
+            return values.copy()
         deviation = (values[:, *place] - usual[place]).mean(axis=(1, 2), keepdims=True)
-        # a sensor without these rows or columns has no clamp
-        return np.asarray(values - self.follow * np.nan_to_num(deviation))
+        return np.asarray(values - self.follow * deviation)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

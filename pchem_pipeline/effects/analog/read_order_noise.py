@@ -17,6 +17,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.common_modes import add_offset
 from pchem_pipeline.effects.estimators.read_order import pink_amplitudes, pink_noise_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.region import Span
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,6 +59,17 @@ class ReadOrderNoise(Effect):
     taps: int = Field(
         default=1, ge=1, le=4096, description="blocks of columns read at the same time, noise of their own"
     )
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with as many taps as these columns have of its width."""
+        return self._with_taps((columns[1] - columns[0]) / shape[1])
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with taps of the same width on all columns; one tap is one whatever the window."""
+        return self if self.taps == 1 else self._with_taps(shape[1] / (columns[1] - columns[0]))
+
+    def _with_taps(self, factor: float) -> Self:
+        return self.model_copy(update={"taps": max(round(self.taps * factor), 1)})
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the noise of the taps referred to the input."""

@@ -20,6 +20,7 @@ from pchem_pipeline.effects.estimators.fading_images import FadingCells
 from pchem_pipeline.effects.estimators.spots import Spot, best_bursts, best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.spot import Falloff, spot_image
 
 if TYPE_CHECKING:
@@ -81,6 +82,37 @@ class Glow(Effect):
         default="exponential",
         description="exponential: to 1/e within the radius; gaussian: of that standard deviation",
     )
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with its centre counted from these rows and columns, and the size that it has there."""
+        centre, size = (self.centre_y, self.centre_x), (rows[1] - rows[0], columns[1] - columns[0])
+        nearest = [
+            np.array([min(max(int(c * n), low), high - 1)])
+            for c, n, (low, high) in zip(centre, shape, (rows, columns), strict=True)
+        ]
+        left = spot_image(nearest[0], nearest[1], shape, centre, self.radius, self.falloff)
+        moved = [
+            (c * n - low) / m for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True)
+        ]
+        return self._moved(moved, max(shape) / max(size), float(left[0, 0]))
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with its centre counted on the sensor."""
+        centre, size = (self.centre_y, self.centre_x), (rows[1] - rows[0], columns[1] - columns[0])
+        moved = [
+            (c * m + low) / n for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True)
+        ]
+        return self._moved(moved, max(size) / max(shape), 1.0)
+
+    def _moved(self, centre: list[float], radius: float, peak: float) -> Self:
+        return self.model_copy(
+            update={
+                "centre_y": centre[0],
+                "centre_x": centre[1],
+                "radius": self.radius * radius,
+                "peak_e": self.peak_e * peak,
+            }
+        )
 
     def pattern(self, rows: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the spot in some rows relative to its brightest pixel, shape (rows, columns)."""

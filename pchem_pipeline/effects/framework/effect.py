@@ -39,7 +39,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.plane import Plane
-from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.effects.framework.region import Region, Span, When
 
 if TYPE_CHECKING:
     import numpy as np
@@ -111,6 +111,22 @@ class Effect(Section):
     def at_place(self, region: Region | None, when: When | None = None) -> Self:
         """Return a copy with another place and time."""
         return self.model_copy(update={"region": region, "when": when})
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it as it acts on some rows and columns that are taken for a sensor of their own.
+
+        For effects with places among their parameters; a region is cut elsewhere.
+
+        Args:
+            rows: first, and behind the last.
+            columns: likewise.
+            shape: rows and columns of the sensor.
+        """
+        return self
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return as an effect on the sensor what was found in some of its rows and columns; see `seen_in`."""
+        return self
 
     @abstractmethod
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:

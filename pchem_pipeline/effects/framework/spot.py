@@ -33,7 +33,9 @@ def spot_image(
     dy = ((rows + 0.5) / shape[0] - centre[0]) * shape[0] / side
     dx = ((columns + 0.5) / shape[1] - centre[1]) * shape[1] / side
     # the pixel nearest to the centre, which may lie between pixels or on the border
-    nearest = [(min(int(c * n), n - 1) + 0.5 - c * n) / side for c, n in zip(centre, shape, strict=True)]
+    nearest = [
+        (min(max(int(c * n), 0), n - 1) + 0.5 - c * n) / side for c, n in zip(centre, shape, strict=True)
+    ]
     away, least = (dy[:, None] ** 2 + dx**2) / radius**2, (nearest[0] ** 2 + nearest[1] ** 2) / radius**2
     if falloff == "gaussian":
         return np.asarray(np.exp(0.5 * (least - away)))

@@ -41,6 +41,17 @@ def test_bands_are_parts_of_the_whole():
     np.testing.assert_array_equal(band, whole[5:15, 7:12])
 
 
+def test_a_window_has_its_part_of_the_clamp():
+    shape, window = (40, 60), ((10, 30), (0, 20))
+    found = BlackClamp(follow=0.3, columns=(0, 4)).found_in(*window, shape)
+    assert (found.rows, found.columns) == ((10, 30), (0, 4))
+    seen_again = found.seen_in(*window, shape)
+    assert (seen_again.rows, seen_again.columns, seen_again.follow) == ((0, 20), (0, 4), 0.3)
+    assert found.seen_in((10, 30), (20, 40), shape).follow == 0.0
+    whole = BlackClamp(follow=0.3, rows=(0, 4))
+    assert whole.found_in((0, 40), (0, 60), shape) == whole
+
+
 def test_ranges_without_lines_are_refused():
     with pytest.raises(ValidationError, match="holds no line"):
         BlackClamp(follow=0.1, rows=(3, 3))

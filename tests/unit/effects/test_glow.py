@@ -44,6 +44,20 @@ def test_a_spot_is_1_in_its_brightest_pixel_and_falls_with_the_distance():
     assert spot[4, 4 + 3] == pytest.approx(np.exp(-3 / (0.2 * 9)))
 
 
+def test_a_window_sees_its_part_of_the_glow():
+    effect = Glow(peak_e=2.0, centre_y=0.1, centre_x=0.6, radius=0.3, falloff="gaussian")
+    image = effect.peak_e * effect.pattern(np.arange(40), (40, 60))
+    for rows, columns in (((0, 20), (20, 50)), ((16, 40), (0, 30)), ((0, 40), (0, 60))):
+        part = effect.seen_in(rows, columns, (40, 60))
+        size = (rows[1] - rows[0], columns[1] - columns[0])
+        own = part.peak_e * part.pattern(np.arange(size[0]), size)
+        np.testing.assert_allclose(own, image[slice(*rows), slice(*columns)], rtol=1e-9)
+    part = effect.seen_in((0, 20), (20, 50), (40, 60)).found_in((0, 20), (20, 50), (40, 60))
+    np.testing.assert_allclose(
+        [getattr(part, n) for n in ("peak_e", "centre_y", "centre_x", "radius")], [2.0, 0.1, 0.6, 0.3]
+    )
+
+
 def test_what_it_adds_has_the_moments_of_the_frames():
     maps = seen(taken(drawn_truth(SHAPE), n_frames=300)).maps
     for effect in (Glow(peak_e=2.0, burst_share=0.1), Glow(peak_e=2.0)):
