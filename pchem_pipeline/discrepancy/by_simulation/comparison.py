@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Contender,
     Hypothesis,
     fit_set,
+    share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
@@ -101,6 +102,8 @@ def compare(
     failed: dict[str, str] = {}
 
     def refit(members: Sequence[Hypothesis]) -> None:
+        if share_place(h.effect for h in (*held, *members)):
+            return
         dear = [one for one in tried if is_dear(one.effects)]
         if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
             return
@@ -157,7 +160,10 @@ def _placebo(
     pool = [
         h
         for h in hypotheses
-        if h.tag not in chosen.tags and unrelated(h.effect, member.effect) and not is_dear([h.effect])
+        if h.tag not in chosen.tags
+        and unrelated(h.effect, member.effect)
+        and not is_dear([h.effect])
+        and not share_place(other.effect for other in (*others, h))
     ]
     if any(one.tags == kept | {h.tag} for one in tried for h in pool):
         return []

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -298,6 +298,19 @@ def score_set(
     return ScoredSet((first, second), first.log_score(shifts[1], noise) + second.log_score(shifts[0], noise))
 
 
+def share_place(effects: Iterable[Effect]) -> bool:
+    """Tell whether several effects act in one part of the sensor or run.
+
+    Effects that have nothing to do with each other meet in one tap or range of frames by coincidence only:
+    where several are needed there, they mimic one cause, and none of them is it.
+    """
+    placed = itertools.combinations([e for e in effects if not e.everywhere], 2)
+    return any(
+        (a.region is not None and a.region == b.region) or (a.when is not None and a.when == b.when)
+        for a, b in placed
+    )
+
+
 def choose(
     hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
 ) -> Choice | None:
@@ -312,7 +325,7 @@ def choose(
     sets = []
     for size in range(1, _LARGEST_SET + 1):
         for members in itertools.combinations(shortlist, size):
-            if len({h.tag for h in members}) == size:
+            if len({h.tag for h in members}) == size and not share_place(h.effect for h in members):
                 scored = score_set(members, shifts, noise)
                 if _all_needed(scored, shifts, noise):
                     sets.append(scored)
