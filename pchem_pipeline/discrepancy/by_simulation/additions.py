@@ -32,6 +32,7 @@ _CLEAR_MARGIN = 50.0  # nats
 _REST_OF_NAMED = 0.1  # of the gap that an effect closes, the most that may be left where it gets a name
 _LEFT = 4.0  # deviations that are left of a statistic
 _MOVED = 2.0  # standard deviations by which an effect moves it
+_OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
 _MOST_RIVALS = 3
 
 
@@ -107,10 +108,11 @@ class AddedRounds:
                     now = self.gaps.gap(self.z.final, this.extended.mean, this.extended.replicates)
                 else:
                     now = after
-                against = "" if rest is None else self._unexplained(parts[member], rest, this.null)
+                against = "" if rest is None else unexplained_of_its_kind(parts[member], rest, this.null)
                 if rest is not None and left >= _REST_OF_NAMED * (gap.value - now.value):
                     against = "too much of the gap is left beside it"
-                additions.append(self._addition(this, int(member), (gap, now), against))
+                later = parts[order[place + 1 :]].sum(axis=0)
+                additions.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
         return Added(tuple(additions), after, unfinished)
 
@@ -119,15 +121,6 @@ class AddedRounds:
         allowed = tolerance(np.concatenate([this.added.parts for this in self.rounds]), self.allowed)
         chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
         return np.asarray((self.z.both - last.mean) / np.hypot(chance, allowed))
-
-    def _unexplained(self, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
-        """Return in words what an effect moves and the whole model does not account for; empty: nothing.
-
-        Whatever is missing besides, it is then not known that this effect has the right name.
-        """
-        mine = np.where(np.abs(part) > _MOVED * null.std, np.abs(rest), 0.0)
-        worst = int(np.argmax(mine))
-        return f"it leaves {STATISTICS[null.names[worst]].sentence}" if mine[worst] > _LEFT else ""
 
     def _against(self, this: Round, member: int) -> str:
         """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.
@@ -140,7 +133,10 @@ class AddedRounds:
         wrong = misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
         return added.effect.stuck_words() or ("it does not account for what it moves itself" if wrong else "")
 
-    def _addition(self, this: Round, member: int, gaps: tuple[Gap, Gap], against: str) -> Addition:
+    def _addition(
+        self, this: Round, member: int, gaps: tuple[Gap, Gap], against: str, later: FloatArray
+    ) -> Addition:
+        """Return an effect of a round; ``later`` is what those of it do that come after, shape (m,)."""
         added = this.added.hypotheses[member]
         rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.settings.certainty)
@@ -163,8 +159,8 @@ class AddedRounds:
             strength_stderr=_stderr(added, float(this.added.stderr[member])),
             before=gaps[0],
             after=gaps[1],
-            rivals=tuple(self._rival(this, one) for one in ranked),
-            placebo=None if placebo is None else self._rival(this, placebo),
+            rivals=tuple(self._rival(this, one, later) for one in ranked),
+            placebo=None if placebo is None else self._rival(this, placebo, later),
             pulls=largest_pulls(
                 this.null.names,
                 added.fingerprint / this.null.std,
@@ -201,9 +197,13 @@ class AddedRounds:
                 found[hypothesis.tag] = _Other(hypothesis.effect, behind, mean, rest, closes)
         return sorted(found.values(), key=lambda other: -other.behind)
 
-    def _rival(self, this: Round, other: _Other) -> Rival:
-        """Return a rival with the gap that it leaves, and the statistic that speaks most against it."""
-        gap = self.gaps.gap(self.z.final, other.mean, this.null.replicates)
+    def _rival(self, this: Round, other: _Other, later: FloatArray) -> Rival:
+        """Return a rival with the gap that it leaves, and the statistic that speaks most against it.
+
+        It was fitted beside all others of the round; its gap stands beside that of the effect in whose place
+        it is, which is measured without those that come later.
+        """
+        gap = self.gaps.gap(self.z.final, other.mean - later, this.null.replicates)
         worst = int(np.argmax(np.abs(other.rest)))
         if not other.closes:
             why = "at no strength does it explain anything"
@@ -233,6 +233,25 @@ class _Other:
     mean: FloatArray
     rest: FloatArray
     closes: bool
+
+
+def unexplained_of_its_kind(part: FloatArray, rest: FloatArray, null: NullModel) -> str:
+    """Return in words what the whole model does not account for of an effect's kind; empty: nothing.
+
+    Of what the effect moves, and of all in the families in which its signature stands: what is missing there
+    may be what makes its signature as well, and then this is not its name.
+
+    Args:
+        part: by how much the effect moves the statistics, shape (m,).
+        rest: what the model leaves of them, in what it may leave, shape (m,).
+        null: of the model before it.
+    """
+    weight = (part / null.std) ** 2
+    families = np.array([STATISTICS[name].family for name in null.names])
+    own = [f for f in set(families) if weight[families == f].sum() > _OF_SIGNATURE * weight.sum()]
+    left = np.where(np.isin(families, own) | (weight > _MOVED**2), np.abs(rest), 0.0)
+    worst = int(np.argmax(left))
+    return f"it leaves {STATISTICS[null.names[worst]].sentence}" if left[worst] > _LEFT else ""
 
 
 def _weight(part: FloatArray, null: NullModel) -> float:
