@@ -36,6 +36,7 @@ Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 _log = logging.getLogger(__name__)
 _MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
+_LEFT = 4.0  # deviations that the model leaves of a leading statistic for its effect to be asked for
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 # nats behind the best, and share of what that explains, from which on an effect is not worth more by itself
 _FAR, _FAR_SHARE = 40.0, 0.5
@@ -132,20 +133,26 @@ class ReplicateSimulator:
         classes: Mapping[str, type[Effect]],
         evidence: Sequence[Evidence],
         parts: Sequence[tuple[Part, Evidence]] = (),
+        beside: Evidence | None = None,
     ) -> list[Effect]:
         """Ask every candidate for hypotheses; one that raises is a defect.
 
         The first evidence in which a candidate sees anything counts. A guess says only what to look at:
         strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
-        the sensor or run gives hypotheses that act there only.
+        the sensor or run gives hypotheses that act there only. Beside the effects of the model others stand
+        out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
+        leading statistics of its effect deviate, what is typical is a guess.
         """
+        known = [] if beside is None else [beside]
         found: list[Effect] = []
         window = self.acquisition.window or SensorWindow.whole(self.maps.bias.shape)
         for tag, effect in classes.items():
             if tag in {present.tag for present in self.model} | self.defects.keys():
                 continue
             try:
-                guessed = next(filter(None, (list(effect.estimate(one)) for one in evidence)), [])
+                guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
+                if not guessed and known and known[0].strongest(*effect.signature[:2]) > _LEFT:
+                    guessed = list(effect.typical())
                 found += [window.found(each) for each in guessed[:_MOST_HYPOTHESES]]
                 for part, own in parts:
                     placed = list(effect.estimate(own))[:_MOST_IN_A_PART]

@@ -230,7 +230,8 @@ class FrameExplainer:
         )
         shifts = (z.train - null.mean, z.test - null.mean)
         apart = self.frames.seen_apart(self.plain)
-        guesses = simulator.guesses(self.classes, (self.plain, *self.evidence[:2]), apart)
+        own = (self.plain, *self.evidence[:2])
+        guesses = simulator.guesses(self.classes, own, apart, self._beside(null, z))
         placebo = placebo_for(guesses, self.classes)
         hypotheses = simulator.fingerprints([*guesses, *placebo])
         hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
@@ -360,6 +361,21 @@ class FrameExplainer:
         return Fitted(maps, expected, added)
 
     # -- pieces ---------------------------------------------------------------------------------
+
+    def _beside(self, null: NullModel, z: Measured) -> Evidence | None:
+        """Return the evidence of the seen frames beside the effects of the model; None where it has none.
+
+        Counts per code beside those that the model expects, and the vector as it deviates from the model's.
+        """
+        if not self.model:
+            return None
+        code, numbers = self.plain.code, self.frames.numbers[self.frames.seen]
+        codes = code.first + np.arange(code.observed.size)
+        expected = expected_codes(self.fit.maps, self.frames.effects(self.model), codes, numbers)
+        left = dict(zip(null.names, null.pulls(z.both, 2).tolist(), strict=True))
+        return replace(
+            self.plain, code=code if expected is None else replace(code, expected=expected), z=left
+        )
 
     def _refit(self, model: tuple[Effect, ...]) -> Refit:
         """Return the fit of the seen frames under a model."""

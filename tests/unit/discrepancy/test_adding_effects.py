@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pchem_pipeline.discrepancy.by_simulation.additions import unexplained_of_its_kind
+from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, own_signature
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
@@ -17,6 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
@@ -146,6 +149,65 @@ def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:
     assert none is None  # what was held has nothing in the data
 
 
+@pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
+def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str) -> None:
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
+    guesses = [
+        Hypothesis(h.effect.at_place(Region.model_validate(place)), h.fingerprint)
+        for h, place in ((hypothesis("row_noise"), "columns=0:8"), (hypothesis("frame_noise"), second))
+    ]
+    found = world.compare(*guesses)
+    assert found is not None
+    assert len(found.chosen.tags) == (1 if second == "columns=0:8" else 2)
+    later = world.compare(guesses[1], held=guesses[:1])
+    assert (later is None) == (second == "columns=0:8")
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [
+        ({"frame.covariance": 6.0}, "it leaves"),
+        ({"frame.covariance": 3.0}, ""),
+        ({"shape.He4.mean": 6.0}, ""),
+    ],
+)
+def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
+    left: dict[str, float], words: str
+) -> None:
+    names = ("frame.readout.variance", "frame.covariance", "shape.He4.mean")
+    null = NullModel.from_replicates(names, np.random.default_rng(3).standard_normal((40, 3)))
+    rest = np.array([left.get(name, 0.0) for name in names])
+    assert unexplained_of_its_kind(np.array([100.0, 0.0, 1.0]), rest, null).startswith(words)
+    assert bool(unexplained_of_its_kind(np.array([100.0, 0.0, 1.0]), rest, null)) == bool(words)
+
+
+def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show() -> None:
+    beside, frames = (SimpleNamespace(strongest=lambda *_, z=z: z) for z in (5.0, 0.0))
+
+    class Seen:
+        signature = ("shape.He3.mean",)
+
+        @staticmethod
+        def estimate(evidence: Any) -> list[Effect]:
+            return [effect("row_noise", 0.1 if evidence is beside else 0.2)]
+
+    class Unseen(Seen):
+        @staticmethod
+        def estimate(_: Any) -> list[Effect]:
+            return []
+
+        @staticmethod
+        def typical() -> list[Effect]:
+            return [effect("frame_noise", 0.3)]
+
+    taken: Any = SimpleNamespace(window=SensorWindow.whole((4, 4)))
+    simulator = ReplicateSimulator(None, (), taken, (), list, "", 1)  # type: ignore[arg-type]
+    classes: Any = {"seen": Seen, "unseen": Unseen}
+    guesses: Any = simulator.guesses
+    assert guesses(classes, [frames], (), beside) == [effect("row_noise", 0.1), effect("frame_noise", 0.3)]
+    assert guesses(classes, [frames]) == [effect("row_noise", 0.2)]
+
+
 def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() -> None:
     own, noise = np.eye(M)[1] * 10.0, np.ones(M)
     left = np.eye(M)[1] * 8.0
@@ -196,3 +258,21 @@ def test_an_effect_that_can_go_no_further_gets_no_name(
     [added] = search.close(before, extended, world.z, False).additions
     assert added.against == against
     assert added.named == (not against)
+
+
+def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World([effect("interpixel_capacitance", 0.2), effect("frame_noise", 0.1)])
+    tags = ("interpixel_capacitance", "frame_noise", "exposure_drift")
+    search, extended = add(world, monkeypatch, *(hypothesis(tag) for tag in tags))
+    search.gaps = StatisticsGap(world.null, 100_000)
+    before = search.gap(world.null, world.z)
+    additions = search.close(before, extended, world.z, False).additions
+    assert {each.effect.tag for each in additions} == {"interpixel_capacitance", "frame_noise"}
+    for each in additions:
+        closed = each.before.value - each.after.value
+        assert closed > 0.0
+        [rival] = [rival for rival in each.rivals if rival.effect == "exposure_drift"]
+        # nothing of it is in the data: in either place it closes nothing
+        assert abs(each.before.value - rival.gap_after) < 0.1 * closed
