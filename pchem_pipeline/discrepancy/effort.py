@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 # and of the mass of a code under one component
 _SAMPLE, _FIT, _REFIT, _LEARN, _MASS = 5.0e-8, 4.0e-5, 4.0e-5, 3.0e-4, 1.0e-7
 _MOST_LEARNT_FROM = 1000  # pixels
+#: By how many times as long the fit of a pixel takes more where its bias may be off by an electron: more
+#: starts, flat maxima and more electron numbers.
+_AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 100.0, 3.0
 #: Share of that which is kept for measuring what no effect explains.
@@ -49,6 +52,7 @@ class Effort:
         most: the same at which nothing more is begun; infinite until the null distribution is there.
         kept: of that, for the end.
         tried: tags of all effects with which the pixels were fitted.
+        ambiguous: share of the pixels whose bias may be off by an electron.
     """
 
     share: float | None
@@ -56,6 +60,7 @@ class Effort:
     most: float = math.inf
     kept: float = 0.0
     tried: set[str] = field(default_factory=set)
+    ambiguous: float = 0.0
 
     def begin(self) -> None:
         """Set the limit, now that the null distribution has been paid."""
@@ -68,11 +73,11 @@ class Effort:
 
     def simulate(self, samples: int, pixels: int, fits: int) -> None:
         """Count a simulated stack, whose pixels are fitted so many times."""
-        self.spent += _SAMPLE * samples + _FIT * pixels * fits
+        self.spent += _SAMPLE * samples + _FIT * self._hard * pixels * fits
 
     def refit(self, pixels: int, components: int, tags: Iterable[str]) -> None:
         """Count a fit of all pixels with effects, whose law has so many components, and what it teaches."""
-        self.spent += _REFIT * pixels * components + _LEARN * min(pixels, _MOST_LEARNT_FROM)
+        self.spent += _REFIT * self._hard * pixels * components + _LEARN * min(pixels, _MOST_LEARNT_FROM)
         self.tried |= set(tags)
 
     def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:
@@ -84,3 +89,8 @@ class Effort:
         """Raise an error if there is nothing left for what comes next."""
         if self.spent >= self.most:
             raise EffortSpentError(doing)
+
+    @property
+    def _hard(self) -> float:
+        """How many times as long a fit takes as where all peaks are resolved."""
+        return 1.0 + _AMBIGUOUS * self.ambiguous

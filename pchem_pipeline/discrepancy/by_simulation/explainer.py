@@ -159,6 +159,7 @@ class FrameExplainer:
         # parameters of a third of the frames scatter too much to stand for the pixels
         splits = self.frames.splits
         self.plain = self.frames.observe(self.frames.seen)
+        self.effort.ambiguous = self.plain.ambiguous
         usable = self.plain.maps.usable
         if usable.sum() < _FEWEST_PIXELS:
             raise InputError(

@@ -58,6 +58,13 @@ def test_a_fit_with_a_law_of_many_components_costs_more():
     assert spent[1] > 2.9 * spent[0]
 
 
+def test_fits_of_pixels_that_are_not_identified_cost_more():
+    plain, poor = Effort(1.0), Effort(1.0, ambiguous=0.9)
+    for effort in (plain, poor):
+        effort.simulate(0, 10**6, 3)
+    assert 4.0 * plain.spent < poor.spent < 6.0 * plain.spent
+
+
 def test_a_law_that_differs_by_pixel_costs_no_more_for_that():
     """Flicker in some rows only: as many components a pixel, not as many as all pixels have together."""
     shape = (12, 16)
