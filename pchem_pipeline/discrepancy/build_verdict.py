@@ -333,7 +333,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
         words = f"{lead}; {none}{_nearest(found)}{_left(added)}"
         return f"The {data} disagree with the model{words}."
     if state == "described":
-        return _described(found, titles)
+        return _described(found, titles, sizes)
     if state == "ambiguous":
         sets = [
             " or ".join(_title(c.effect) for c in each.candidates)
@@ -359,9 +359,11 @@ def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
     return title_words(effect) if size is None else f"{title_words(effect)} of {size.words()}"
 
 
-def _described(found: Findings, titles: Sequence[str]) -> str:
+def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
-    words = _and([each.effect.words() for each in found.added.additions if each.described])
+    measured = [each.effect for each in found.added.additions if each.described]
+    known = [(effect.words(), sizes.get(effect.tag)) for effect in measured]
+    words = _and([text if size is None else f"{text}, {size.words()} in all" for text, size in known])
     besides = f" besides {_and(titles)}" if titles else ""
     none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (

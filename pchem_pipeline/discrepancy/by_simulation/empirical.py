@@ -1,8 +1,10 @@
-"""The empirical component: what no known effect explains, measured as shifts of the samples.
+"""The empirical component: what no known effect explains, measured as moves of the samples.
 
-The histograms of the pixels are taken for mixtures of their law, moved by shifts on a grid; the shares of the
-shifts are those of maximum likelihood (Laird 1978; by Newton steps as Kim, Carbonetto, Stephens and Anitescu
-2020 take them). Few of them come out different from nothing, and those that the likelihood needs are kept.
+The samples are taken for a mixture of their law and of what moves would make of it: shifts on a grid, and,
+given the sample beside or before, moves towards that one. The shares of the moves are those of maximum
+likelihood (Laird 1978; by Newton steps as Kim, Carbonetto, Stephens and Anitescu 2020 take them). Few of them
+come out different from nothing, and those that the likelihood needs are kept. A neighbour must explain more
+than a sample of the same pixel from another time, which stands for it where the law alone is wrong.
 """
 
 from __future__ import annotations
@@ -12,50 +14,69 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import optimize, special
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.effects.adc.empirical import Empirical
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.readout.empirical import Empirical, Move, Together
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
-from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Place = tuple[int, int, int]
 
 _MOST_PIXELS = 600  # that stand for all
-_FINE = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0)  # DN
+_MOST_SAMPLES = 60_000  # that stand for all where each has a neighbour
+_FINE = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # DN
 _FARTHEST_E = 6.0  # electrons: shifts beyond are hits of particles or the like
 _ITERATIONS, _HALVINGS = 20, 8
 _CONVERGED = 0.01  # nats
 _NOTHING = 1e-300
-_MOST_SHIFTS = 6
-_CLEAR = 10.0  # nats of likelihood that a shift must be worth
+_MOST_MOVES = 6
+_CLEAR = 10.0  # nats of likelihood that a move must be worth
 _LEAST = 1e-6  # share
+#: Neighbours: one and two frames before, and those beside in the same frame.
+_PLACES: tuple[Place, ...] = (
+    (-1, 0, 0), (-2, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1),
+)  # fmt: skip
+_BESIDE: tuple[Place, ...] = ((0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0))
+_ACROSS: tuple[Place, ...] = ((0, -1, 0), (0, 1, 0))
+_SLIPPING: tuple[Together, ...] = ("row", "rest_of_row", "frame")
+_TOWARDS = (1, 2, 4, 8)  # DN
+_WITHIN = (0.5, 1.0)  # electrons
+_CHANCE = 7  # frames between a sample and the one that stands for a neighbour by chance
+_OF_CHANCE = 3.0  # times what that one explains, that a neighbour must
+_TOGETHER: tuple[Together, ...] = ("row", "column", "frame")
+_ROWS_TOGETHER = 4  # neighbouring rows
+_RARE = 1e-6  # least mass of a code: what is rarer has other reasons
+_SURE = 30.0  # nats, the most that a sample says
+_MUTUAL = 0.5  # of rows that come in the place of the next, as many of this part in that of the one before
+_FIRST_SHARE, _STEPS = 0.02, 60
 
 
 @dataclass(frozen=True)
 class _Mixture:
-    """Histograms and the mass of their codes by shift.
+    """Samples and the mass of their codes under each move.
 
     Attributes:
-        counts: samples of each pixel at each code, shape (n, c).
-        mass: of these codes with each shift, the first is none, shape (l, n, c).
+        counts: how many samples there are of each kind, shape (n,).
+        mass: of their codes with each move, the first is none, shape (l, n).
     """
 
     counts: FloatArray
     mass: FloatArray
 
     def fitted(self, used: Sequence[int]) -> tuple[FloatArray, float]:
-        """Return the shares of some of the shifts, (l,), 0 for the others, and the log likelihood, nats.
+        """Return the shares of some of the moves, (l,), 0 for the others, and the log likelihood, nats.
 
         ``sum n log(M s) - N sum s`` is concave: Newton steps, each a problem of non-negative least squares,
         halved where they overshoot.
         """
-        mass, total = self.mass[list(used)].reshape(len(used), -1), float(self.counts.sum())
-        counts = self.counts.ravel()
+        mass, total = self.mass[list(used)], float(self.counts.sum())
+        counts = self.counts
         share = np.full(len(used), 1e-3 / max(len(used) - 1, 1))
         share[0] = 1.0 - share[1:].sum()
         best = _likelihood(counts, mass, share)
@@ -84,72 +105,351 @@ class _Mixture:
         found[list(used)] = share
         return found, best
 
+    def gain(self) -> float:
+        """Return by how much likelier the samples are with moves, nats."""
+        return self.fitted(range(len(self.mass)))[1] - self.fitted([0])[1]
+
+    def needed(self) -> tuple[list[int], FloatArray, float]:
+        """Return the moves that the likelihood needs, the shares of all, (l,), and what they gain, nats."""
+        every, _ = self.fitted(range(len(self.mass)))
+        used = [0, *(int(i) for i in np.argsort(-every[1:])[:_MOST_MOVES] + 1 if every[i] > _LEAST)]
+        shares, best = self.fitted(used)
+        for one in sorted(used[1:], key=lambda i: shares[i]):
+            fewer = [i for i in used if i != one]
+            without, likelihood = self.fitted(fewer)
+            if best - likelihood < _CLEAR:
+                used, shares, best = fewer, without, likelihood
+        return [i for i in used[1:] if shares[i] > 0.0], shares, best - self.fitted([0])[1]
+
 
 def _likelihood(counts: FloatArray, mass: FloatArray, share: FloatArray) -> float:
     return float(counts @ np.log(np.maximum(share @ mass, _NOTHING)))
 
 
-def measured_shifts(
-    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
+@dataclass(frozen=True)
+class _Laws:
+    """The mass of the codes of some pixels under a model.
+
+    Attributes:
+        pixels: their numbers on the sensor, shape (n,).
+        first: their first codes, shape (n,).
+        mass: of successive codes, 0 at both ends, shape (n, c).
+    """
+
+    pixels: IntArray
+    first: IntArray
+    mass: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        frames: NDArray[np.unsignedinteger],
+        maps: PixelMaps,
+        effects: Sequence[Effect],
+        pixels: IntArray,
+        margin: int,
+    ) -> _Laws | None:
+        """Return those of pixels that are usable; None where the effects give no law."""
+        flat = tuple(values.ravel()[pixels] for values in maps.maps)
+        try:
+            law = sample_law(effects, pixel_maps(flat, np.ones(pixels.size, bool)))
+        except ConfigError:
+            return None
+        own = frames.reshape(len(frames), -1)[:, pixels]
+        first = own.min(axis=0).astype(np.int64) - margin
+        length = int((own.max(axis=0).astype(np.int64) - first).max()) + 1 + margin
+        mass = sample_mass(law, flat, first[:, None] + np.arange(length))
+        mass[:, [0, -1]] = 0.0
+        return cls(pixels, first, mass)
+
+    def at(self, row: IntArray, code: IntArray) -> FloatArray:
+        """Return the mass of codes in the pixels of some rows, 0 beyond what is known."""
+        place = (code - self.first[row]).clip(0, self.mass.shape[1] - 1)
+        return np.asarray(self.mass[row, place])
+
+    def moved(self, move: Move, row: IntArray, code: IntArray, other: IntArray | None) -> FloatArray:
+        """Return the mass of codes that have been moved, given the neighbours' codes."""
+        if other is None:
+            return self.at(row, code - move.shift_dn)
+        if move.shift_dn:
+            before = [code - move.shift_dn, code + move.shift_dn, code]
+        elif move.part == 1.0:
+            return np.asarray(code == other, np.float64)
+        else:
+            # x = floor((u + v) / 2) for two values of u
+            before = [2 * code - other, 2 * code - other + 1]
+        mass = sum(np.where(move.of(u, other) == code, self.at(row, u), 0.0) for u in before)
+        if move.within_dn is not None and not move.shift_dn:
+            mass = mass + np.where(abs(code - other) > move.within_dn, self.at(row, code), 0.0)
+        return np.asarray(mass)
+
+
+def measured_moves(
+    frames: NDArray[np.unsignedinteger],
+    numbers: IntArray,
+    maps: PixelMaps,
+    effects: Sequence[Effect],
 ) -> Empirical | None:
-    """Return the shifts that the samples of some frames need beside a model; None where they need none.
+    """Return the moves that the samples of some frames need beside a model; None where they need none.
 
     Args:
         frames: (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, shape (frame,).
         maps: parameters of the pixels under the model.
         effects: of the model.
     """
-    grid = _grid(maps)
-    mixture = _mixture(frames, maps, effects, grid)
-    if mixture is None or grid.size < 2:
-        return None
-    every, best = mixture.fitted(range(grid.size))
-    used = [0, *(int(i) for i in np.argsort(-every[1:])[:_MOST_SHIFTS] + 1 if every[i] > _LEAST)]
-    shares, best = mixture.fitted(used)
-    for one in sorted(used[1:], key=lambda i: shares[i]):
-        fewer = [i for i in used if i != one]
-        without, likelihood = mixture.fitted(fewer)
-        if best - likelihood < _CLEAR:
-            used, shares, best = fewer, without, likelihood
-    moved = [i for i in used[1:] if shares[i] > 0.0]
-    if not moved:
-        return None
-    total = float(shares[moved].sum())
-    return Empirical(
-        share=total,
-        shift_dn=tuple(float(grid[i]) for i in moved),
-        weight=tuple(float(shares[i] / total) for i in moved),
-    )
+    shifts = _measured_shifts(frames, maps, effects)
+    towards = _measured_towards(frames, numbers, maps, effects)
+    slips = _measured_slips(frames, maps, effects)
+    found = [one for one in (shifts, towards, slips) if one is not None]
+    return max(found, key=lambda one: one.gain).effect if found else None
 
 
-def _grid(maps: PixelMaps) -> FloatArray:
-    """Return the shifts to look for, none first, DN."""
+@dataclass(frozen=True)
+class _Found:
+    """A component, and what it gains for a sample, nats."""
+
+    effect: Empirical
+    gain: float
+
+
+def _measured_shifts(
+    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
+) -> _Found | None:
+    """Return the shifts that histograms of pixels that stand for all need."""
     farthest = _FARTHEST_E / float(np.median(maps.conversion_gain[maps.usable]))
-    sizes = np.array([size for size in _FINE if size <= farthest])
-    return np.concatenate([[0.0], -sizes, sizes])
-
-
-def _mixture(
-    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect], grid: FloatArray
-) -> _Mixture | None:
-    """Return the histograms and masses of pixels that stand for all; None where the effects give no law."""
+    sizes = [size for size in _FINE if size <= farthest]
     usable = np.flatnonzero(maps.usable.ravel())
-    chosen = usable[:: max(usable.size // _MOST_PIXELS, 1)]
-    every = maps.maps
-    flat = tuple(values.ravel()[chosen] for values in every)
-    try:
-        law = sample_law(effects, pixel_maps(flat, np.ones(chosen.size, bool)))
-    except ConfigError:
+    pixels = usable[:: max(usable.size // _MOST_PIXELS, 1)]
+    laws = _Laws.of(frames, maps, effects, pixels, 1 + max(sizes, default=0))
+    if laws is None or not sizes:
         return None
+    moves = [Move(shift_dn=sign * size) for sign in (-1, 1) for size in sizes]
     histograms = histogram_frames(frames)
-    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])[chosen].astype(np.float64)
-    # the codes of the pixels begin at their own origins
-    codes = histograms.origin.ravel()[chosen][:, None] + np.arange(counts.shape[1])
-    filled = np.flatnonzero(counts.any(axis=0))
-    counts, codes = counts[:, filled[0] : filled[-1] + 1], codes[:, filled[0] : filled[-1] + 1]
-    mass = np.stack([sample_mass(_shifted(law, float(shift)), flat, codes) for shift in grid])
-    return _Mixture(counts, mass)
+    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])[pixels]
+    row, column = np.nonzero(counts)
+    code = histograms.origin.ravel()[pixels][row] + column
+    mass = [laws.at(row, code), *(laws.moved(move, row, code, None) for move in moves)]
+    mixture = _Mixture(counts[row, column].astype(np.float64), np.stack(mass))
+    used, shares, gain = mixture.needed()
+    return _component(moves, used, shares, gain / float(counts.sum()))
 
 
-def _shifted(law: SampleLaw, shift: float) -> SampleLaw:
-    return law if shift == 0.0 else law.with_noise([1.0], shift_dn=shift)
+def _component(
+    moves: Sequence[Move], used: Sequence[int], shares: FloatArray, gain: float, **how: object
+) -> _Found | None:
+    total = float(shares[list(used)].sum())
+    if not used or total <= 0.0:
+        return None
+    kept = tuple(moves[i - 1].model_copy(update={"weight": float(shares[i] / total)}) for i in used)
+    return _Found(Empirical.model_validate({"share": min(total, 1.0), "moves": kept, **how}), gain)
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Samples whose neighbours are known.
+
+    Attributes:
+        row: of the pixel's law, shape (m,).
+        place: frame, row and column, shape (3, m).
+        code: DN, shape (m,).
+        other: that of the neighbour, shape (m,).
+        chance: one of the neighbour's pixel at another time, shape (m,).
+    """
+
+    row: IntArray
+    place: IntArray
+    code: IntArray
+    other: IntArray
+    chance: IntArray
+
+
+def _measured_towards(
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, effects: Sequence[Effect]
+) -> _Found | None:
+    """Return the moves towards neighbours that samples need, those of the one or two best neighbours."""
+    pixels, some = _chosen(maps.usable, len(frames))
+    step = 1.0 / float(np.median(maps.conversion_gain[maps.usable]))
+    laws = _Laws.of(frames, maps, effects, pixels, max(_TOWARDS) + 1)
+    if laws is None:
+        return None
+    best: tuple[float, Place] | None = None
+    for place in _PLACES:
+        samples = _samples(frames, numbers, laws, place, some)
+        if samples.code.size < _MOST_PIXELS:
+            continue
+        moves = _moves_towards(place, step)
+        gain = _mixture(laws, samples, moves, samples.other).gain()
+        if gain > max(_CLEAR, 0.0 if best is None else best[0]):
+            gain -= _OF_CHANCE * _mixture(laws, samples, moves, samples.chance).gain()
+        if gain > max(_CLEAR, 0.0 if best is None else best[0]):
+            best = gain, place
+    if best is None:
+        return None
+    samples, moves = _samples(frames, numbers, laws, best[1], some), _moves_towards(best[1], step)
+    used, shares, gain = _mixture(laws, samples, moves, samples.other).needed()
+    together, share = _together(laws, samples, moves, shares, frames.shape)
+    if together != "sample":
+        shares = shares * share / max(float(shares[used].sum()), _LEAST)
+    return _component(moves, used, shares, gain / samples.code.size, together=together)
+
+
+def _measured_slips(
+    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
+) -> _Found | None:
+    """Return the rows whose samples follow the laws of the pixels beside them."""
+    pixels, some = _chosen(maps.usable, len(frames))
+    laws = _Laws.of(frames, maps, effects, np.flatnonzero(maps.usable.ravel()), 1)
+    if laws is None:
+        return None
+    beside = {place: _of_beside(frames, laws, pixels, place, some) for place in _BESIDE}
+    n_samples = max(ratio.size for ratio, _ in beside.values())
+    best: tuple[float, Together, FloatArray] | None = None
+    for together in _SLIPPING:
+        sums = [_of_groups(*each, together, frames.shape) for each in beside.values()]
+        shares, gain = shares_of(np.stack(sums))
+        if gain > (_CLEAR if best is None else best[0]):
+            best = gain, together, shares
+    if best is None:
+        return None
+    gain, together, shares = best
+    place, share = _BESIDE[int(shares.argmax())], float(shares.max())
+    across = [float(shares[_BESIDE.index(way)]) for way in _ACROSS]
+    exchange: str | None = None
+    if together == "row" and place in _ACROSS and min(across) > _MUTUAL * max(across):
+        place = (0, 1, 0)
+        down = _of_groups(*beside[place], together, frames.shape).reshape(frames.shape[:2])
+        share, exchange = max(
+            (float(shares_of(down[:, parity::2].reshape(1, -1))[0][0]), name)
+            for parity, name in enumerate(("even", "odd"))
+        )
+    return _component(
+        [Move(towards=place)], [1], np.array([1.0 - share, share]), gain / max(n_samples, 1),
+        together=together, exchange=exchange,
+    )  # fmt: skip
+
+
+def _of_beside(
+    frames: NDArray[np.unsignedinteger], laws: _Laws, pixels: IntArray, place: Place, some: IntArray
+) -> tuple[FloatArray, IntArray]:
+    """Return by how much likelier samples are under the law of the pixel beside, nats, and their places."""
+    ny, nx = frames.shape[1:]
+    of = np.full(ny * nx, -1)
+    of[laws.pixels] = np.arange(laws.pixels.size)
+    y, x = pixels // nx + place[1], pixels % nx + place[2]
+    there = np.where((y >= 0) & (y < ny) & (x >= 0) & (x < nx), of[(y * nx + x).clip(0, ny * nx - 1)], -1)
+    t, i = (each.ravel() for each in np.meshgrid(some, np.flatnonzero(there >= 0), indexing="ij"))
+    at = np.stack([t, pixels[i] // nx, pixels[i] % nx])
+    code = frames[tuple(at)].astype(np.int64)
+    own, other = (np.maximum(laws.at(row, code), _RARE) for row in (of[pixels[i]], there[i]))
+    return np.log(other / own), at
+
+
+def _chosen(usable: NDArray[np.bool_], n_frames: int) -> tuple[IntArray, IntArray]:
+    """Return pixels of whole rows that stand for all, and frames that have earlier ones."""
+    rows = np.flatnonzero(usable.any(axis=1))
+    groups = np.array_split(rows, max(-(-rows.size // _ROWS_TOGETHER), 1))
+    most = max(_MOST_PIXELS // (usable.shape[1] * _ROWS_TOGETHER), 1)
+    kept = np.concatenate(groups[:: -(-len(groups) // most)])
+    some = np.zeros(usable.shape, np.bool_)
+    some[kept] = usable[kept]
+    pixels = np.flatnonzero(some.ravel())
+    first = _CHANCE - min(place[0] for place in _PLACES)
+    stride = max(-(-n_frames * pixels.size // _MOST_SAMPLES), 1)
+    return pixels, np.arange(first, n_frames, stride)
+
+
+def _samples(
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, laws: _Laws, place: Place, some: IntArray
+) -> _Samples:
+    """Return the samples of some frames that have a neighbour at a place."""
+    ny, nx = frames.shape[1:]
+    before, down, right = place
+    y, x = laws.pixels // nx, laws.pixels % nx
+    some = some[numbers[some + before] == numbers[some] + before]
+    row = np.flatnonzero((y + down >= 0) & (y + down < ny) & (x + right >= 0) & (x + right < nx))
+    t, i = (each.ravel() for each in np.meshgrid(some, row, indexing="ij"))
+    there = y[i] + down, x[i] + right
+    code, other, chance = (
+        frames[each].astype(np.int64)
+        for each in ((t, y[i], x[i]), (t + before, *there), (t + before - _CHANCE, *there))
+    )
+    return _Samples(i, np.stack([t, y[i], x[i]]), code, other, chance)
+
+
+def _moves_towards(place: Place, step: float) -> list[Move]:
+    """Return the moves that are tried towards a neighbour, ``step`` DN per electron."""
+    near = [max(int(part * step), 1) for part in _WITHIN]
+    return [
+        Move(towards=place),
+        Move(towards=place, part=0.5),
+        *(Move(towards=place, part=0.5, within_dn=within) for within in near),
+        *(Move(towards=place, shift_dn=shift) for shift in _TOWARDS),
+    ]
+
+
+def _mixture(laws: _Laws, samples: _Samples, moves: Sequence[Move], other: IntArray) -> _Mixture:
+    """Return the samples as a mixture of moves towards some neighbours."""
+    mass = [laws.moved(move, samples.row, samples.code, other) for move in moves]
+    return _Mixture(np.ones(samples.code.size), np.stack([laws.at(samples.row, samples.code), *mass]))
+
+
+def _log_ratio(laws: _Laws, samples: _Samples, moves: Sequence[Move], shares: FloatArray) -> FloatArray:
+    """Return by how much likelier samples are if they were moved, nats, shape (m,)."""
+    mass = _mixture(laws, samples, moves, samples.other).mass
+    moved = shares[1:] @ mass[1:] / max(float(shares[1:].sum()), _LEAST)
+    ratio = np.log(np.maximum(moved, _NOTHING) / np.maximum(mass[0], _NOTHING))
+    return np.asarray(ratio.clip(-_SURE, _SURE))
+
+
+def _together(
+    laws: _Laws, samples: _Samples, moves: Sequence[Move], shares: FloatArray, shape: tuple[int, ...]
+) -> tuple[Together, float]:
+    """Return what is moved alike, by the likelihood, and the share of it that is."""
+    ratio = _log_ratio(laws, samples, moves, shares)
+    best = shares_of(ratio[None])[1] + _CLEAR
+    found: tuple[Together, float] = ("sample", 0.0)
+    for together in _TOGETHER:
+        share, likelihood = shares_of(_of_groups(ratio, samples.place, together, shape)[None])
+        if likelihood > best:
+            best, found = likelihood, (together, float(share[0]))
+    return found
+
+
+def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tuple[int, ...]) -> FloatArray:
+    """Return by how much likelier rows, columns or frames are if they were moved, nats; -inf without any."""
+    t, y, x = place
+    group, count = {
+        "row": (t * shape[1] + y, shape[0] * shape[1]),
+        "rest_of_row": (t * shape[1] + y, shape[0] * shape[1]),
+        "column": (t * shape[2] + x, shape[0] * shape[2]),
+        "frame": (t, shape[0]),
+    }[together]
+    known = np.bincount(group, minlength=count) > 0
+    if together == "rest_of_row":
+        table = np.zeros((count, shape[2]))
+        table[group, x] = ratio
+        from_here = np.cumsum(table[:, ::-1], axis=1)
+        sums = special.logsumexp(from_here, axis=1) - np.log(shape[2])
+    else:
+        sums = np.bincount(group, ratio, count)
+    return np.where(known, sums, -np.inf)
+
+
+def shares_of(ratio: FloatArray) -> tuple[FloatArray, float]:
+    """Return the shares of groups that are moved in each of several ways, and what they gain, nats.
+
+    By expectation and maximisation.
+
+    Args:
+        ratio: log likelihood of each group moved, over that of the group as it should be, shape (ways, n).
+    """
+    ratio = ratio[:, np.isfinite(ratio).any(axis=0)]
+    every = np.concatenate([np.zeros((1, ratio.shape[1])), ratio])
+    share = np.full(len(every), _FIRST_SHARE)
+    share[0] -= share.sum() - 1.0
+    for _ in range(_STEPS):
+        log = every + np.log(np.maximum(share, _NOTHING))[:, None]
+        share = special.softmax(log, axis=0).mean(axis=1) if ratio.size else share
+    total = special.logsumexp(every + np.log(np.maximum(share, _NOTHING))[:, None], axis=0)
+    return share[1:], float(total.sum())

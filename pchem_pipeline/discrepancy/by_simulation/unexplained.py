@@ -6,13 +6,15 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.comparison import leaves_nothing
-from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
+from pchem_pipeline.discrepancy.by_simulation.empirical import measured_moves
+from pchem_pipeline.discrepancy.by_simulation.empirical_modes import Sums, common_scores, measured_mode
 from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
     Covariances,
     measured_noise,
@@ -26,6 +28,7 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.effects.analog.empirical_noise import On, Shared
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
@@ -34,6 +37,13 @@ Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Effect | None
 
 _CONVINCING = 6.0  # nats that a form must add
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
+
+
+class _Shared(NamedTuple):
+    """How samples vary together: products of their residuals, and sums of their scores."""
+
+    covariances: Covariances
+    scores: dict[tuple[Shared, On], Sums]
 
 
 @dataclass
@@ -70,9 +80,9 @@ class Unexplained:
         Parts are looked at where what is everywhere leaves something.
         """
         refitter = self.refitter
-        forms: dict[str, Measure] = {"empirical": self._shifts}
+        forms: dict[str, Measure] = {"empirical": self._moves}
         if with_noise:
-            data = self._covariances(self.frames.stack[self.frames.seen], self.plain.maps)
+            data = self._shared(self.frames.stack[self.frames.seen], self.plain.maps)
             forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, {})
         # one that the model has already is not replaced
         forms = {tag: form for tag, form in forms.items() if tag not in {e.tag for e in refitter.present}}
@@ -126,26 +136,33 @@ class Unexplained:
             return None
         return self._described(tuple(h for h in kept if h.tag in proven), part, measure)
 
-    def _shifts(self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]) -> Effect | None:
-        """Measure the shifts of the samples of a part beside effects, with the pixels as they now are."""
+    def _moves(self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]) -> Effect | None:
+        """Measure the moves of the samples of a part beside effects, with the pixels as they now are."""
         maps = self.refit(present).maps
         own = replace(maps, usable=maps.usable & self.frames.inside(part))
-        seen = self.frames.seen[part.frames(self.frames.numbers[self.frames.seen])]
-        return measured_shifts(self.frames.stack[seen], own, beside) if own.usable.any() else None
+        if not own.usable.any():
+            return None
+        numbers = self.frames.numbers[self.frames.seen]
+        some = part.frames(numbers)
+        return measured_moves(self.frames.stack[self.frames.seen[some]], numbers[some], own, beside)
 
     def _noise_of_samples(
         self,
-        data: Callable[[Part], Covariances],
-        known: dict[str, Callable[[Part], Covariances]],
+        data: Callable[[Part], _Shared],
+        known: dict[str, Callable[[Part], _Shared]],
         part: Part,
         _: tuple[Effect, ...],
         beside: tuple[Effect, ...],
     ) -> Effect | None:
-        """Measure the noise that samples of a part share beyond what effects make of them."""
+        """Measure what samples of a part share beyond what effects make of them: gain or light, or noise."""
         key = "|".join(e.model_dump_json() for e in beside)
         if key not in known:
-            known[key] = self._covariances(*self._simulated(beside))
-        return measured_noise(data(part), known[key](part), self.plain, self.frames.inside(part))
+            known[key] = self._shared(*self._simulated(beside))
+        (covariances, scores), model = data(part), known[key](part)
+        inside = self.frames.inside(part)
+        return measured_mode(scores, model.scores, self.plain.maps, inside) or measured_noise(
+            covariances, model.covariances, self.plain, inside
+        )
 
     def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
         """Simulate the frames that are seen under a model, and fit their pixels."""
@@ -155,17 +172,17 @@ class Unexplained:
         self.effort.simulate(frames.size, drawn.usable.size, 1)
         return frames, fitted_maps(frames, ~drawn.usable)
 
-    def _covariances(
-        self, frames: NDArray[np.unsignedinteger], maps: PixelMaps
-    ) -> Callable[[Part], Covariances]:
+    def _shared(self, frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> Callable[[Part], _Shared]:
         """Return what measures how the samples of a part vary together in frames like those that are seen."""
         numbers = self.frames.numbers[self.frames.seen]
 
         @functools.cache
-        def of(part: Part) -> Covariances:
-            some = part.frames(numbers)
-            found = residual_covariances(frames[some], numbers[some], maps, self.frames.inside(part))
-            # the shape of a line beyond the window is not known
-            return found if self.frames.window is None else found._replace(lines={})
+        def of(part: Part) -> _Shared:
+            some, inside = part.frames(numbers), self.frames.inside(part)
+            found = residual_covariances(frames[some], numbers[some], maps, inside)
+            if self.frames.window is not None:
+                # the shape of a line beyond the window is not known
+                found = found._replace(lines={})
+            return _Shared(found, common_scores(frames[some], maps, inside))
 
         return of

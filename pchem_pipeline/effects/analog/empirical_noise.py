@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy import stats
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.estimators.common_modes import add_offset
@@ -32,6 +33,7 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
 Shared = Literal["sample", "row", "column", "frame"]
+On = Literal["offset", "gain", "light"]
 _DIMS: dict[Shared, tuple[Dim, ...]] = {
     "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
 }  # fmt: skip
@@ -53,6 +55,22 @@ class NoiseMode(Section):
     correlation: tuple[float, ...] = Field(
         default=(), max_length=64, description="correlation of the values at each of them, no unit"
     )
+    on: On = Field(default="offset", description="what it moves: the offset, the gain or the light")
+    signal_dn: float = Field(
+        default=1.0, gt=0, description="gain, light: mean signal over the bias at which it has its size, DN"
+    )
+    burst: float | None = Field(
+        default=None,
+        gt=0,
+        lt=1,
+        description="share of the frames, rows, columns or samples that have all of it; null: it is Gaussian",
+    )
+    negative: bool = Field(default=False, description="burst: whether it takes away")
+    shape: tuple[tuple[float, ...], ...] = Field(
+        default=(),
+        max_length=16,
+        description="of a frame: relative size in equal blocks of the sensor, rows of blocks; none: alike",
+    )
     profile: tuple[float, ...] = Field(
         default=(),
         max_length=32,
@@ -71,6 +89,10 @@ class NoiseMode(Section):
             self.of not in ("row", "column") or len(self.profile) < 2 or not any(self.profile)
         ):
             raise ValueError("profile: of a row or column, two points or more, not all 0")
+        if self.shape and (self.of != "frame" or len({len(row) for row in self.shape}) != 1):
+            raise ValueError("shape: of a frame, rows of equally many blocks")
+        if self.burst is not None and self.lags:
+            raise ValueError("burst: each by itself; leave lags out")
         return self
 
     def words(self) -> str:
@@ -82,7 +104,37 @@ class NoiseMode(Section):
         shared = f"correlated by {', '.join(apart)}{more}" if apart else ""
         if self.profile:
             whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
-        return ", ".join(part for part in (whole, shared) if part)
+        if self.shape:
+            whole += f", strongest in {self.strongest()}"
+        on = "" if self.on == "offset" else f"of the {self.on} at {self.signal_dn:.3g} DN"
+        burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
+        return ", ".join(part for part in (on, whole, burst, shared) if part)
+
+    def values(self, number: int, context: EffectContext) -> FloatArray:
+        """Return its values, of mean square 1, in a shape that fits (frame, y, x)."""
+        if self.burst is None:
+            return _field(self, number, context)
+        some = context.random.uniform(_DIMS[self.of], number) < self.burst
+        return np.asarray(some * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst))
+
+    def strongest(self) -> str:
+        """Return in words where a change of a frame has more than half of its largest size."""
+        blocks = np.abs(self.shape)
+        found = []
+        for axis, lines in enumerate(("rows", "columns")):
+            some = np.flatnonzero((blocks > 0.5 * blocks.max()).any(axis=1 - axis))
+            low, high = 100.0 * some[0] / blocks.shape[axis], 100.0 * (some[-1] + 1) / blocks.shape[axis]
+            found.append(f"the {lines} from {low:.0f} to {high:.0f} %")
+        return " and ".join(found)
+
+    def across(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """Return the size at positions from 0 to 1 across the sensor, (y, x); its mean square is 1."""
+        blocks = np.asarray(self.shape)
+        y, x = (
+            np.minimum(position * size, size - 1).astype(np.int64)
+            for position, size in zip((rows, columns), blocks.shape, strict=True)
+        )
+        return np.asarray(blocks[y][:, x] / np.sqrt(np.mean(blocks**2)))
 
     def along(self, position: FloatArray) -> FloatArray:
         """Return the size at positions from 0, the first pixel of a line, to 1; its mean square is 1."""
@@ -128,14 +180,23 @@ class EmpiricalNoise(Effect):
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the noise referred to the input."""
         total: Any = 0.0
+        electrons: Any = 0.0
         for number, mode in enumerate(self.modes):
-            field = self.share_of(mode) * _field(mode, number, context)
+            field = self.share_of(mode) * mode.values(number, context)
             if mode.profile:
                 columns = np.arange(values.shape[2]) / max(context.shape[1] - 1, 1)
                 rows = context.rows[:, None] / max(context.shape[0] - 1, 1)
                 field = field * mode.along(columns if mode.of == "row" else rows)
-            total = total + field
-        return add_offset(values, total, context)
+            if mode.shape:
+                places = context.rows / context.shape[0], np.arange(values.shape[2]) / context.shape[1]
+                field = field * mode.across(*places)
+            if mode.on == "offset":
+                total = total + field
+            elif mode.on == "gain":
+                electrons = electrons + field / mode.signal_dn * np.asarray(context.charge)
+            else:
+                electrons = electrons + _of_light(field / mode.signal_dn, number, context)
+        return add_offset(values + electrons, total, context)
 
     def share_of(self, mode: NoiseMode) -> float:
         """Return the standard deviation of a mode, DN."""
@@ -162,14 +223,24 @@ class EmpiricalNoise(Effect):
         return 2 * max(_average(mode).reach[0] for mode in self.modes)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with its variance: exact, a Gaussian on a Gaussian; with a profile its mean."""
-        return model.with_variance(dn2=self.noise_dn**2)
+        """Return the law with its variance, exact for a Gaussian offset; with a profile its mean.
+
+        That of the light is left out: in a pixel's histogram it is nearly a variance of the electron number.
+        """
+        for mode in self.modes:
+            power = self.share_of(mode) ** 2
+            if mode.on == "offset":
+                model = model.with_variance(dn2=power)
+            elif mode.on == "gain":
+                model = model.with_variance(per_electron2=power / mode.signal_dn**2)
+        return model
 
     def words(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         parts = [f"{self.share_of(mode):.2g} DN {mode.words()}" for mode in self.modes]
-        return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({'; '.join(parts)})"
+        total = f"noise of {self.noise_dn:.2g} DN{place} that samples share"
+        return f"{total} before the converter ({'; '.join(parts)})"
 
 
 class _Average(NamedTuple):
@@ -212,6 +283,16 @@ def _average(mode: NoiseMode) -> _Average:
     return _Average(
         tuple((lag, weight / norm) for lag, weight in kept), (int(reach[0]), int(reach[1]), int(reach[2]))
     )
+
+
+def _of_light(change: FloatArray, number: int, context: EffectContext) -> FloatArray:
+    """Return the electrons that a relative change of the light brings or takes, (frame, y, x), e-."""
+    more = context.random.poisson(np.maximum(change, 0.0) * context.exposure, number)
+    if change.min() >= 0.0:
+        return more.astype(np.float64)
+    drawn = context.random.uniform(("frame", "y", "x"), len(_DIMS) + number)
+    lost = stats.binom.ppf(drawn, context.charge, np.clip(-change, 0.0, 1.0))
+    return np.asarray(more - np.nan_to_num(lost), np.float64)
 
 
 def _field(mode: NoiseMode, number: int, context: EffectContext) -> FloatArray:

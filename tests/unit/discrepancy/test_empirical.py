@@ -1,8 +1,9 @@
-"""The empirical component: shifts of the samples are measured, simulated and fitted, and never compete."""
+"""The empirical component: moves of the samples are measured, simulated and fitted, and never compete."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,66 +11,153 @@ from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.empirical import measured_shifts
+from pchem_pipeline.discrepancy.by_simulation.empirical import measured_moves
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.adc.empirical import Empirical
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.readout.empirical import Empirical, Move, neighbour_words
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
 
-SHAPE, FRAMES, STEP = (10, 12), 3000, 12.0
+SHAPE, FRAMES, STEP = (10, 12), 1500, 12.0
 
 
-def frames(seed: int, share: float = 0.0, shift: int = 0) -> tuple[np.ndarray, PixelMaps]:
-    """Return frames of a plain sensor, some samples moved, and its true parameters."""
+def sensor(seed: int) -> tuple[np.ndarray, np.random.Generator, PixelMaps]:
+    """Return the samples of a plain sensor before rounding, DN, random numbers, and its true parameters."""
     rng = np.random.default_rng(seed)
-    exposure, bias = rng.uniform(0.6, 2.0, SHAPE), rng.uniform(95.0, 105.0, SHAPE)
+    exposure, bias = rng.uniform(0.6, 2.0, SHAPE), rng.uniform(90.0, 110.0, SHAPE)
     noise = rng.uniform(0.22, 0.28, SHAPE) * STEP
-    signal = (
-        bias + STEP * rng.poisson(exposure, (FRAMES, *SHAPE)) + noise * rng.standard_normal((FRAMES, *SHAPE))
-    )
-    code = np.floor(signal + 0.5).astype(np.int64)
-    code += shift * (rng.random(code.shape) < share)
+    size = (FRAMES, *SHAPE)
+    dn = bias + STEP * rng.poisson(exposure, size) + noise * rng.standard_normal(size)
     maps = PixelMaps(
         exposure, np.full(SHAPE, 1 / STEP), bias, np.sqrt(noise**2 + 1 / 12), np.ones(SHAPE, bool)
     )
-    return code.astype(np.uint16), maps
+    return dn, rng, maps
+
+
+def codes(dn: np.ndarray) -> np.ndarray:
+    """Return samples rounded."""
+    return np.floor(dn + 0.5).astype(np.int64)
+
+
+def plain(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Move nothing."""
+    return codes(dn)
+
+
+def shifted(share: float, shift: int):
+    """Move samples by a number of DN."""
+    return lambda dn, rng: codes(dn) + shift * (rng.random(dn.shape) < share)
+
+
+def averaged(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Average samples with those delivered before where these are alike."""
+    code = codes(dn)
+    for t in range(1, FRAMES):
+        alike = abs(code[t] - code[t - 1]) <= STEP / 2
+        some = alike & (rng.random(SHAPE) < 0.1)
+        code[t] = np.where(some, (code[t] + code[t - 1]) // 2, code[t])
+    return code
+
+
+def drawn(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw samples towards the one delivered before."""
+    code = codes(dn)
+    for t in range(1, FRAMES):
+        code[t] = codes(dn[t] + 2.0 * np.sign(code[t - 1] - dn[t]))
+    return code
+
+
+def late(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Deliver rows one column late."""
+    code = codes(dn)
+    return np.where(rng.random((FRAMES, SHAPE[0], 1)) < 0.1, np.roll(code, 1, axis=2), code)
+
+
+def slipped(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Lose a sample of rows, so that later ones come early."""
+    code = codes(dn)
+    found = code.copy()
+    begin = np.where(rng.random((FRAMES, SHAPE[0])) < 0.1, rng.integers(0, SHAPE[1], code.shape[:2]), 99)
+    early = np.arange(SHAPE[1] - 1) >= begin[..., None]
+    found[:, :, :-1] = np.where(early, code[:, :, 1:], code[:, :, :-1])
+    return found
+
+
+def swapped(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Exchange even rows with the next ones."""
+    code = codes(dn)
+    pairs = code.reshape(FRAMES, SHAPE[0] // 2, 2, SHAPE[1])
+    some = rng.random((FRAMES, SHAPE[0] // 2, 1, 1)) < 0.1
+    return np.where(some, pairs[:, :, ::-1], pairs).reshape(code.shape)
+
+
+def frames(seed: int, move: Any = plain) -> tuple[np.ndarray, np.ndarray, PixelMaps]:
+    """Return frames of a sensor, some samples moved, their numbers, and the true parameters."""
+    dn, rng, maps = sensor(seed)
+    return move(dn, rng).astype(np.uint16), np.arange(FRAMES), maps
 
 
 @pytest.mark.parametrize(("share", "shift"), [(0.004, -8), (0.02, 4)])
 def test_shifts_are_measured(share: float, shift: int) -> None:
-    found = measured_shifts(*frames(3, share, shift), ())
+    found = measured_moves(*frames(3, shifted(share, shift)), ())
     assert found is not None
     samples = FRAMES * SHAPE[0] * SHAPE[1]
-    mean = float(found.shares() @ np.array(found.shift_dn))
+    mean = float(found.shares() @ np.array([move.shift_dn for move in found.moves]))
     # neighbouring shifts of the grid stand for one another: their mean is what is known well
     assert mean == pytest.approx(share * shift, rel=0.1)
     assert found.share == pytest.approx(share, rel=0.35)
     assert found.share * samples > 100
 
 
+@pytest.mark.parametrize(
+    ("move", "share", "wanted", "together"),
+    [
+        (averaged, 0.1, Move(towards=(-1, 0, 0), part=0.5, within_dn=6), "sample"),
+        (drawn, 1.0, Move(towards=(-1, 0, 0), shift_dn=2), "sample"),
+        (late, 0.1, Move(towards=(0, 0, -1)), "row"),
+        (slipped, 0.1, Move(towards=(0, 0, 1)), "rest_of_row"),
+        (swapped, 0.1, Move(towards=(0, 1, 0)), "row"),
+    ],
+)
+def test_what_depends_on_a_neighbour_is_measured(
+    move: Any, share: float, wanted: Move, together: str
+) -> None:
+    found = measured_moves(*frames(5, move), ())
+    assert found is not None
+    main = max(found.moves, key=lambda one: one.weight)
+    assert main.model_copy(update={"weight": 1.0}) == wanted
+    assert found.together == together
+    assert found.exchange == ("even" if move is swapped else None)
+    # the first column of a late row has no sample beside it; a few samples are taken for other moves
+    assert found.share == pytest.approx(share, rel=0.15)
+    assert neighbour_words(wanted.towards) in found.words() or found.exchange
+
+
 def test_nothing_is_measured_where_there_is_nothing() -> None:
-    found = [measured_shifts(*frames(seed), ()) for seed in range(4)]
+    found = [measured_moves(*frames(seed), ()) for seed in range(4)]
     assert [one for one in found if one is not None and one.share > 1e-3] == []
 
 
-def test_what_is_simulated_follows_the_law_that_is_fitted() -> None:
-    effect = Empirical(share=0.2, shift_dn=(-9.0, 5.0), weight=(3.0, 1.0))
+def simulated(effect: Empirical, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return simulated frames with and without an effect."""
+    values = (1.0, 1 / STEP, 100.0, 0.25)
+    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    how = SimulateSettings(shape=SHAPE, n_frames=n_frames, seed=4, bit_depth=12)
+    with_it = how.model_copy(update={"effects": (effect,)})
+    return tuple(simulate_block(truth, each, (0, n_frames))[0].astype(int) for each in (with_it, how))
+
+
+def test_samples_are_moved_by_their_shares() -> None:
+    effect = Empirical(share=0.2, moves=(Move(shift_dn=-9, weight=3.0), Move(shift_dn=5, weight=1.0)))
     np.testing.assert_allclose(effect.shares(), [0.15, 0.05])
-
-    class Random:
-        def uniform(self, dims: tuple[str, ...], draw: int = 0) -> np.ndarray:
-            assert dims == ("frame", "y", "x")
-            return np.random.default_rng(5).random((200_000, 1, 1))
-
-    class Context:
-        random = Random()
-
-    moved = effect.apply(np.zeros((200_000, 1, 1)), Context())  # type: ignore[arg-type]
-    for shift, share in ((-9.0, 0.15), (5.0, 0.05), (0.0, 0.8)):
-        error = np.sqrt(share * (1 - share) / moved.size)
-        assert abs((moved == shift).mean() - share) < 5 * error
+    found, own = simulated(effect, 1000)
+    for shift, share in ((-9, 0.15), (5, 0.05), (0, 0.8)):
+        error = np.sqrt(share * (1 - share) / own.size)
+        assert abs((found - own == shift).mean() - share) < 5 * error
     maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
     codes = np.arange(40, 260)
     law = sample_mass(effect.sample_law(SampleLaw(), maps), (1.2, 1 / STEP, 100.0, 3.0), codes)[0]
@@ -78,14 +166,61 @@ def test_what_is_simulated_follows_the_law_that_is_fitted() -> None:
     np.testing.assert_allclose(law[20:-20], wanted[20:-20], atol=1e-9)
 
 
+def test_samples_are_moved_towards_what_was_delivered_before() -> None:
+    found, own = simulated(Empirical(share=0.2, moves=(Move(towards=(-1, 0, 0), part=0.5),)), 400)
+    towards = own[1:] + (found[:-1] - own[1:]) // 2
+    moved = (found[1:] != own[1:]) & (towards != own[1:])
+    # four moves after another are followed, a fifth one is not
+    wrong = (found[1:] != towards)[moved].mean()
+    assert wrong < 2 * 0.2**4
+    assert abs(moved.sum() / (towards != own[1:]).sum() - 0.2) < 0.01
+
+
+@pytest.mark.parametrize("together", ["row", "rest_of_row", "frame", "column"])
+def test_what_is_moved_together_comes_from_one_side(together: Any) -> None:
+    move = Move(towards=(0, 0, 1))
+    found, own = simulated(Empirical(share=0.3, moves=(move,), together=together), 400)
+    moved, kept = found[:, :, :-1] == own[:, :, 1:], found[:, :, :-1] == own[:, :, :-1]
+    assert np.all(moved | kept)
+    axes = {"row": 2, "frame": (1, 2), "column": 1}
+    if together in axes:
+        whole = moved.all(axis=axes[together])
+        assert np.all(whole | kept.all(axis=axes[together]))
+        assert abs(whole.mean() - 0.3) < 5 * np.sqrt(0.21 / whole.size) + 0.01
+    else:
+        # once moved, it is so to the end
+        assert np.all(np.logical_or.accumulate(~kept, axis=2) <= moved)
+
+
+def test_rows_change_places() -> None:
+    move = Move(towards=(0, 1, 0))
+    found, own = simulated(Empirical(share=0.1, moves=(move,), together="row", exchange="odd"), 600)
+    down = (found[:, :-1] == own[:, 1:]).all(axis=2) & (found[:, 1:] == own[:, :-1]).all(axis=2)
+    assert not down[:, ::2].any()
+    assert abs(down[:, 1::2].mean() - 0.1) < 5 * np.sqrt(0.09 / down[:, 1::2].size)
+    np.testing.assert_array_equal(np.sort(found, axis=1).sum(axis=1), np.sort(own, axis=1).sum(axis=1))
+
+
+def test_the_same_frames_at_every_division() -> None:
+    moves = (Move(towards=(-1, 0, 0), part=0.5), Move(towards=(0, 1, 0)))
+    effect = Empirical(share=0.4, moves=moves)
+    values = (1.0, 1 / STEP, 100.0, 0.25)
+    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    how = SimulateSettings(shape=SHAPE, n_frames=30, seed=4, bit_depth=12, effects=(effect,))
+    whole = simulate_block(truth, how, (0, 30))[0]
+    np.testing.assert_array_equal(simulate_block(truth, how, (9, 22), (3, 6))[0], whole[9:22, 3:6])
+
+
 def test_it_competes_with_nothing_and_refuses_half_a_table() -> None:
     assert "empirical" not in candidate_classes(DiscrepancySettings())
-    with pytest.raises(ValidationError, match="one weight"):
-        Empirical(share=0.1, shift_dn=(1.0, 2.0), weight=(1.0,))
+    with pytest.raises(ValidationError, match="earlier"):
+        Move(towards=(1, 0, 0))
+    with pytest.raises(ValidationError, match="weight above 0"):
+        Empirical(share=0.1, moves=(Move(shift_dn=1, weight=0.0),))
 
 
 def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() -> None:
-    effect = Empirical(share=0.004, shift_dn=(-8.0,), weight=(1.0,))
+    effect = Empirical(share=0.004, moves=(Move(shift_dn=-8),))
     before, after = Gap(2e-3, 5e-5, (0.0, 0.0), {}), Gap(3e-5, 5e-5, (0.0, 0.0), {})
     addition = Addition(effect, True, "", (), 1e-4, before, after, (), None, (), described=True)
     found = Findings(

@@ -1,0 +1,213 @@
+"""The empirical component: gain or light that the samples of a frame, row or column share.
+
+To first order a common change of the offset, the gain or the light moves the sum of the samples' scores for
+it, by the information that they have of it. Where there is none such a sum is Gaussian, of a variance that
+is the information; the excess of its variance is the power of the change, and of several changes that are
+correlated in the samples the one that is there has the clearest excess (Rao 1948: the score test).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.empirical import shares_of
+from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, On, Shared
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_ON: tuple[On, ...] = ("offset", "gain", "light")
+_OF: tuple[Shared, ...] = ("frame", "row", "column")
+_CLEAR = 15.0  # nats
+# times what a Gaussian explains that bursts must, and nats: the scores are skewed themselves
+_OF_GAUSSIAN, _BURST = 1.3, 10.0
+_FARTHEST = 3  # frames
+_MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
+_UNEVEN = 5.0  # standard errors of its power by which a shape must be clearer than the same everywhere
+_OF_ERROR = 2.0  # standard errors: blocks of less have none
+_CERTAIN = 4.0  # standard errors of a correlation
+_SIZES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0)  # relative changes in bursts
+_MOST_IN_BURSTS = 0.3
+
+
+class Sums(NamedTuple):
+    """Sums of scores of frames, rows or columns for one kind of change.
+
+    Attributes:
+        sums: (frame, line).
+        information: of each line, (line,).
+        blocks: of frames, the same by blocks of the sensor, (frame, y', x') and (y', x'); None: of lines.
+    """
+
+    sums: FloatArray
+    information: FloatArray
+    blocks: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Their mean square in that by chance."""
+        known = self.information > 0.0
+        return float(np.mean(self.sums[:, known] ** 2 / self.information[known])) if known.any() else 1.0
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return len(self.sums) * int(np.count_nonzero(self.information))
+
+
+def common_scores(
+    frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolArray
+) -> dict[tuple[Shared, On], Sums]:
+    """Sum the scores of the samples over frames, rows and columns, for each kind of change.
+
+    Args:
+        frames: (frame, y, x), DN.
+        maps: parameters of the pixels.
+        inside: pixels that are looked at, shape (y, x).
+    """
+    inside = inside & maps.usable
+    found: dict[tuple[Shared, On], Sums] = {}
+    pixels = np.flatnonzero(inside.ravel())
+    if not pixels.size:
+        return found
+    own = frames.reshape(len(frames), -1)[:, pixels].astype(np.int64)
+    first = own.min(axis=0)
+    tables = _score_tables(maps, pixels, first, int((own - first).max()) + 1)
+    place = np.arange(pixels.size), own - first
+    for number, on in enumerate(_ON):
+        u = np.zeros((len(frames), *inside.shape))
+        values = tables[number][place]
+        u[:, inside] = values - values.mean(axis=0)
+        power = np.zeros(inside.shape)
+        power[inside] = values.var(axis=0)
+        blocks = _in_blocks(u), _in_blocks(power[None])[0]
+        found["frame", on] = Sums(u.sum(axis=(1, 2))[:, None], power.sum(keepdims=True)[0], blocks)
+        rows, columns = u.sum(axis=2), u.sum(axis=1)
+        found["row", on] = Sums(rows, power.sum(axis=1))
+        found["column", on] = Sums(columns, power.sum(axis=0))
+    return found
+
+
+def _in_blocks(values: FloatArray) -> FloatArray:
+    """Return sums over equal blocks of the sensor, (frame, y', x')."""
+    for axis in (1, 2):
+        size = values.shape[axis]
+        number = min(_MOST_BLOCKS, max(size // _SMALLEST_BLOCK, 1))
+        # as blocks are found from a position: floor(i n / size)
+        starts = -(-np.arange(number) * size // number)
+        values = np.add.reduceat(values, starts, axis=axis)
+    return values
+
+
+def _score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
+    """Return the scores of codes for an offset (1/DN), a relative gain and a relative light, (3, n, c)."""
+    exposure, gain, bias, sigma = (values.ravel()[pixels][:, None] for values in maps.maps)
+    most = int(np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0))
+    signal = first[:, None] + np.arange(length) - bias
+    total, sums = np.zeros(signal.shape), np.zeros((3, *signal.shape))
+    chance = np.exp(-exposure)
+    for k in range(most + 1):
+        chance = chance * exposure / k if k else chance
+        rest = (signal - k / gain) / sigma**2
+        weight = chance * np.exp(-0.5 * np.minimum((signal - k / gain) ** 2 / sigma**2, 200.0))
+        total += weight
+        for one, score in zip(sums, (rest, rest * k / gain, k - exposure), strict=True):
+            one += weight * score
+    return np.asarray(sums / np.maximum(total, np.finfo(np.float64).tiny))
+
+
+def measured_mode(
+    data: dict[tuple[Shared, On], Sums],
+    model: dict[tuple[Shared, On], Sums],
+    maps: PixelMaps,
+    inside: BoolArray,
+) -> EmpiricalNoise | None:
+    """Return the common change of gain or light beyond what a model makes; None where an offset is clearer.
+
+    Args:
+        data: sums of the frames.
+        model: of frames simulated with it.
+        maps: parameters of the pixels.
+        inside: pixels that were looked at, shape (y, x).
+    """
+    best: tuple[Shared, On, Sums, tuple[tuple[float, ...], ...], float] | None = None
+    gain = _CLEAR
+    for (of, on), sums in data.items():
+        one, blocks = _shaped(sums)
+        expected = max(model[of, on].ratio, 1.0)
+        ratio = max(one.ratio / expected, 1.0)
+        here = 0.5 * one.number * (ratio - 1.0 - np.log(ratio))
+        if here > gain:
+            best, gain = (of, on, one, blocks, one.ratio - expected), here
+    if best is None or best[1] == "offset":
+        return None
+    of, on, one, blocks, excess = best
+    power = excess / float(np.mean(one.information[one.information > 0.0]))
+    inside = inside & maps.usable
+    signal = float(np.median((maps.quanta_exposure / maps.conversion_gain)[inside]))
+    burst, size = _bursts(one, gain)
+    lags, correlation = ((), ()) if burst else _correlation(one, power)
+    mode = NoiseMode(
+        of=of, share=1.0, on=on, signal_dn=round(signal, 3), lags=lags, correlation=correlation,
+        burst=burst, negative=size < 0.0, shape=blocks,
+    )  # fmt: skip
+    rms = abs(size) * np.sqrt(burst) if burst else np.sqrt(power)
+    return EmpiricalNoise(noise_dn=float(rms * signal), modes=(mode,))
+
+
+def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
+    """Return sums of frames weighted by the shape of the change over the sensor, and that; none where even.
+
+    The shape is the largest principal component of the blocks' sums, each in its noise (Karhunen 1947, Loeve
+    1948), where its power lies beyond what blocks without a change reach (Marchenko and Pastur 1967).
+    """
+    if one.blocks is None or one.blocks[1].size < 2:
+        return one, ()
+    sums, information = (each.reshape(*each.shape[:-2], -1) for each in one.blocks)
+    scale = np.sqrt(np.maximum(information, np.finfo(np.float64).tiny))
+    in_noise = np.where(information > 0.0, sums / scale, 0.0)
+    n = len(in_noise)
+    powers, shapes = np.linalg.eigh(in_noise.T @ in_noise / n)
+    power, shape = float(powers[-1]), shapes[:, -1]
+    chance = (1.0 + np.sqrt(shape.size / n)) ** 2 - 1.0
+    if power - max(one.ratio, 1.0) < chance + _UNEVEN * power * np.sqrt(2.0 / n):
+        return one, ()
+    error = np.sqrt(power / n) / (power - 1.0)
+    shape = np.where((abs(shape) > _OF_ERROR * error) & (information > 0.0), shape / scale, 0.0)
+    # as strong in the mean as a change that is the same everywhere, and mostly positive
+    shape *= np.sign(shape.sum()) / np.sqrt(float(information @ shape**2) / information.sum())
+    blocks = tuple(tuple(np.round(row, 3).tolist()) for row in shape.reshape(one.blocks[1].shape))
+    return Sums((sums @ shape)[:, None], np.array([information @ shape**2])), blocks
+
+
+def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float, ...]]:
+    """Return the correlations of a change over frames that are clear."""
+    scaled = one.sums / np.maximum(one.information, np.finfo(np.float64).tiny)
+    lags: list[Lag] = []
+    found: list[float] = []
+    for step in range(1, _FARTHEST + 1):
+        products = (scaled[step:] * scaled[:-step])[:, one.information > 0.0]
+        value, error = float(products.mean()), float(products.std() / np.sqrt(products.size))
+        if abs(value) > _CERTAIN * error:
+            lags.append((step, 0, 0))
+            found.append(round(float(np.clip(value / power, -0.99, 0.99)), 4))
+    return tuple(lags), tuple(found)
+
+
+def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
+    """Return the share of lines that have a change, and its relative size; None where all have some."""
+    known = one.information > 0.0
+    sums = one.sums[:, known].ravel()
+    information = np.broadcast_to(one.information[known], one.sums[:, known].shape).ravel()
+    best = _OF_GAUSSIAN * gaussian + _BURST
+    found: tuple[float | None, float] = (None, 0.0)
+    for size in (sign * size for sign in (1.0, -1.0) for size in _SIZES):
+        shares, gain = shares_of((size * sums - 0.5 * size**2 * information)[None])
+        if gain > best and shares[0] < _MOST_IN_BURSTS:
+            best, found = gain, (float(shares[0]), size)
+    return found

@@ -1,0 +1,235 @@
+"""What is measured and not understood: samples that come out moved, by themselves or towards a neighbour.
+
+Where no known effect explains the samples, their law can still be told: the law of a sample, given one that
+was read beside or before it, is that of the model, mixed with moves. A move by a fixed number of DN is the
+mixing law of a deconvolution, which maximum likelihood makes a few atoms of (Laird 1978; Lindsay 1983); one
+towards a neighbour is an atom of the mixture transition distribution of Raftery (1985). Nothing is said
+about why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import Dim, EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import SampleLaw
+
+#: What is moved together.
+Together = Literal["sample", "row", "rest_of_row", "column", "frame"]
+_DIMS: dict[Together, tuple[Dim, ...]] = {
+    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "rest_of_row": ("frame", "y"),
+    "column": ("frame", "x"), "frame": ("frame",),
+}  # fmt: skip
+_DEPTH = 4  # frames through which a move towards an earlier frame is followed
+_MOST_TOLD = 4
+
+
+class Move(Section):
+    """A change of a sample: by a number of DN, or towards a neighbour.
+
+    Towards a neighbour: by ``shift_dn`` where that is given, else by ``part`` of the difference, rounded down
+    to whole DN. The neighbour in an earlier frame is the sample that was delivered; those in the
+    same frame are as they were before any move.
+    """
+
+    weight: float = Field(default=1.0, ge=0, description="relative frequency of this move, no unit")
+    shift_dn: int = Field(default=0, description="by how much, DN")
+    towards: tuple[int, int, int] | None = Field(
+        default=None, description="place of the neighbour: frames, rows, columns from the sample"
+    )
+    part: float = Field(default=1.0, ge=0, le=1, description="part of the difference to it, no unit")
+    within_dn: int | None = Field(
+        default=None, ge=0, description="only samples that differ from it by no more, DN; null: all"
+    )
+
+    @model_validator(mode="after")
+    def _of_the_past(self) -> Self:
+        if self.towards is not None and (self.towards[0] > 0 or not any(self.towards)):
+            raise ValueError("towards: another sample, of this frame or an earlier one")
+        if self.towards is not None and self.shift_dn < 0:
+            raise ValueError("shift_dn: towards a neighbour it is not negative")
+        return self
+
+    def of(self, own: NDArray[np.int64], other: NDArray[np.int64] | None) -> NDArray[np.int64]:
+        """Return samples moved, DN; ``other`` are their neighbours."""
+        if other is None:
+            return own + self.shift_dn
+        difference = other - own
+        if self.shift_dn:
+            step = self.shift_dn * np.sign(difference)
+        else:
+            step = np.floor(self.part * difference).astype(np.int64)
+        if self.within_dn is not None:
+            step = np.where(abs(difference) <= self.within_dn, step, 0)
+        return np.asarray(own + step)
+
+    def words(self) -> str:
+        """Return it in words."""
+        if self.towards is None:
+            return f"by {self.shift_dn:+d} DN"
+        near = "" if self.within_dn is None else f" where they differ by at most {self.within_dn} DN"
+        if self.shift_dn:
+            return f"by {self.shift_dn} DN towards {neighbour_words(self.towards)}{near}"
+        if self.part == 1.0:
+            return f"to the value of {neighbour_words(self.towards)}{near}"
+        return f"by {self.part:.2g} of the difference towards {neighbour_words(self.towards)}{near}"
+
+
+def neighbour_words(place: tuple[int, int, int]) -> str:
+    """Return the place of a neighbour in words, for example ``the sample one column to the left``."""
+    frames, rows, columns = place
+    parts = []
+    for number, noun, (before, after) in (
+        (frames, "frame", ("earlier", "later")),
+        (rows, "row", ("above", "below")),
+        (columns, "column", ("to the left", "to the right")),
+    ):
+        if number:
+            count = "one" if abs(number) == 1 else str(abs(number))
+            parts.append(f"{count} {noun}{'s' if abs(number) > 1 else ''} {before if number < 0 else after}")
+    return f"the sample {' and '.join(parts)}"
+
+
+@register_effect
+class Empirical(Effect):
+    """A share of the samples is moved, by so many DN or towards a neighbour.
+
+    Signature: none of its own; it is measured where the data disagree with all that is known, and describes
+    the samples without a name for what makes them so.
+    """
+
+    tag: Literal["empirical"] = Field(default="empirical", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.READOUT
+    title: ClassVar[str] = "Measured moves of samples, without an explanation"
+    source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
+    strength: ClassVar[str] = "share"
+    measured_only: ClassVar[bool] = True
+    share: float = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
+    moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
+    together: Together = Field(
+        default="sample", description="what is moved alike: each sample by itself, a row, the rest of a row "
+        "from a random place on, a column or a frame"
+    )  # fmt: skip
+    exchange: Literal["even", "odd"] | None = Field(
+        default=None, description="rows of this parity change places with the row below; null: none does"
+    )
+
+    @model_validator(mode="after")
+    def _has_moves(self) -> Self:
+        if not sum(move.weight for move in self.moves) > 0:
+            raise ValueError("empirical: give at least one of moves a weight above 0")
+        if self.exchange and (self.together != "row" or [m.towards for m in self.moves] != [(0, 1, 0)]):
+            raise ValueError("empirical: a row exchanges its samples with the one below: (0, 1, 0)")
+        return self
+
+    def shares(self) -> NDArray[np.float64]:
+        """Return the share of the samples that each move has."""
+        weight = np.array([move.weight for move in self.moves])
+        return np.asarray(self.share * weight / weight.sum())
+
+    def halo(self) -> int:
+        """Return how far the neighbours lie across rows, px."""
+        reach = max(abs(move.towards[1]) if move.towards else 0 for move in self.moves)
+        return reach * (_DEPTH if self.history() else 1)
+
+    def history(self) -> int:
+        """Return how many frames before it matter: those of the neighbours, and of theirs."""
+        return _DEPTH * max(-move.towards[0] if move.towards else 0 for move in self.moves)
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the digital numbers (frame, y, x), DN, with some samples moved."""
+        drawn = context.random.uniform(_DIMS[self.together])
+        which = np.searchsorted(np.cumsum(self.shares()), drawn.ravel(), side="right").reshape(drawn.shape)
+        if self.together == "rest_of_row":
+            begin = np.floor(context.random.uniform(("frame", "y"), 1) * values.shape[2])
+            which = np.where(np.arange(values.shape[2]) >= begin, which, len(self.moves))
+        own = values.astype(np.int64)
+        if self.exchange:
+            parity = (context.rows % 2 == (self.exchange == "odd"))[:, None]
+            return _exchanged(values, (which == 0) & parity)
+        found = own
+        # each pass follows the moves of earlier frames one frame further back
+        for _ in range(_DEPTH if self.history() else 1):
+            before, found = found, own
+            for number, move in enumerate(self.moves):
+                here: NDArray[np.bool_] = which == number
+                if not here.any():
+                    continue
+                other = None
+                if move.towards is not None:
+                    other, known = _neighbours(before if move.towards[0] else own, move.towards)
+                    here = here & known
+                found = np.where(here, move.of(own, other), found)
+        return found.clip(0, 2**context.bit_depth - 1).astype(values.dtype)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return a hundredth of the samples 8 DN too low."""
+        return (cls(share=0.01, moves=(Move(shift_dn=-8),)),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return none: it is measured where all else has failed, and competes with nothing."""
+        return ()
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law with satellites at the shifts: exact; what neighbours add to it is left out."""
+        own = [
+            (share, m.shift_dn) for share, m in zip(self.shares(), self.moves, strict=True) if not m.towards
+        ]
+        if not own:
+            return model
+        shares, shifts = np.array(own, np.float64).T
+        weights = np.append(shares, max(1.0 - float(shares.sum()), 0.0))
+        return model.with_noise(weights, shift_dn=np.append(shifts, 0.0))
+
+    def words(self) -> str:
+        """Return what is known of it."""
+        place = f" in {place_words(self)}" if place_words(self) else ""
+        what = {
+            "sample": "samples", "row": "rows", "rest_of_row": "rows, from a random place on,",
+            "column": "columns", "frame": "frames",
+        }[self.together]  # fmt: skip
+        if self.exchange:
+            return (
+                f"a share of {self.share:.2g} of the {self.exchange} rows{place} changes places with the next"
+            )
+        shares = self.shares()
+        told = [f"{shares[i]:.2g} {self.moves[i].words()}" for i in np.argsort(-shares)[:_MOST_TOLD]]
+        free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside it"
+        how = f"comes out moved after the converter ({', '.join(told)}){free}"
+        return f"a share of {self.share:.2g} of the {what}{place} {how}"
+
+
+def _neighbours(
+    values: NDArray[np.int64], place: tuple[int, int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the samples at a place beside those of frames (frame, y, x), and where there are any."""
+    to, source = [], []
+    for shift, size in zip(place, values.shape, strict=True):
+        to.append(slice(max(-shift, 0), max(size - max(shift, 0), 0)))
+        source.append(slice(max(shift, 0), max(size + min(shift, 0), 0)))
+    found, known = values.copy(), np.zeros(values.shape, np.bool_)
+    found[tuple(to)], known[tuple(to)] = values[tuple(source)], True
+    return found, known
+
+
+def _exchanged(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return frames whose chosen rows, (frame, y, 1), no two successive ones, are exchanged with the next."""
+    first = chosen[:, :-1]
+    result: NDArray[Any] = values.copy()
+    result[:, :-1] = np.where(first, values[:, 1:], result[:, :-1])
+    result[:, 1:] = np.where(first, values[:, :-1], result[:, 1:])
+    return result

@@ -1,0 +1,132 @@
+"""Gain or light that samples share: measured by the sums of their scores, and simulated as it is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.discrepancy.by_simulation.empirical_modes import Sums, common_scores, measured_mode
+from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+
+SHAPE, FRAMES, STEP = (16, 20), 1500, 14.0
+SIGNAL = 1.5 * STEP
+EVERYWHERE = np.ones(SHAPE, bool)
+
+
+def frames(seed: int, gain: Any = 1.0, light: Any = 1.0, offset: Any = 0.0) -> tuple[np.ndarray, PixelMaps]:
+    """Return frames of a sensor of 1.5 e- whose gain, light or offset moves, and its parameters."""
+    rng = np.random.default_rng(seed)
+    exposure = np.broadcast_to(1.5 * np.asarray(light), (FRAMES, *SHAPE))
+    noise = 0.25 * STEP
+    dn = 100.0 + STEP * gain * rng.poisson(exposure) + offset + noise * rng.standard_normal(exposure.shape)
+    maps = (np.full(SHAPE, v) for v in (1.5, 1 / STEP, 100.0, np.sqrt(noise**2 + 1 / 12)))
+    return np.floor(dn + 0.5).astype(np.uint16), PixelMaps(*maps, EVERYWHERE)
+
+
+def measured(stack: tuple[np.ndarray, PixelMaps], inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
+    """Return what is measured beside a model without common changes."""
+    data = common_scores(*stack, inside)
+    nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
+    return measured_mode(data, nothing, stack[1], inside)
+
+
+def drawn(*shape: int) -> np.ndarray:
+    """Return random numbers of mean 0 and variance 1."""
+    return np.random.default_rng(9).standard_normal(shape)
+
+
+@pytest.mark.parametrize(
+    ("of", "shape"),
+    [("frame", (FRAMES, 1, 1)), ("row", (FRAMES, SHAPE[0], 1)), ("column", (FRAMES, 1, SHAPE[1]))],
+)
+def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, ...]) -> None:
+    found = measured(frames(1, gain=1.0 + 0.02 * drawn(*shape)))
+    assert found is not None
+    (mode,) = found.modes
+    assert (mode.of, mode.on, mode.burst, mode.shape) == (of, "gain", None, ())
+    # its own variance is known to sqrt(2 / n); the scores see a little less where the peaks overlap
+    error = 0.02 * SIGNAL * np.sqrt(0.5 / np.prod(shape))
+    assert abs(found.noise_dn - 0.02 * SIGNAL) < 5 * error + 0.15 * 0.02 * SIGNAL
+    assert f"of the gain at 21 DN, the same in a whole {of}" in found.words()
+
+
+def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
+    corner = np.zeros(SHAPE)
+    corner[:4, :5] = 1.0
+    burst = np.random.default_rng(3).random((FRAMES, 1, 1)) < 0.05
+    found = measured(frames(2, light=1.0 + 1.5 * burst * corner))
+    assert found is not None
+    (mode,) = found.modes
+    assert (mode.of, mode.on) == ("frame", "light")
+    assert mode.burst == pytest.approx(burst.mean(), rel=0.3)
+    assert not mode.negative
+    blocks = np.array(mode.shape)
+    assert blocks.shape == (4, 5)
+    assert blocks[0, 0] > 5 * abs(blocks).ravel()[2:].max()
+    assert "strongest in the rows from 0 to 25 %" in found.words()
+
+
+def test_a_change_that_has_a_memory_is_told_with_it() -> None:
+    white = drawn(FRAMES + 1, 1, 1)
+    found = measured(frames(4, gain=1.0 + 0.03 * (white[1:] + 0.7 * white[:-1])))
+    assert found is not None
+    assert found.modes[0].lags == ((1, 0, 0),)
+    # 0.7 / (1 + 0.7^2) = 0.47, within five errors of 1 / sqrt(1500)
+    assert found.modes[0].correlation[0] == pytest.approx(0.47, abs=0.13)
+
+
+def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:
+    assert [measured(frames(seed)) for seed in range(10, 14)] == [None] * 4
+    assert measured(frames(5, offset=0.5 * drawn(FRAMES, 1, 1))) is None
+
+
+def test_what_a_model_makes_is_taken_off() -> None:
+    stack = frames(6, gain=1.0 + 0.03 * drawn(FRAMES, 1, 1))
+    data = common_scores(*stack, EVERYWHERE)
+    assert measured_mode(data, data, stack[1], EVERYWHERE) is None
+
+
+def simulated(mode: NoiseMode, noise_dn: float) -> np.ndarray:
+    """Return frames of a sensor of next to no read noise in which something is shared."""
+    values = (4.0, 1 / STEP, 100.0, 1e-6)
+    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    effect = EmpiricalNoise(noise_dn=noise_dn, modes=(mode,))
+    how = SimulateSettings(shape=SHAPE, n_frames=FRAMES, seed=5, bit_depth=14, effects=(effect,))
+    return simulate_block(truth, how, (0, FRAMES))[0] - 100.0
+
+
+@pytest.mark.parametrize("on", ["gain", "light"])
+def test_the_simulated_change_has_its_size(on: Any) -> None:
+    mode = NoiseMode(of="frame", share=1.0, on=on, signal_dn=4 * STEP)
+    means = simulated(mode, 0.1 * 4 * STEP).mean(axis=(1, 2)) / (4 * STEP)
+    own = 1 / (4 * means.size * EVERYWHERE.size)
+    chance = np.var(simulated(mode, 0.0).mean(axis=(1, 2)) / (4 * STEP))
+    assert abs(means.mean() - 1.0) < 5 * np.sqrt(own + 0.01 / FRAMES)
+    assert means.var() - chance == pytest.approx(0.01, rel=5 * np.sqrt(2 / FRAMES))
+
+
+def test_simulated_bursts_are_as_rare_and_where_they_are_told() -> None:
+    mode = NoiseMode(
+        of="frame", share=1.0, on="light", signal_dn=4 * STEP, burst=0.04, shape=((1.0, 0.0), (0.0, 0.0))
+    )
+    found = simulated(mode, 2.0 * np.sqrt(0.04) / 2.0 * 4 * STEP)
+    corner, rest = found[:, :8, :10].mean(axis=(1, 2)), found[:, 8:, 10:].mean(axis=(1, 2))
+    high = corner > 6 * STEP
+    assert abs(high.mean() - 0.04) < 5 * np.sqrt(0.04 / FRAMES)
+    # twice the light more: a root mean square over the sensor of half of that
+    assert corner[high].mean() == pytest.approx(12 * STEP, rel=0.03)
+    assert rest.max() < 6 * STEP
+
+
+def test_half_a_mode_is_refused() -> None:
+    with pytest.raises(ValidationError, match="leave lags out"):
+        NoiseMode(of="frame", share=1.0, burst=0.1, lags=((1, 0, 0),), correlation=(0.1,))
+    with pytest.raises(ValidationError, match="equally many"):
+        NoiseMode(of="row", share=1.0, shape=((1.0,),))
