@@ -26,6 +26,7 @@ _OF: tuple[Shared, ...] = ("frame", "row", "column")
 _CLEAR = 15.0  # nats
 # times what a Gaussian explains that bursts must, and nats: the scores are skewed themselves
 _OF_GAUSSIAN, _BURST = 1.3, 10.0
+_CHUNK = 256  # frames at once
 _FARTHEST = 3  # frames
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
 _UNEVEN = 5.0  # standard errors of its power by which a shape must be clearer than the same everywhere
@@ -75,21 +76,24 @@ def common_scores(
     pixels = np.flatnonzero(inside.ravel())
     if not pixels.size:
         return found
-    own = frames.reshape(len(frames), -1)[:, pixels].astype(np.int64)
-    first = own.min(axis=0)
-    tables = _score_tables(maps, pixels, first, int((own - first).max()) + 1)
-    place = np.arange(pixels.size), own - first
-    for number, on in enumerate(_ON):
-        u = np.zeros((len(frames), *inside.shape))
-        values = tables[number][place]
-        u[:, inside] = values - values.mean(axis=0)
-        power = np.zeros(inside.shape)
-        power[inside] = values.var(axis=0)
-        blocks = _in_blocks(u), _in_blocks(power[None])[0]
-        found["frame", on] = Sums(u.sum(axis=(1, 2))[:, None], power.sum(keepdims=True)[0], blocks)
-        rows, columns = u.sum(axis=2), u.sum(axis=1)
-        found["row", on] = Sums(rows, power.sum(axis=1))
-        found["column", on] = Sums(columns, power.sum(axis=0))
+    flat = frames.reshape(len(frames), -1)
+    first = flat.min(axis=0)[pixels].astype(np.int64)
+    length = int((flat.max(axis=0)[pixels] - first).max()) + 1
+    for on, table in zip(_ON, _score_tables(maps, pixels, first, length), strict=True):
+        gathered: list[tuple[FloatArray, ...]] = []
+        mean, square = np.zeros(inside.shape), np.zeros(inside.shape)
+        for begin in range(0, len(flat), _CHUNK):
+            u = np.zeros((len(flat[begin : begin + _CHUNK]), *inside.shape))
+            u[:, inside] = table[np.arange(pixels.size), flat[begin : begin + _CHUNK, pixels] - first]
+            gathered.append((u.sum(axis=(1, 2))[:, None], u.sum(axis=2), u.sum(axis=1), _in_blocks(u)))
+            mean += u.sum(axis=0) / len(flat)
+            square += np.einsum("tyx,tyx->yx", u, u) / len(flat)
+        power = np.maximum(square - mean**2, 0.0)
+        frame, row, column, block = (np.concatenate(parts) for parts in zip(*gathered, strict=True))
+        blocks = block - _in_blocks(mean[None]), _in_blocks(power[None])[0]
+        found["frame", on] = Sums(frame - mean.sum(), power.sum(keepdims=True)[0], blocks)
+        found["row", on] = Sums(row - mean.sum(axis=1), power.sum(axis=1))
+        found["column", on] = Sums(column - mean.sum(axis=0), power.sum(axis=0))
     return found
 
 
