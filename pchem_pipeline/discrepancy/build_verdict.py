@@ -233,8 +233,9 @@ def build_verdict(
         defects: candidates that failed, and why.
         n_replicates: drawn in all.
     """
+    # e-, and the share of the read noise, of pixels whose gain and read noise are open would be made up
     sizes = {
-        each.effect.tag: size_of(each.effect, fitted.maps, looked_at[1].frames)
+        each.effect.tag: None if found.doubt else size_of(each.effect, fitted.maps, looked_at[1].frames)
         for each in found.added.additions
     }
     both = found.z.both

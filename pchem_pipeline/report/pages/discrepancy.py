@@ -328,6 +328,9 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     found = data.found
     flags = [Flag("caution", f"{found.limit[0].upper()}{found.limit[1:]}.")] if found.limit else []
     extended = [step for step in found.steps if step.effect]
+    if found.doubt:
+        words = "What rests on the parameters of the pixels was not tested, and no size is given in e⁻"
+        flags.append(Flag("caution", f"{words}: {found.doubt}."))
     if extended:
         flags += _closing(found)
         flags += [flag for step in extended for flag in _compared(step, data)]

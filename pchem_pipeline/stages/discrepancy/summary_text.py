@@ -29,6 +29,8 @@ def verdict_text(found: Verdict) -> str:
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
+    if found.doubt and found.steps:
+        lines += _wrapped(f"not tested, and no size in e-: {found.doubt}")
     if found.unexplained:
         lines += _places("left unexplained: ", found.unexplained, _MOST_LEFT)
     lines += [line for tag, why in found.defects.items() for line in _wrapped(_DEFECT.format(tag, why))]

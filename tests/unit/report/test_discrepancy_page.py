@@ -428,3 +428,10 @@ def test_the_page_of_a_run(tmp_path: Path) -> None:
     store.write_file("discrepancy.json", b"[1, 2")
     with pytest.raises(StoreError, match=r"discrepancy.json is damaged .*run pchem discrepancy with --force"):
         read_run(store)
+
+
+def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
+    data = discrepancy_data("named", doubt="the bias of 93 % of the pixels may be off by an electron")
+    flags = [flag for flag in remarks(data) if "93 %" in flag.text]
+    assert [flag.level for flag in flags] == ["caution"]
+    assert not any("no size is given" in flag.text for flag in remarks(discrepancy_data("named")))

@@ -68,3 +68,8 @@ def test_numbers_that_are_not_known_are_said_so() -> None:
     text = verdict_text(verdict_of("named", gap=gap, steps=steps, where=[{"statistic": "code.top"}]))
     assert "gap:" not in text
     assert "code.top (sd not known)" in text
+
+
+def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
+    text = verdict_text(verdict_of("named", doubt="the bias of 93 % of the pixels may be off"))
+    assert "no size in e-: the bias of 93 %" in " ".join(text.split())
