@@ -94,7 +94,7 @@ class AddedRounds:
         # what the final frames prove to be left: few of them tell the gap of a weak effect from none badly
         left = max(after.interval[0], 0.0)
         unfinished = not after.at_floor and (still or left > _REST_OF_NAMED * before.value)
-        rest = self._rest(last) if unfinished and self.rounds else None
+        rest = left_of(self.rounds, last, self.z, self.allowed) if unfinished and self.rounds else None
         additions: list[Addition] = []
         gap = before
         for index, this in enumerate(self.rounds):
@@ -115,12 +115,6 @@ class AddedRounds:
                 additions.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
         return Added(tuple(additions), after, unfinished)
-
-    def _rest(self, last: NullModel) -> FloatArray:
-        """Return what the final model leaves of each statistic, in what it may leave, shape (m,)."""
-        allowed = tolerance(np.concatenate([this.added.parts for this in self.rounds]), self.allowed)
-        chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
-        return np.asarray((self.z.both - last.mean) / np.hypot(chance, allowed))
 
     def _against(self, this: Round, member: int) -> str:
         """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.
@@ -235,21 +229,44 @@ class _Other:
     closes: bool
 
 
-def unexplained_of_its_kind(part: FloatArray, rest: FloatArray, null: NullModel) -> str:
-    """Return in words what the whole model does not account for of an effect's kind; empty: nothing.
+def left_of(rounds: Sequence[Round], last: NullModel, z: Measured, allowed: float) -> FloatArray:
+    """Return what a model with the effects of rounds leaves of each statistic, in what it may leave, (m,).
 
-    Of what the effect moves, and of all in the families in which its signature stands: what is missing there
-    may be what makes its signature as well, and then this is not its name.
+    Args:
+        rounds: one or more.
+        last: null of the model with them.
+        z: statistics of the data.
+        allowed: see :class:`AddedRounds`.
+    """
+    of_effects = tolerance(np.concatenate([this.added.parts for this in rounds]), allowed)
+    chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
+    return np.asarray((z.both - last.mean) / np.hypot(chance, of_effects))
+
+
+def unexplained_of_its_own(part: FloatArray, rest: FloatArray, null: NullModel) -> str:
+    """Return in words what the whole model does not account for of what an effect moves; empty: nothing.
 
     Args:
         part: by how much the effect moves the statistics, shape (m,).
         rest: what the model leaves of them, in what it may leave, shape (m,).
         null: of the model before it.
     """
+    return _worst_words(np.abs(part) > _MOVED * null.std, rest, null)
+
+
+def unexplained_of_its_kind(part: FloatArray, rest: FloatArray, null: NullModel) -> str:
+    """Return the same of all in the families in which the signature of the effect stands, too.
+
+    What is missing there may be what makes its signature as well, and then this is not its name.
+    """
     weight = (part / null.std) ** 2
     families = np.array([STATISTICS[name].family for name in null.names])
     own = [f for f in set(families) if weight[families == f].sum() > _OF_SIGNATURE * weight.sum()]
-    left = np.where(np.isin(families, own) | (weight > _MOVED**2), np.abs(rest), 0.0)
+    return _worst_words(np.isin(families, own) | (weight > _MOVED**2), rest, null)
+
+
+def _worst_words(looked_at: NDArray[np.bool_], rest: FloatArray, null: NullModel) -> str:
+    left = np.where(looked_at, np.abs(rest), 0.0)
     worst = int(np.argmax(left))
     return f"it leaves {STATISTICS[null.names[worst]].sentence}" if left[worst] > _LEFT else ""
 

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
-from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, Round
+from pchem_pipeline.discrepancy.by_simulation.additions import (
+    AddedRounds,
+    Round,
+    left_of,
+    unexplained_of_its_own,
+)
 from pchem_pipeline.discrepancy.by_simulation.candidates import (
     Mapper,
     ReplicateSimulator,
@@ -273,9 +278,10 @@ class FrameExplainer:
         """Measure what no effect explains as shifts or as noise of the samples, and put it into the model.
 
         Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
-        First without the effects that were added, since one that merely mimics has no place beside it; with
-        them where that does not close the gap. Noise only with them: it could be any common mode that has a
-        name. None where it closes less than half of what is left.
+        First without the effects that were added, since one that merely mimics has no place beside it; where
+        that does not close the gap, with those of them that account for what they move themselves. Noise only
+        with these: it could be any common mode that has a name. None where it closes less than half of what
+        is left.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -298,8 +304,9 @@ class FrameExplainer:
             self.effort,
             self.defects,
         )
-        for kept in [(), held] if held else [()]:
-            found = unexplained.measured(kept, with_noise=kept == held)
+        sure = self._sure(null, z)
+        for kept in [(), sure] if sure else [()]:
+            found = unexplained.measured(kept, with_noise=kept == sure)
             if found is None:
                 continue
             gap = self.gaps.gap(z.final, found.mean, found.vectors)
@@ -315,6 +322,18 @@ class FrameExplainer:
                 last = self.rounds[-1].extended if self.rounds else self.first
                 return self._put(Comparison(found, (found,)), found, (), last)
         return None
+
+    def _sure(self, null: NullModel, z: Measured) -> tuple[Hypothesis, ...]:
+        """Return the effects that were added of which the model accounts for what they move."""
+        if not self.rounds:
+            return ()
+        rest = left_of(self.rounds, null, z, self._allowed)
+        return tuple(
+            h
+            for this in self.rounds
+            for h, part in zip(this.added.hypotheses, this.added.parts, strict=True)
+            if not unexplained_of_its_own(part, rest, this.null)
+        )
 
     def tolerance(self) -> FloatArray | float:
         """Return what is not held against effects that were added: a fraction of what they do."""

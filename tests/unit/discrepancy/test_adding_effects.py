@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.additions import unexplained_of_its_kind
+from pchem_pipeline.discrepancy.by_simulation.additions import (
+    unexplained_of_its_kind,
+    unexplained_of_its_own,
+)
 from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, own_signature
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
@@ -179,6 +182,9 @@ def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
     rest = np.array([left.get(name, 0.0) for name in names])
     assert unexplained_of_its_kind(np.array([100.0, 0.0, 1.0]), rest, null).startswith(words)
     assert bool(unexplained_of_its_kind(np.array([100.0, 0.0, 1.0]), rest, null)) == bool(words)
+    # of what it moves itself, nothing else
+    assert not unexplained_of_its_own(np.array([100.0, 0.0, 1.0]), rest, null)
+    assert bool(unexplained_of_its_own(np.array([100.0, 9.0, 1.0]), rest, null)) == bool(words)
 
 
 def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show() -> None:
@@ -235,6 +241,17 @@ def test_what_is_found_enters_the_model_at_its_best_strength(monkeypatch: pytest
     assert [e.tag for e in search.model] == ["row_noise"]
     assert search.model[0].row_noise_dn == pytest.approx(0.5, rel=0.05)
     assert np.abs(extended.mean[0] - statistics(search.model)[0]) < 3.0
+
+
+def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World([effect("row_noise", 0.5)])
+    search, extended = add(world, monkeypatch, hypothesis("row_noise"))
+    assert [h.tag for h in search._sure(extended, world.z)] == ["row_noise"]
+    elsewhere, own = np.eye(M)[5] * 60.0, np.eye(M)[0] * 60.0
+    assert [h.tag for h in search._sure(extended.shifted(elsewhere), world.z)] == ["row_noise"]
+    assert search._sure(extended.shifted(own), world.z) == ()
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
