@@ -34,13 +34,13 @@ CAMERA = """
 run: {{store: {name}.zarr, tile: 8}}
 compute: {{backend: {backend}, workers: 2}}
 simulate:
-  shape: [16, 16]
-  n_frames: 900
+  shape: [{side}, {side}]
+  n_frames: {frames}
   seed: {seed}
   sensor_seed: 3
   output: {name}_frames
   format: npy
-  frames_per_file: 300
+  frames_per_file: {per_file}
   integration_time: {time}
   effects: [{{tag: row_noise, row_noise_dn: 1.2}}]
 discrepancy: {{replicates: 20, extended_replicates: 12, candidates: [row_noise]}}
@@ -99,9 +99,9 @@ WORKS = (
 class Bench:
     """A folder in which commands run, and copies of its states."""
 
-    def __init__(self, folder: Path, backend: str) -> None:
+    def __init__(self, folder: Path, backend: str, side: int = 16, frames: int = 900) -> None:
         self.folder, self.case = folder, folder / "case"
-        self._backend = backend
+        self._camera = {"backend": backend, "side": side, "frames": frames, "per_file": frames // 3}
         self._states: dict[tuple[Any, ...], Path] = {}
 
     def pchem(self, *arguments: str) -> subprocess.Popen[str]:
@@ -141,7 +141,7 @@ class Bench:
         shutil.rmtree(self.case, ignore_errors=True)
         self.case.mkdir(parents=True)
         for seed, (name, seconds) in enumerate((("a", 2.0), ("b", 6.0))):
-            text = CAMERA.format(name=name, seed=seed, time=seconds, backend=self._backend)
+            text = CAMERA.format(name=name, seed=seed, time=seconds, **self._camera)
             (self.case / f"{name}.yaml").write_text(text)
         (self.case / "joint.yaml").write_text(JOINT)
         self.ok("simulate", "a.yaml")
