@@ -7,10 +7,44 @@ each field is the comment that ``pchem init`` writes.
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+import re
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic_core import PydanticCustomError
+
+#: kind of the complaint about a value that must not be repeated in a message
+SECRET = "secret"
+
+_SECRETS = re.compile(
+    r"^[a-z][a-z0-9+.-]*:/+([^/@]*:[^/]*@|.*[?&](sig|signature|\w*token|x-amz-\w[\w-]*|awsaccesskeyid)=)",
+    re.IGNORECASE | re.DOTALL,
+)
 
 
 class Section(BaseModel):
     """A frozen YAML section: unknown keys, NaN and infinities are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+
+def holds_secret(place: str) -> bool:
+    """Tell whether a URL holds a password, a key or a signature: YAML, log and pages would show it."""
+    return _SECRETS.match(place) is not None
+
+
+#: What is said of such a URL, which is not repeated.
+NO_SECRETS = (
+    "a URL with a password, key or signature in it, which the run would keep in its YAML; give keys as AWS "
+    "tools take them (AWS_ACCESS_KEY_ID, ~/.aws), or fetch the file first"
+)
+
+
+def _without_secrets(place: str) -> str:
+    if holds_secret(place):
+        raise PydanticCustomError(SECRET, NO_SECRETS)
+    return place
+
+
+#: A path, or a URL that holds no secret.
+Place = Annotated[str, AfterValidator(_without_secrets)]

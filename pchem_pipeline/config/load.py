@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import to_jsonable_python
 
 from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.base.settings import SECRET
 from pchem_pipeline.config.tree import RunConfig
 
 #: values of a configuration: 100,000 named files are not unusual
@@ -198,7 +199,8 @@ def _complaint(item: Any, root: type[BaseModel]) -> str:
     if item["type"] == "extra_forbidden":
         close = difflib.get_close_matches(_shown(str(item["loc"][-1])), _keys_at(item["loc"][:-1], root), 1)
         return f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else "")
-    given = "" if isinstance(item["input"], dict | BaseModel) else f" (given: {_shown(repr(item['input']))})"
+    hidden = item["type"] == SECRET or isinstance(item["input"], dict | BaseModel)
+    given = "" if hidden else f" (given: {_shown(repr(item['input']))})"
     return f"{where}: {message}{given}" if where else message
 
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.settings import Place, Section
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.settings import ModelSettings
@@ -22,7 +22,7 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 class RunSettings(Section):
     """What concerns the run as a whole."""
 
-    store: str = Field(
+    store: Place = Field(
         default="run.zarr",
         min_length=1,
         description="the run's store (zarr): a folder, or a URL of an object storage: s3://bucket/run.zarr",

@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.settings import Place, Section
 
 
 class SampleSettings(Section):
@@ -31,7 +31,7 @@ class InputSettings(Section):
     take it from the file; if the file does not say, the value stays unknown and is never guessed.
     """
 
-    files: tuple[str, ...] = Field(
+    files: tuple[Place, ...] = Field(
         default=(),
         description="camera files, globs or folders, relative to this YAML file, or URLs such as "
         "s3://bucket/frames/*.tif; "

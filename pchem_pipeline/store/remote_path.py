@@ -18,7 +18,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
 
-from pchem_pipeline.base.errors import MissingDependencyError, StoreError, install_hint
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint
+from pchem_pipeline.base.settings import NO_SECRETS, holds_secret
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -45,10 +46,16 @@ def refused(where: object, error: BaseException) -> RemoteError:
 
 
 def place_of(path: Path | str, base_dir: Path | None = None) -> Path:
-    """Return a path below a folder, or a `RemotePath` for a URL, also one that went through ``Path``."""
+    """Return a path below a folder, or a `RemotePath` for a URL, also one that went through ``Path``.
+
+    Raises:
+        ConfigError: the URL holds a secret.
+    """
     if isinstance(path, RemotePath):
         return path
     if _URL.match(str(path)):
+        if holds_secret(str(path)):
+            raise ConfigError(NO_SECRETS)
         return RemotePath(path)
     return Path(path) if base_dir is None else base_dir / path
 

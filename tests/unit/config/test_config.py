@@ -95,6 +95,29 @@ def test_old_keys_are_read_and_the_new_ones_told(capsys):
     assert parse_config(both).discrepancy.extended_replicates == 30
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "s3://key:SECRET@bucket/*.tif",
+        "HTTPS://lab:SECRET@camera.example/a.tif",
+        "https://b.s3.amazonaws.com/a.tif?X-Amz-Credential=k&X-Amz-Signature=SECRET",
+        "https://example.org/a.tif?access_token=SECRET",
+    ],
+)
+@pytest.mark.parametrize("text", ["input: {{files: ['{}']}}", "run: {{store: '{}'}}"])
+def test_a_url_with_a_secret_is_refused_and_not_repeated(text, url):
+    with pytest.raises(ConfigError, match="a password, key or signature in it") as caught:
+        parse_config(text.format(url))
+    assert "SECRET" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url", ["s3://bucket/a@b:c/*.tif", "https://host:8080/a.tif?raw=1", "C:/a@b.tif", "a:b@c"]
+)
+def test_other_urls_and_paths_are_taken(url):
+    assert parse_config(f"input: {{files: ['{url}']}}").input.files == (url,)
+
+
 def bomb(start):
     """Return lines in which nine aliases a line stand for a billion values."""
     names = "abcdefghij"

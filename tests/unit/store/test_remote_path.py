@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pchem_pipeline
-from pchem_pipeline.base.errors import MissingDependencyError, StoreError
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
 from pchem_pipeline.store.remote_path import RemoteError, RemotePath, place_of, refused
 from pchem_pipeline.store.run_store import RunStore
 
@@ -35,6 +35,13 @@ def test_a_url_survives_what_paths_do_to_it(text):
         assert isinstance(same, RemotePath)
         assert same == path
         assert hash(same) == hash(path)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_url_with_a_secret_is_refused_and_not_repeated(kind):
+    with pytest.raises(ConfigError, match="a password, key or signature in it") as caught:
+        place_of(kind("s3://key:SECRET@bucket/run.zarr"))
+    assert "SECRET" not in str(caught.value)
 
 
 def test_other_paths_stay_what_they_are():
