@@ -509,7 +509,9 @@ class FrameExplainer:
         self, found: Comparison, added: Refitted, hypotheses: tuple[Hypothesis, ...], null: NullModel
     ) -> NullModel:
         """Put a set into the model, at the strengths to which its replicates correct it."""
-        change = np.where(np.abs(added.change) < _NEAR, np.expm1(added.change), 0.0)
+        # within a standard error the steps end, too
+        near = np.abs(added.change) < np.maximum(_NEAR, added.stderr)
+        change = np.where(near, np.expm1(added.change), 0.0)
         corrected = tuple(
             Hypothesis(h.rescaled(1.0 + float(c)), h.fingerprint * (1.0 + c))
             for h, c in zip(added.hypotheses, change, strict=True)
