@@ -111,20 +111,22 @@ class AddedRounds:
                 against = "" if rest is None else unexplained_of_its_kind(parts[member], rest, this.null)
                 if rest is not None and left >= _REST_OF_NAMED * (gap.value - now.value):
                     against = "too much of the gap is left beside it"
+                against = against or self._against(this, int(member), still)
                 later = parts[order[place + 1 :]].sum(axis=0)
                 additions.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
         return Added(tuple(additions), after, unfinished)
 
-    def _against(self, this: Round, member: int) -> str:
+    def _against(self, this: Round, member: int, still: bool) -> str:
         """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.
 
         A parameter that can go no further was driven there by another effect; and at its best fit an effect
-        accounts for all that it moves.
+        accounts for all that it moves. That is asked where the data disagree with the whole model: one that
+        agrees, with every effect in it, is not judged a second time by fewer statistics.
         """
         added, parts = this.added.hypotheses[member], this.added.parts
         allowed = tolerance(parts, self.allowed)
-        wrong = misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
+        wrong = still and misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
         return added.effect.stuck_words() or ("it does not account for what it moves itself" if wrong else "")
 
     def _addition(
@@ -135,7 +137,7 @@ class AddedRounds:
         rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.settings.certainty)
         described = type(added.effect).measured_only
-        against = "" if described else against or self._against(this, member)
+        against = "" if described else against
         named = len(kept) == 1 and not against and not described
         compared = [
             (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)

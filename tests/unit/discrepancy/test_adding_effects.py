@@ -293,3 +293,17 @@ def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands
         [rival] = [rival for rival in each.rivals if rival.effect == "exposure_drift"]
         # nothing of it is in the data: in either place it closes nothing
         assert abs(each.before.value - rival.gap_after) < 0.1 * closed
+
+
+def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_the_model(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World([effect("interpixel_capacitance", 0.2)])
+    search, extended = add(world, monkeypatch, hypothesis("interpixel_capacitance"))
+    search.gaps = StatisticsGap(world.null, 100_000)
+    before = search.gap(world.null, world.z)
+    search.rounds = [replace(search.rounds[0], extended=extended.shifted(np.eye(M)[3] * 20.0))]
+    for still in (False, True):
+        [added] = search.close(before, extended, world.z, still).additions
+        assert added.named == (not still)
+        assert bool(added.against) == still
