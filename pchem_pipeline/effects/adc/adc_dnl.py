@@ -67,6 +67,7 @@ class AdcDnl(Effect):
     power: ClassVar[float] = 2.0
     attained: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
     separate: ClassVar[Mapping[str, str]] = {
+        "gain_stitch": "a ramp over many codes: a stitch moves all codes above it, DNL single ones",
         "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
         "adc_inl": "a ramp or a shifted bias over many codes: DNL is new from code to code, INL smooth",
     }

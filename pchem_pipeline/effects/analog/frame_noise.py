@@ -53,6 +53,7 @@ class FrameNoise(Effect):
     strength: ClassVar[str] = "frame_noise_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
+        "black_clamp": "the camera's clamp switched off: its offsets follow the charge of some pixels",
         "exposure_flicker": "frames without light and at short exposure: flicker of the exposure vanishes",
         "periodic_pickup": "a spectrum of frame means of a longer run: pickup is a line, noise is flat",
         "bias_drift": "a longer run: a drift grows with the time between two frames, noise does not",

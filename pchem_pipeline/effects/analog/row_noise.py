@@ -46,6 +46,7 @@ class RowNoise(Effect):
     strength: ClassVar[str] = "row_noise_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
+        "read_order_noise": "pixels far apart in a row: as alike as neighbours here, less alike there",
         "periodic_pickup": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
         "interpixel_capacitance": "pixels far apart in a row: they are as correlated as neighbours",
         "frame_noise": "means of rows within a frame: frame noise shifts them all alike",

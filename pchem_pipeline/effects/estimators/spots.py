@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -75,21 +76,62 @@ def best_spot(
         part = np.sum(inverse * background * values, axis=(-2, -1), keepdims=True) / power
         return np.asarray(values - background * part)
 
-    target, best = beside(amplitude), None
-    grid = np.linspace(0.0, 1.0, _CENTRES)
+    def seen(spots: FloatArray) -> FloatArray:
+        return beside(spots).reshape(len(spots), -1)
+
+    target = beside(amplitude).reshape(-1)
+    return _fitted((y, x), shape, falloffs, seen, target, inverse.reshape(-1))
+
+
+def _fitted(
+    places: tuple[FloatArray, FloatArray],
+    shape: tuple[int, ...],
+    falloffs: tuple[Falloff, ...],
+    seen: Callable[[FloatArray], FloatArray],
+    target: FloatArray,
+    inverse: FloatArray,
+) -> Spot | None:
+    """Return the spot that lowers chi2 the most, of a grid and then around it; None if none is positive.
+
+    Args:
+        places: rows and columns of the cells.
+        shape: rows and columns of the sensor.
+        falloffs: forms that are tried.
+        seen: what spots (n, rows, columns) would be in the data, (n, m).
+        target: the data, (m,).
+        inverse: their inverse variances, (m,).
+    """
+    from scipy.optimize import minimize
+
+    def fits(centres: list[tuple[float, float]], radius: float, falloff: Falloff) -> FloatArray:
+        """Return by how much each spot lowers chi2, and its peak, (2, n)."""
+        shown = seen(np.stack([spot_image(*places, shape, centre, radius, falloff) for centre in centres]))
+        overlap, size = (inverse * shown * target).sum(axis=1), (inverse * shown**2).sum(axis=1)
+        size = np.maximum(size, 1e-300)
+        return np.stack([np.where(overlap > 0, overlap**2 / size, 0.0), overlap / size])
+
+    grid = [(float(y), float(x)) for y in np.linspace(0, 1, _CENTRES) for x in np.linspace(0, 1, _CENTRES)]
+    best: tuple[float, tuple[float, float], float, Falloff] = (0.0, grid[0], _RADII[0], "gaussian")
     for falloff in falloffs:
         for radius in _RADII:
-            for cy in grid:
-                spots = beside(
-                    np.stack([spot_image(y, x, shape, (float(cy), cx), radius, falloff) for cx in grid])
-                )
-                overlap, size = np.sum(inverse * spots * target, (1, 2)), np.sum(inverse * spots**2, (1, 2))
-                gain = np.where(overlap > 0, overlap**2 / np.maximum(size, 1e-300), 0.0)
-                i = int(np.argmax(gain))
-                if gain[i] > (best.worth if best is not None else 0.0):
-                    centre = float(cy), float(grid[i])
-                    best = Spot(float(overlap[i] / size[i]), centre, radius, float(gain[i]), falloff)
-    return best
+            gains = fits(grid, radius, falloff)[0]
+            place = int(gains.argmax())
+            if gains[place] > best[0]:
+                best = float(gains[place]), grid[place], radius, falloff
+    if not best[0] > 0.0:
+        return None
+    _, centre, radius, falloff = best
+
+    def loss(values: FloatArray) -> float:
+        return -float(fits([(float(values[0]), float(values[1]))], float(np.exp(values[2])), falloff)[0, 0])
+
+    step = 1.0 / (_CENTRES - 1)
+    limits = [(max(c - step, 0.0), min(c + step, 1.0)) for c in centre]
+    limits.append((np.log(radius / 1.5), np.log(radius * 1.5)))
+    polished = minimize(loss, [*centre, np.log(radius)], method="Nelder-Mead", bounds=limits).x
+    centre, radius = (float(polished[0]), float(polished[1])), float(np.exp(polished[2]))
+    gain, peak = fits([centre], radius, falloff)[:, 0]
+    return Spot(float(peak), centre, radius, float(gain), falloff)
 
 
 @dataclass(frozen=True)
@@ -218,19 +260,8 @@ def _form(lines: _Lines, burst: FloatArray, shape: tuple[int, ...]) -> Spot | No
     """Return the spot that fits rows and columns of the bursts, less those of other frames, best."""
     mean = burst @ lines.charge / burst.sum() - (1.0 - burst) @ lines.charge / (1.0 - burst).sum()
     inverse = 1.0 / np.maximum(lines.lines(lines.variance), 1e-12)
-    grid, best = np.linspace(0.0, 1.0, _CENTRES), None
-    falloffs: tuple[Falloff, ...] = ("gaussian", "exponential")
-    for falloff in falloffs:
-        for radius in _RADII:
-            for cy in grid:
-                spots = np.stack(
-                    [spot_image(lines.y, lines.x, shape, (float(cy), cx), radius, falloff) for cx in grid]
-                )
-                seen = lines.lines(spots * lines.response)
-                overlap, size = (inverse * seen * mean).sum(axis=1), (inverse * seen**2).sum(axis=1)
-                gain = np.where(overlap > 0, overlap**2 / np.maximum(size, 1e-300), 0.0)
-                i = int(gain.argmax())
-                if best is None or gain[i] > best.worth:
-                    centre = float(cy), float(grid[i])
-                    best = Spot(float(overlap[i] / size[i]), centre, radius, float(gain[i]), falloff)
-    return best if best is not None and best.peak > 0 else None
+
+    def seen(spots: FloatArray) -> FloatArray:
+        return lines.lines(spots * lines.response)
+
+    return _fitted((lines.y, lines.x), shape, ("gaussian", "exponential"), seen, mean, inverse)

@@ -58,6 +58,7 @@ class ExposureDrift(Effect):
     )
     strength: ClassVar[str] = "drift"
     separate: ClassVar[Mapping[str, str]] = {
+        "glow": "a map of the change along the run: a drift goes with H, a glow has its place",
         "gain_drift": "the readout residual of bright pixels against that of dim ones: constant here",
         "bias_drift": "covered pixels, or frames without exposure: constant here",
         "persistence": "the map of the change: proportional to H here",

@@ -56,6 +56,7 @@ class ExposureFlicker(Effect):
     power: ClassVar[float] = 2.0
     attained: ClassVar[tuple[str, ...]] = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
+        "glow": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
         "exposure_drift": "a longer run: a flicker does not go on in one direction",
         "frame_noise": "covered pixels, or frames without exposure: constant here",
         "overdispersed_counts": "correlation between pixels of one frame: all of them here",

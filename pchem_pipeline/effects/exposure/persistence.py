@@ -54,6 +54,7 @@ class Persistence(Effect):
     strength: ClassVar[str] = "peak_e"
     attained: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
+        "glow": "a run after a longer time in the dark: persistence is gone, a glow is not",
         "exposure_drift": "a run after a longer time in the dark: the change, not proportional to H, is gone",
         "dark_current_rts": "a longer run: single pixels jump up and down there, regions fade once here",
         "bias_drift": "frames without exposure: the residual stays here",
