@@ -361,12 +361,14 @@ class ReadOrderNoise(Hidden):
     """
 
     tag: ClassVar[str] = "read_order_noise"
-    s95: ClassVar[float] = 0.13
+    s95: ClassVar[float] = 0.07
     scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
 
     def draw(self):
         ny, nx = self.sensor.shape
         self.taps = int(self.pick("taps", 1, 4, p=(0.7, 0.3)))
+        # the more taps, the less is common to a row
+        self.strength *= self.taps**0.5
         n = ny * (nx // self.taps)
         # one record goes on through the frames
         f = np.fft.rfftfreq(n * self.sensor.n_frames)

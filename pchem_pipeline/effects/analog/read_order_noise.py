@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import add_offset
-from pchem_pipeline.effects.estimators.read_order import pink_amplitudes, pink_noise_of
+from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes, pink_noise_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 
@@ -82,8 +82,9 @@ class ReadOrderNoise(Effect):
         noise = np.empty((values.shape[0], context.rows.size, columns))
         for t, frame in enumerate(context.frames):
             random = context.random.generator(frame=int(frame))
-            white = np.fft.rfft(random.standard_normal((taps, rows * width)))
-            series = np.fft.irfft(amplitudes * white, rows * width).reshape(taps, rows, width)
+            white = np.fft.rfft(random.standard_normal((taps, RECORD * rows * width)))
+            record = np.fft.irfft(amplitudes * white, RECORD * rows * width)
+            series = record[:, : rows * width].reshape(taps, rows, width)
             noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
         noise *= self.noise_dn
         return add_offset(values, noise, context)

@@ -19,15 +19,22 @@ _LEAST = 3.0  # standard errors
 _LEAST_SHAPE = 6.0  # chi2 by which it must beat rows whose pixels move together, each row by itself
 
 
-def pink_amplitudes(n: int) -> FloatArray:
-    """Return factors of the spectrum (n // 2 + 1,) that make white noise of n samples 1/f, of variance 1.
+RECORD = 4  #: frames in a record of noise, of which one is used: what is cut from a longer one has no period
 
-    No part is constant: the lowest frequency is one cycle in n samples.
+
+def pink_amplitudes(n: int) -> FloatArray:
+    """Return factors of the spectrum that make white noise of a record 1/f, of variance 1.
+
+    Args:
+        n: samples of a frame; there is nothing slower than one cycle in so many.
+
+    Returns:
+        (RECORD n // 2 + 1,), real.
     """
-    frequency = np.arange(n // 2 + 1)
-    amplitudes = np.where(frequency > 0, np.maximum(frequency, 1) ** -0.5, 0.0)
-    weight = np.where((frequency == 0) | (2 * frequency == n), 1.0, 2.0)
-    return np.asarray(amplitudes / np.sqrt((weight * amplitudes**2).sum() / n))
+    cycles = np.arange(RECORD * n // 2 + 1)
+    amplitudes = np.where(cycles >= RECORD, np.maximum(cycles, 1) ** -0.5, 0.0)
+    weight = np.where((cycles == 0) | (2 * cycles == RECORD * n), 1.0, 2.0)
+    return np.asarray(amplitudes / np.sqrt((weight * amplitudes**2).sum() / (RECORD * n)))
 
 
 def pink_noise_of(evidence: Evidence) -> list[tuple[float, int]]:
@@ -92,14 +99,20 @@ def _seen(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray]
 def _shown(evidence: Evidence, rows: int, columns: int, taps: int) -> FloatArray:
     """Return what noise of variance 1 DN^2 would show of these."""
     width = columns // taps
-    n = rows * width
-    covariance = np.asarray(np.fft.irfft(pink_amplitudes(n) ** 2, n), np.float64)
-    response = responsivity(evidence) ** 2
-    apart = np.arange(width) - np.arange(width)[:, None]
+    n = RECORD * rows * width
+    covariance = np.asarray(np.fft.irfft(pink_amplitudes(rows * width) ** 2, n), np.float64)
+    # of a row's mean with that of one so many rows below: lags of the samples with a triangle of weights
+    near = np.arange(1 - width, width)
+    weight = (width - np.abs(near)) / width**2
+    of_rows = covariance[(np.arange(rows)[:, None] * width + near) % n] @ weight / taps
+    line = np.arange(rows)
+    every = of_rows[np.abs(line - line[:, None])]
+    common = every.mean()
+    # the frame's mean is taken from each
+    every = every - every.mean(axis=0) - every.mean(axis=1)[:, None] + common
     shown = np.zeros(_LAGS + 3)
-    for lag in range(_LAGS + 1):
-        shown[lag] = covariance[(lag * width + apart) % n].mean() / taps
+    shown[: _LAGS + 1] = [np.diagonal(every, lag).mean() for lag in range(_LAGS + 1)]
     relative = float(np.nanmean(evidence.readout_std**-2.0))
-    shown[_LAGS + 1] = covariance[1] * relative * (columns - taps) / (columns - 1)
-    shown[_LAGS + 2] = covariance[width] * relative
-    return shown * response
+    shown[_LAGS + 1] = (covariance[1] * (columns - taps) / (columns - 1) - common) * relative
+    shown[_LAGS + 2] = (covariance[width] - common) * relative
+    return np.asarray(shown * responsivity(evidence) ** 2)

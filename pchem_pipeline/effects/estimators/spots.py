@@ -25,6 +25,7 @@ _SHARES = np.array([0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4])
 _HEIGHTS = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0])
 _CLOSER = 12  # spots whose mixture is looked at
 _LEAST_GAIN = 12.0  # of the log-likelihood, best of some 1,000 spots with two parameters
+_FEWEST_BURSTS = 3.0  # a single one may be a particle's
 _MOST = 0.6  # share of the frames beyond which a burst is the rule
 
 
@@ -173,7 +174,7 @@ def best_bursts(evidence: Evidence) -> Bursts | None:
     chosen = np.argsort(-sharp)[:_CLOSER]
     found = [_mixture(heights[:, i]) for i in chosen]
     gain, share, burst = max(found, key=lambda each: each[0])
-    if gain < _LEAST_GAIN or share > _MOST:
+    if gain < _LEAST_GAIN or share > _MOST or burst.sum() < _FEWEST_BURSTS:
         return None
     spot = _form(lines, burst, shape)
     return None if spot is None else Bursts(spot, share)
