@@ -32,6 +32,7 @@ SEALED = (
 TWINS = (
     ("overdispersed_counts", "branching_counts"),
     ("nonlinearity", "adc_inl"),
+    ("gain_stitch", "adc_inl"),  # a kink without a step is a bend
     ("exposure_drift", "persistence"),
 )
 # the first members come from different planes, the rest are drawn

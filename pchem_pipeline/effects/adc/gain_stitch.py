@@ -36,7 +36,8 @@ class GainStitch(Effect):
     """Above ``level_dn`` the scale deviates by ``gain_change (x - origin_dn)``, below it by nothing.
 
     Signature: counts per DN, summed over the pixels, deviate on both sides of one DN, beyond what the pixels'
-    own bias and gain take up; pixels of different bias show it at the same DN.
+    own bias and gain take up; pixels of different bias show it at the same DN. A step shows sharply, at one
+    code; a kink without a step is hardly told from a bend of the whole curve (`adc_inl`).
     """
 
     tag: Literal["gain_stitch"] = Field(default="gain_stitch", description="name of the effect")
