@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,13 @@ _RARE = 1e-6  # least mass of a code: what is rarer has other reasons
 _SURE = 30.0  # nats, the most that a sample says
 _MUTUAL = 0.5  # of rows that come in the place of the next, as many of this part in that of the one before
 _FIRST_SHARE, _STEPS = 0.02, 60
+
+
+class Measurement(NamedTuple):
+    """What was measured, and by how much likelier the samples are with it, nats."""
+
+    effect: Effect
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -189,7 +197,7 @@ def measured_moves(
     numbers: IntArray,
     maps: PixelMaps,
     effects: Sequence[Effect],
-) -> Empirical | None:
+) -> Measurement | None:
     """Return the moves that the samples of some frames need beside a model; None where they need none.
 
     Args:
@@ -202,20 +210,15 @@ def measured_moves(
     towards = _measured_towards(frames, numbers, maps, effects)
     slips = _measured_slips(frames, maps, effects)
     found = [one for one in (shifts, towards, slips) if one is not None]
-    return max(found, key=lambda one: one.gain).effect if found else None
-
-
-@dataclass(frozen=True)
-class _Found:
-    """A component, and what it gains for a sample, nats."""
-
-    effect: Empirical
-    gain: float
+    if not found:
+        return None
+    best = max(found, key=lambda one: one.gain)
+    return best._replace(gain=best.gain * len(frames) * int(np.count_nonzero(maps.usable)))
 
 
 def _measured_shifts(
     frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
-) -> _Found | None:
+) -> Measurement | None:
     """Return the shifts that histograms of pixels that stand for all need."""
     farthest = _FARTHEST_E / float(np.median(maps.conversion_gain[maps.usable]))
     sizes = [size for size in _FINE if size <= farthest]
@@ -237,12 +240,12 @@ def _measured_shifts(
 
 def _component(
     moves: Sequence[Move], used: Sequence[int], shares: FloatArray, gain: float, **how: object
-) -> _Found | None:
+) -> Measurement | None:
     total = float(shares[list(used)].sum())
     if not used or total <= 0.0:
         return None
     kept = tuple(moves[i - 1].model_copy(update={"weight": float(shares[i] / total)}) for i in used)
-    return _Found(Empirical.model_validate({"share": min(total, 1.0), "moves": kept, **how}), gain)
+    return Measurement(Empirical.model_validate({"share": min(total, 1.0), "moves": kept, **how}), gain)
 
 
 @dataclass(frozen=True)
@@ -266,7 +269,7 @@ class _Samples:
 
 def _measured_towards(
     frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, effects: Sequence[Effect]
-) -> _Found | None:
+) -> Measurement | None:
     """Return the moves towards neighbours that samples need, those of the one or two best neighbours."""
     pixels, some = _chosen(maps.usable, len(frames))
     step = 1.0 / float(np.median(maps.conversion_gain[maps.usable]))
@@ -296,7 +299,7 @@ def _measured_towards(
 
 def _measured_slips(
     frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
-) -> _Found | None:
+) -> Measurement | None:
     """Return the rows whose samples follow the laws of the pixels beside them."""
     pixels, some = _chosen(maps.usable, len(frames))
     laws = _Laws.of(frames, maps, effects, np.flatnonzero(maps.usable.ravel()), 1)

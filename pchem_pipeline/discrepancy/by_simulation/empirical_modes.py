@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.empirical import shares_of
+from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, shares_of
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, On, Shared
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
@@ -130,7 +130,7 @@ def measured_mode(
     model: dict[tuple[Shared, On], Sums],
     maps: PixelMaps,
     inside: BoolArray,
-) -> EmpiricalNoise | None:
+) -> Measurement | None:
     """Return the common change of gain or light beyond what a model makes; None where an offset is clearer.
 
     Args:
@@ -161,7 +161,7 @@ def measured_mode(
         burst=burst, negative=size < 0.0, shape=blocks,
     )  # fmt: skip
     rms = abs(size) * np.sqrt(burst) if burst else np.sqrt(power)
-    return EmpiricalNoise(noise_dn=float(rms * signal), modes=(mode,))
+    return Measurement(EmpiricalNoise(noise_dn=float(rms * signal), modes=(mode,)), float(gain))
 
 
 def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -188,7 +189,7 @@ def _products(one: NDArray[Any], two: NDArray[Any], starts: IntArray) -> FloatAr
 
 def measured_noise(
     data: Covariances, model: Covariances, evidence: Evidence, inside: BoolArray
-) -> EmpiricalNoise | None:
+) -> Measurement | None:
     """Return the noise that samples share beyond what a model makes; None where they share none.
 
     Args:
@@ -230,22 +231,27 @@ def measured_noise(
         powers.append(found.power)
     if not modes:
         return None
+    # of a mean product that is Gaussian
+    gain = sum(0.5 * (left[key] / error[key]) ** 2 for key in clear)
+    gain += sum(0.5 * found.clear**2 for found in profiles.values())
     most = _MOST * float(np.median(evidence.maps.read_noise_dn[inside])) ** 2
-    return EmpiricalNoise(
+    noise = EmpiricalNoise(
         noise_dn=float(np.sqrt(min(sum(powers), most))),
         modes=tuple(
             mode.model_copy(update={"share": round(power / sum(powers), 4)})
             for mode, power in zip(modes, powers, strict=True)
         ),
     )
+    return Measurement(noise, gain)
 
 
 class _Profile(NamedTuple):
-    """A shape of lines: its values at evenly spaced points, at each place, and its power, DN^2."""
+    """A shape of lines: its values at evenly spaced points, at each place, its power, DN^2, in its errors."""
 
     points: FloatArray
     shape: FloatArray
     power: float
+    clear: float
 
     def take_off(self, of: Shared, left: dict[tuple[Shared, Lag], float], response: float) -> None:
         """Take it off from what lines share alike, which stands for it badly, and from near samples."""
@@ -306,4 +312,4 @@ def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatA
     (found, clear), (_, alike) = power(shape), power(np.ones(size))
     if clear < _CLEAR_SHAPE or clear**2 < _BETTER * alike**2 + _CLEAR_SHAPE**2 / 2.0:
         return None
-    return _Profile(np.linalg.lstsq(hats, shape, rcond=None)[0], shape, found)
+    return _Profile(np.linalg.lstsq(hats, shape, rcond=None)[0], shape, found, clear)

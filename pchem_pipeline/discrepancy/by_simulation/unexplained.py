@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.comparison import leaves_nothing
-from pchem_pipeline.discrepancy.by_simulation.empirical import measured_moves
+from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, measured_moves
 from pchem_pipeline.discrepancy.by_simulation.empirical_modes import Sums, common_scores, measured_mode
 from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
     Covariances,
@@ -33,9 +33,10 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 #: Measures a part of the frames, the pixels fitted with some effects, beside some of these.
-Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Effect | None]
+Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Measurement | None]
 
 _CONVINCING = 6.0  # nats that a form must add
+_MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
 
@@ -75,10 +76,7 @@ class Unexplained:
     defects: dict[str, str] = field(default_factory=dict)
 
     def measured(self, kept: tuple[Hypothesis, ...], with_noise: bool) -> Refitted | None:
-        """Return effects with what is best measured beside them, and with the other form beside both.
-
-        Parts are looked at where what is everywhere leaves something.
-        """
+        """Return effects with what is best measured beside them, and with the other form beside both."""
         refitter = self.refitter
         forms: dict[str, Measure] = {"empirical": self._moves}
         if with_noise:
@@ -91,9 +89,7 @@ class Unexplained:
             beside, better, score = kept, "", -np.inf
             if found is not None:
                 beside, score = found.hypotheses, found.score + _CONVINCING
-            for part, form in itertools.product((Part(), *self.frames.parts), tuple(forms)):
-                if part != Part() and found is not None and leaves_nothing(refitter, found):
-                    break
+            for part, form in self._likeliest(tuple(h.effect for h in beside), forms):
                 try:
                     one = self._described(beside, part, forms[form])
                 except EffortSpentError:
@@ -106,10 +102,27 @@ class Unexplained:
                     continue
                 if one is not None and one.score > score:
                     found, better, score = one, form, one.score
+                    if leaves_nothing(refitter, one):
+                        break
             if not better:
                 break
             del forms[better]
         return found
+
+    def _likeliest(self, effects: tuple[Effect, ...], forms: Mapping[str, Measure]) -> list[tuple[Part, str]]:
+        """Return the parts and forms that explain most beside effects, what is everywhere included."""
+        model = self.refitter.model(effects)
+        found: list[tuple[float, Part, str]] = []
+        for part, form in itertools.product((Part(), *self.frames.parts), forms):
+            try:
+                one = forms[form](part, model, model)
+            # a defect of what is measured must not cost the verdict
+            except Exception as error:
+                self.defects[form] = error_words(error)
+                continue
+            if one is not None:
+                found.append((one.gain, part, form))
+        return [(part, form) for _, part, form in sorted(found, key=lambda one: -one[0])[:_MOST_TRIED]]
 
     def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Refitted | None:
         """Return effects with what is measured in a part beside them at their best fit, or None.
@@ -119,10 +132,10 @@ class Unexplained:
         refitter, effects, measured = self.refitter, tuple(h.effect for h in kept), None
         for _ in range(_MEASUREMENTS):
             present = refitter.model(effects if measured is None else (*effects, measured))
-            measured = measure(part, present, refitter.model(effects))
-            if measured is None:
+            seen = measure(part, present, refitter.model(effects))
+            if seen is None:
                 return None
-            measured = measured.at_place(part.region, part.when)
+            measured = seen.effect.at_place(part.region, part.when)
         assert measured is not None
         refitter.allow(measured.tag)
         _, vectors = refitter.draw((*effects, measured), self.replicates)
@@ -136,7 +149,9 @@ class Unexplained:
             return None
         return self._described(tuple(h for h in kept if h.tag in proven), part, measure)
 
-    def _moves(self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]) -> Effect | None:
+    def _moves(
+        self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]
+    ) -> Measurement | None:
         """Measure the moves of the samples of a part beside effects, with the pixels as they now are."""
         maps = self.refit(present).maps
         own = replace(maps, usable=maps.usable & self.frames.inside(part))
@@ -153,7 +168,7 @@ class Unexplained:
         part: Part,
         _: tuple[Effect, ...],
         beside: tuple[Effect, ...],
-    ) -> Effect | None:
+    ) -> Measurement | None:
         """Measure what samples of a part share beyond what effects make of them: gain or light, or noise."""
         key = "|".join(e.model_dump_json() for e in beside)
         if key not in known:

@@ -34,7 +34,8 @@ def measured(stack: tuple[np.ndarray, PixelMaps], inside: np.ndarray = EVERYWHER
     """Return what is measured beside a model without common changes."""
     data = common_scores(*stack, inside)
     nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
-    return measured_mode(data, nothing, stack[1], inside)
+    found = measured_mode(data, nothing, stack[1], inside)
+    return None if found is None else found.effect
 
 
 def drawn(*shape: int) -> np.ndarray:
