@@ -359,7 +359,7 @@ class _Batch:
         evaluate = cells_likelihood() if cells else density_likelihood()
         search = engine.cells_search() if cells else engine.density_search()
 
-        def fit(pixels: NDArray[np.intp]) -> None:
+        def fit(pixels: NDArray[np.intp], quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
             tile_numba.fit_tile(
@@ -367,7 +367,7 @@ class _Batch:
                 pixels,
                 packed,
                 starts,
-                limits,
+                limits._replace(quick=quick),
                 evaluate,
                 engine.climb(),
                 search,
@@ -414,6 +414,7 @@ class _Batch:
             reshapes=laws is not None and any(_reshapes(each) for each in laws),
             warm=warm,
             scan=scan,
+            quick=False,
             sandwich=settings.errors == "sandwich",
         )
 

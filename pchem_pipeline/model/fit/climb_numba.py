@@ -68,6 +68,7 @@ _REFUSED, _REFUSED_CELLS = 3e-5, 1e-2  # after a step that was refused
 _INDEFINITE_CELLS = (
     1.0  # where the information is not positive definite: most of the step is the damping matrix's
 )
+_SURELY_LOWER = 1e-3  # nats still to rise, where that much cannot reach the likelihood that is known
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken, where there is one
 _MOST_SHARE = 1e9
 _BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
@@ -91,6 +92,7 @@ class Limits(NamedTuple):
         reshapes: the law changes more than the width of peaks: look at neighbours.
         warm: a start is of nearly the same law, not of the density.
         scan: look for other starts at few DN per electron.
+        quick: with the density, the first maximum that tells the gain will do.
         sandwich: the covariance is to hold even where the model does not.
     """
 
@@ -108,6 +110,7 @@ class Limits(NamedTuple):
     reshapes: bool
     warm: bool
     scan: bool
+    quick: bool
     sandwich: bool
 
 
@@ -117,8 +120,8 @@ class Goal(NamedTuple):
     Attributes:
         first: it comes from a start, not from a neighbour: it may warm up by EM steps.
         to_beat: give up once twice the expected rise would leave the log-likelihood below.
-        known: log-likelihood of a maximum known already: the climb ends where it heads for that one; infinite
-            without one.
+        known: log-likelihood of a maximum known already: the climb ends where it heads for that one, or
+            has all but reached a lower one; infinite without one.
         tied: 1/g moves sigma with it, so that ``sigma g`` stays: the profile of the read noise in e-.
     """
 
@@ -335,6 +338,8 @@ def _end_of(
 ) -> int:
     """Tell how a climb ends whose next step is Newton's own, or that it goes on."""
     if rise < limits.tolerance:
+        return CONVERGED
+    if rise < _SURELY_LOWER and loglik + 2.0 * _SURELY_LOWER < goal.known < math.inf:
         return CONVERGED
     if loglik + 2.0 * rise + 1.0 < goal.to_beat:
         return FAR_BELOW

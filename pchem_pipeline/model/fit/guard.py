@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.search_numba import CHI2, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, OUTLYING
-from pchem_pipeline.model.fit.tile_numba import FREEDOM, STATUS, Answers, Histograms
+from pchem_pipeline.model.fit.tile_numba import EVALUATIONS, FREEDOM, STATUS, Answers, Histograms
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT
 
 Pixels = NDArray[np.intp]
@@ -29,7 +29,7 @@ _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
 
 
 def fit_guarded(
-    fit: Callable[[Pixels], None],
+    fit: Callable[[Pixels, bool], None],
     leave_out: Callable[[Pixels, NDArray[np.float64]], NDArray[np.bool_]],
     given: Histograms,
     limits: Limits,
@@ -40,10 +40,11 @@ def fit_guarded(
     A good fit of all samples says itself which it does not expect. Otherwise both ends of the histograms are
     left out first, as much of them as may be outliers; where that says nothing, the samples that a gap cuts
     off. What these parameters expect then comes back, until the samples left out stay the same. Where that
-    fails, or where they are too many to be a few outliers, it is the fit of all samples.
+    fails, or where they are too many to be a few outliers, it is the fit of all samples, which is not fitted
+    twice. What is left after a cut only has to say what it expects, and is fitted quickly.
 
     Args:
-        fit: fits some pixels.
+        fit: fits some pixels; quickly (True): the first maximum that tells the gain will do.
         leave_out: leaves out what the last fit does not expect: from the number left out before, which it
             updates, to whether they are others.
         given: histograms; codes that are left out before stay so at first; out: those left out at last.
@@ -53,42 +54,75 @@ def fit_guarded(
     n = given.counts.shape[0]
     everything = np.arange(n)
     if limits.floor == 0.0:
-        fit(everything)
+        fit(everything, False)
         answers.out[:, OUTLYING] = 0.0
         return
-    guard = _Guard(
-        fit, leave_out, given, limits, answers, np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
-    )
+    counters = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.full(n, -1)
+    guard = _Guard(fit, leave_out, given, limits, answers, answers, *counters)
     left = given.mask == LEFT_OUT
     resumed = left.any(axis=1)
     guard_numba.cut_tile(given, everything, 0.0, np.empty((0, 0), np.uint8), guard.gone)
     far = guard.gone > 0
     guard.gone[:] = (given.counts * left).sum(axis=1) if resumed.any() else 0.0
-    fit(np.flatnonzero(~far | resumed))
+    fit(np.flatnonzero(~far | resumed), False)
     good = (_scores(answers) <= _MISFIT) | limits.cells
     suspicious = ~far & ~resumed & guard.suspicious(everything)
+    guard.keep(np.flatnonzero(suspicious))
     answers.out[~far & ~suspicious & ~resumed, OUTLYING] = 0.0
     guard.attempt[:] = np.where(resumed | far | ~good, _EXPECTED, _EXPECTED - 1)
     again, stuck = guard.check(np.flatnonzero(resumed), far)
     stuck = np.concatenate([stuck, np.flatnonzero(far & ~resumed | suspicious)])
     while again.size or stuck.size:
         active = np.sort(np.concatenate([again, guard.begin(stuck, far)]))
-        fit(active)
+        guard.fit_again(active)
         again, stuck = guard.check(active, far)
 
 
 @dataclass
 class _Guard:
-    """What the tail guard knows of n pixels (samples left out, attempt, passes of it), and works with."""
+    """What the tail guard knows of n pixels, and works with.
 
-    fit: Callable[[Pixels], None]
+    Attributes:
+        fit, leave_out, given, limits, answers: see :func:`fit_guarded`.
+        whole: answers for some pixels, all their samples counted.
+        gone: samples left out.
+        attempt, passes: the attempt, and fits of it.
+        place: in ``whole``; -1: not there.
+    """
+
+    fit: Callable[[Pixels, bool], None]
     leave_out: Callable[[Pixels, NDArray[np.float64]], NDArray[np.bool_]]
     given: Histograms
     limits: Limits
     answers: Answers
+    whole: Answers
     gone: NDArray[np.float64]
     attempt: NDArray[np.int64]
     passes: NDArray[np.int64]
+    place: NDArray[np.int64]
+
+    def keep(self, pixels: Pixels) -> None:
+        """Keep the answers of pixels of which all samples were fitted."""
+        self.whole = Answers(*(each[pixels] for each in self.answers))
+        self.place[pixels] = np.arange(pixels.size)
+
+    def fit_again(self, pixels: Pixels) -> None:
+        """Fit what the mask leaves of pixels, all of whose samples are not fitted twice."""
+        known = (self.place[pixels] >= 0) & (self.gone[pixels] == 0)
+        spent = self.answers.words[pixels[known], EVALUATIONS]
+        for each, of_all in zip(self.answers, self.whole, strict=True):
+            each[pixels[known]] = of_all[self.place[pixels[known]]]
+        self.answers.words[pixels[known], EVALUATIONS] = spent
+        pixels = pixels[~known]
+        quick = self._cut(pixels)
+        for some, quickly in ((pixels[quick], True), (pixels[~quick], False)):
+            if some.size:
+                self.fit(some, quickly)
+
+    def _cut(self, pixels: Pixels) -> NDArray[np.bool_]:
+        """Tell which pixels have just had their ends, or what a gap cuts off, left out."""
+        cut = (self.attempt[pixels] == _ENDS) | (self.attempt[pixels] == _CORE)
+        return np.asarray(cut & (self.passes[pixels] == 0))
 
     def suspicious(self, pixels: Pixels) -> NDArray[np.bool_]:
         """Tell which fits may have been led by outliers: by single samples or as a whole."""
@@ -133,7 +167,7 @@ class _Guard:
         failed |= ~np.isfinite(answers.out[pixels, OUTLYING])
         stuck, pixels = pixels[failed], pixels[~failed]
         before = self.gone[pixels]
-        changed = self.leave_out(pixels, self.gone)
+        changed = self.leave_out(pixels, self.gone) | self._cut(pixels)
         answers.out[pixels[~changed], OUTLYING] = before[~changed]
         pixels = pixels[changed]
         self.passes[pixels] += 1

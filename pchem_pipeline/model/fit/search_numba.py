@@ -520,6 +520,8 @@ def search_density(
             found = _climb_start(pixel, tools, clear, found, trial, best, out)
         if found.loglik > before and not _settled(pixel, best, clear, out)[1]:
             break
+        if limits.quick and found.loglik - null > limits.gap:
+            break
     if not best[n + STEP] > 0.0:
         return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, found.used, 0
     out[LOG_LIKELIHOOD] = found.loglik
