@@ -14,7 +14,9 @@ from pchem_pipeline.model.law.pixel_numba import AT, Pixel, Scratch, load, make_
 
 Array = NDArray[np.float64]
 
-LIMITS = Limits(-np.inf, 1e-8, 200, 0, True, False, 5.0, 0.5, 0.0, 0.0, 0.0, False, False, False, False, False)
+LIMITS = Limits(
+    -np.inf, 1e-8, 200, 0, True, False, 5.0, 0.5, 0.0, 0.0, 0.0, False, False, False, False, False
+)
 FREE = np.array([False])
 
 

@@ -103,7 +103,7 @@ class _Guard:
 
     def keep(self, pixels: Pixels) -> None:
         """Keep the answers of pixels of which all samples were fitted."""
-        self.whole = Answers(*(each[pixels] for each in self.answers))
+        self.whole = Answers._make(each[pixels] for each in self.answers)
         self.place[pixels] = np.arange(pixels.size)
 
     def fit_again(self, pixels: Pixels) -> None:
