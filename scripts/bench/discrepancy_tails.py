@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 LEVELS = (1e-2, 1e-3, 1e-4)
 SIGNIFICANCE = 0.005
 MOST_SAMPLES = 3e5
+_COLOURS = 10  # before they begin anew
 OWN = "data"  # what comes of the measured stack, not of the simulated ones
 
 
@@ -117,9 +118,10 @@ def draw_tails(records: Sequence[dict[str, Any]], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
-    for kind, p in _gathered(records).items():
-        if not kind.startswith(OWN):
-            axes.loglog(np.sort(p), np.arange(1, p.size + 1) / p.size, lw=1.2, label=kind)
+    simulated = {kind: p for kind, p in _gathered(records).items() if not kind.startswith(OWN)}
+    for i, (kind, p) in enumerate(simulated.items()):
+        style = "-" if i < _COLOURS else ":"
+        axes.loglog(np.sort(p), np.arange(1, p.size + 1) / p.size, style, lw=1.2, label=kind)
     axes.loglog([1e-6, 1], [1e-6, 1], "k--", lw=0.8)
     axes.set(xlabel="p-value", ylabel="share of clean stacks below it", xlim=(1e-6, 1), ylim=(1e-5, 1))
     axes.legend(fontsize=7)
