@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival
 from pchem_pipeline.effects.framework.effect import Effect
@@ -108,7 +109,10 @@ class AddedRounds:
                     now = self.gaps.gap(self.z.final, this.extended.mean, this.extended.replicates)
                 else:
                     now = after
-                against = "" if rest is None else unexplained_of_its_kind(parts[member], rest, this.null)
+                effect = this.added.hypotheses[member].effect
+                against = (
+                    "" if rest is None else unexplained_of_its_kind(effect, parts[member], rest, this.null)
+                )
                 if rest is not None and left >= _REST_OF_NAMED * (gap.value - now.value):
                     against = "too much of the gap is left beside it"
                 against = against or self._against(this, int(member), still)
@@ -256,15 +260,17 @@ def unexplained_of_its_own(part: FloatArray, rest: FloatArray, null: NullModel) 
     return _worst_words(np.abs(part) > _MOVED * null.std, rest, null)
 
 
-def unexplained_of_its_kind(part: FloatArray, rest: FloatArray, null: NullModel) -> str:
-    """Return the same of all in the families in which the signature of the effect stands, too.
+def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
+    """Return the same of all in the families in which the signature of the effect stands and in its place.
 
     What is missing there may be what makes its signature as well, and then this is not its name.
     """
+    place = "@" + Part(effect.region, effect.when).text
+    beside = np.array([not effect.everywhere and name.endswith(place) for name in null.names])
     weight = (part / null.std) ** 2
     families = np.array([STATISTICS[name].family for name in null.names])
     own = [f for f in set(families) if weight[families == f].sum() > _OF_SIGNATURE * weight.sum()]
-    return _worst_words(np.isin(families, own) | (weight > _MOVED**2), rest, null)
+    return _worst_words(np.isin(families, own) | beside | (weight > _MOVED**2), rest, null)
 
 
 def _worst_words(looked_at: NDArray[np.bool_], rest: FloatArray, null: NullModel) -> str:

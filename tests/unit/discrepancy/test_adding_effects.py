@@ -177,14 +177,22 @@ def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str)
 def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
     left: dict[str, float], words: str
 ) -> None:
-    names = ("frame.readout.variance", "frame.covariance", "shape.He4.mean")
-    null = NullModel.from_replicates(names, np.random.default_rng(3).standard_normal((40, 3)))
+    names = ("frame.readout.variance", "frame.covariance", "shape.He4.mean", "code.smooth@columns=0:8")
+    null = NullModel.from_replicates(names, np.random.default_rng(3).standard_normal((40, 4)))
+    everywhere = effect("frame_noise", 0.1)
+    placed = everywhere.at_place(Region.model_validate("columns=0:8"))
     rest = np.array([left.get(name, 0.0) for name in names])
-    assert unexplained_of_its_kind(np.array([100.0, 0.0, 1.0]), rest, null).startswith(words)
-    assert bool(unexplained_of_its_kind(np.array([100.0, 0.0, 1.0]), rest, null)) == bool(words)
+    part = np.array([100.0, 0.0, 1.0, 0.0])
+    for one in (everywhere, placed):
+        assert unexplained_of_its_kind(one, part, rest, null).startswith(words)
+        assert bool(unexplained_of_its_kind(one, part, rest, null)) == bool(words)
+    # what stands in its place, whatever it is
+    there = np.array([0.0, 0.0, 0.0, 6.0])
+    assert not unexplained_of_its_kind(everywhere, part, there, null)
+    assert unexplained_of_its_kind(placed, part, there, null).startswith("it leaves")
     # of what it moves itself, nothing else
-    assert not unexplained_of_its_own(np.array([100.0, 0.0, 1.0]), rest, null)
-    assert bool(unexplained_of_its_own(np.array([100.0, 9.0, 1.0]), rest, null)) == bool(words)
+    assert not unexplained_of_its_own(part, rest, null)
+    assert bool(unexplained_of_its_own(part + 9.0 * np.eye(4)[1], rest, null)) == bool(words)
 
 
 def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show() -> None:
