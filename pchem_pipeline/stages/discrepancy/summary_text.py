@@ -126,7 +126,8 @@ def _gap(found: Verdict) -> list[str]:
         words += f" -> {micronats(gap.after)}"
     words += f" micronats per sample (floor {micronats(gap.floor)}"
     if found.steps and math.isfinite(gap.closed_fraction):
-        words += f", {100 * gap.closed_fraction:.1f} % closed"
+        nearest = " by what is most like it" if found.verdict == "unexplained" else ""
+        words += f", {100 * gap.closed_fraction:.1f} % closed{nearest}"
     words += ")"
     for step in found.steps:
         for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo)):
