@@ -226,7 +226,7 @@ def _everywhere(hidden: str, settings: SimulateSettings, truth: TruthMaps) -> Ef
     if hidden != RANDOM:
         kinds = list(effect_class(hidden).typical())
         return kinds[0] if kinds else _clipping(settings, truth, high=False)
-    usable = [tag for tag, each in effect_classes().items() if not each.untestable]
+    usable = [tag for tag, each in effect_classes().items() if not (each.untestable or each.measured_only)]
     usable = [tag for tag in usable if tag == "clipping" or effect_class(tag).typical()]
     tag = usable[int(rng.integers(len(usable)))]
     kinds = list(effect_class(tag).typical())
