@@ -410,10 +410,11 @@ def _together(
 ) -> tuple[Together, float]:
     """Return what is moved alike, by the likelihood, and the share of it that is."""
     ratio = _log_ratio(laws, samples, moves, shares)
-    best = shares_of(ratio[None])[1] + _CLEAR
+    single = min(float(shares[1:].sum()), 1.0 - _LEAST)
+    best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + _CLEAR
     found: tuple[Together, float] = ("sample", 0.0)
     for together in _TOGETHER:
-        share, likelihood = shares_of(_of_groups(ratio, samples.place, together, shape)[None])
+        share, likelihood = shares_of(_of_groups(ratio, samples.place, together, shape)[None], single)
         if likelihood > best:
             best, found = likelihood, (together, float(share[0]))
     return found
@@ -439,17 +440,18 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
     return np.where(known, sums, -np.inf)
 
 
-def shares_of(ratio: FloatArray) -> tuple[FloatArray, float]:
+def shares_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[FloatArray, float]:
     """Return the shares of groups that are moved in each of several ways, and what they gain, nats.
 
     By expectation and maximisation.
 
     Args:
         ratio: log likelihood of each group moved, over that of the group as it should be, shape (ways, n).
+        first: share of each from which the steps begin.
     """
     ratio = ratio[:, np.isfinite(ratio).any(axis=0)]
     every = np.concatenate([np.zeros((1, ratio.shape[1])), ratio])
-    share = np.full(len(every), _FIRST_SHARE)
+    share = np.full(len(every), first)
     share[0] -= share.sum() - 1.0
     for _ in range(_STEPS):
         log = every + np.log(np.maximum(share, _NOTHING))[:, None]

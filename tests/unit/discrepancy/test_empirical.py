@@ -63,12 +63,16 @@ def averaged(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return code
 
 
-def drawn(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def drawn(strength: float):
     """Draw samples towards the one delivered before."""
-    code = codes(dn)
-    for t in range(1, FRAMES):
-        code[t] = codes(dn[t] + 2.0 * np.sign(code[t - 1] - dn[t]))
-    return code
+
+    def move(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        code = codes(dn)
+        for t in range(1, FRAMES):
+            code[t] = codes(dn[t] + strength * np.sign(code[t - 1] - dn[t]))
+        return code
+
+    return move
 
 
 def late(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -124,7 +128,8 @@ def test_shifts_are_measured(share: float, shift: int) -> None:
     ("move", "share", "wanted", "together"),
     [
         (averaged, 0.1, Move(towards=(-1, 0, 0), part=0.5, within_dn=6), "sample"),
-        (drawn, 1.0, Move(towards=(-1, 0, 0), shift_dn=2), "sample"),
+        (drawn(2.0), 1.0, Move(towards=(-1, 0, 0), shift_dn=2), "sample"),
+        (drawn(0.7), 0.7, Move(towards=(-1, 0, 0), shift_dn=1), "sample"),
         (late, 0.1, Move(towards=(0, 0, -1)), "row"),
         (slipped, 0.1, Move(towards=(0, 0, 1)), "rest_of_row"),
         (swapped, 0.1, Move(towards=(0, 1, 0)), "row"),
@@ -140,7 +145,7 @@ def test_what_depends_on_a_neighbour_is_measured(
     assert found.together == together
     assert found.exchange == ("even" if move is swapped else None)
     # the first column of a late row has no sample beside it; a few samples are taken for other moves
-    assert found.share == pytest.approx(share, rel=0.15)
+    assert found.share == pytest.approx(share, rel=0.25)
     assert neighbour_words(wanted.towards) in found.words() or found.exchange
 
 
