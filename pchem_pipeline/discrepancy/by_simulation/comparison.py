@@ -259,8 +259,9 @@ def _all_seen(refitter: Refitter, one: Refitted, known: dict[frozenset[str], Ref
         one: the set.
         known: sets at their best fit, by their tags; those that are fitted here come to them.
     """
-    if len(one.hypotheses) == 1:
-        return True
+    if len(one.tags) == 1:
+        # the same effect in two places: without it nothing is left to compare with
+        return len(one.hypotheses) == 1
     noise = np.sqrt(np.diag(refitter.noise(one.covariance, len(one.vectors)).covariance))
     if not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
