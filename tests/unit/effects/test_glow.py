@@ -10,6 +10,7 @@ from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
+from pchem_pipeline.effects.estimators.spots import best_spot
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.glow import Glow
 from pchem_pipeline.effects.framework.spot import spot_image
@@ -93,3 +94,12 @@ def test_relatives_glow_nowhere():
         evidence = seen(taken(truth, *hidden, n_frames=1500, seed=31 + number))
         assert Glow.estimate(evidence) == []
     assert Glow.estimate(replace(evidence, time=None)) == []
+
+
+def test_a_spot_between_the_cells_is_no_guess() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        # cells far wider than the narrowest spot, and noise only: its far tail would fit with any peak
+        noise = rng.normal(0.0, 0.01, (4, 4))
+        spot = best_spot(noise, np.full((4, 4), 0.01), np.ones((4, 4)), (128, 128))
+        assert spot is None or spot.peak < 1.0
