@@ -98,8 +98,8 @@ def test_relatives_glow_nowhere():
 
 def test_a_spot_between_the_cells_is_no_guess() -> None:
     rng = np.random.default_rng(5)
-    for _ in range(5):
+    for _ in range(12):
         # cells far wider than the narrowest spot, and noise only: its far tail would fit with any peak
-        noise = rng.normal(0.0, 0.01, (4, 4))
-        spot = best_spot(noise, np.full((4, 4), 0.01), np.ones((4, 4)), (128, 128))
+        noise = rng.normal(0.0, 0.01, (2, 2))
+        spot = best_spot(noise, np.full((2, 2), 0.01), np.ones((2, 2)), (64, 64))
         assert spot is None or spot.peak < 1.0
