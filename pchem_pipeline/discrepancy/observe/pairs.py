@@ -33,9 +33,10 @@ MODES = ("row", "column", "frame")
 PERIOD = 32
 #: Cells along an edge of the sensor, for lines; half as many for frames.
 _CELLS = 64
+#: Of each table of sums of products: two channels and the counts, as gathered and as told.
+_COPIES = 11
 #: Samples count as no more than so many standard deviations: a track of a particle is no common mode.
 _CLIP = 6.0
-_CHUNK_SAMPLES = 1 << 22
 
 
 class FrameBlocks(Protocol):
@@ -86,6 +87,7 @@ class Samples:
         start: row of the first one in ``tables``, (y, x).
         tables: k and r of each code over their standard deviation, (2, rows).
         usable: pixels that count, (y, x).
+        most: samples that are looked at at a time, whole frames.
     """
 
     frames: FrameBlocks
@@ -94,6 +96,7 @@ class Samples:
     start: NDArray[np.int32]
     tables: Float32Array
     usable: BoolArray
+    most: int = 1 << 22
 
     @classmethod
     def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
@@ -117,10 +120,11 @@ class Samples:
         pixels = pixel_statistics(laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), shape)
         usable = pixels.usable
         first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T.astype(np.int32)
-        tables = laws.tables.T.copy()
-        of = np.repeat(np.arange(length.size), np.where(laws.good, laws.support[:, 1], 0))
+        codes = np.where(laws.good, laws.support[:, 1], 0)
+        tables = laws.tables[: 1 + codes.sum()].T.copy()
         for channel, variance in enumerate((pixels.charge, pixels.readout)):
-            tables[channel, 1 : 1 + of.size] /= np.sqrt(np.where(usable, variance, 1.0)).ravel()[of]
+            deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
+            tables[channel, 1:] /= np.repeat(deviation, codes)
         np.clip(tables, -_CLIP, _CLIP, out=tables)
         first, last, start = (values.reshape(shape) for values in (first, first + length - 1, start))
         return cls(frames, first, last, start, tables, usable)
@@ -141,7 +145,7 @@ class Samples:
         box = rows, columns
         first, last, offset = self.first[box], self.last[box], (self.start - self.first)[box]
         weight = self.usable[box].astype(np.float32)
-        for block in self.frames.blocks(max(1, _CHUNK_SAMPLES // self.usable.size)):
+        for block in self.frames.blocks(max(1, self.most // self.usable.size)):
             at = block[(slice(None), *box)].astype(np.int32)
             np.clip(at, first, last, out=at)
             at += offset
@@ -231,6 +235,13 @@ def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
         for each, u in zip(gathered, chunk, strict=True):
             each.add(u)
     return [_told(each, counted, samples.n_frames) for each in gathered]
+
+
+def pairs_bytes(shape: tuple[int, int]) -> int:
+    """Return the memory that :func:`pairs_of` takes for a sensor of some rows and columns, beside its frames."""
+    y, x = (min(n, _CELLS) for n in shape)
+    v, u = (-(-n // 2) if n > _CELLS // 2 else n for n in (y, x))
+    return _COPIES * 8 * (y * x * (y + x) + (v * u) ** 2)
 
 
 class _Gathered:

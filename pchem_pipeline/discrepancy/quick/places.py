@@ -14,6 +14,7 @@ from pchem_pipeline.discrepancy.scan import scan_map
 from pchem_pipeline.effects.framework.region import Region
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 #: Cells along an edge of the maps that are scanned; of a larger sensor pixels are taken together.
@@ -72,39 +73,66 @@ def block_deviations(sums: StackSums) -> FloatArray:
     return np.asarray(means - np.median(means, axis=(1, 2))[:, None, None])
 
 
-def sensor_place(name: str, values: FloatArray, significance: float) -> SensorPlace | None:
+@dataclass(frozen=True)
+class CellMap:
+    """Clipped sums over cells of a map of the sensor whose pixels are N(0, 1) where nothing is wrong.
+
+    Attributes:
+        rows, columns: edges of the cells, pixels.
+        sums: of the values, (cell y, cell x).
+        counts: pixels that have one.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    sums: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> CellMap:
+        """Begin with no pixel of a sensor of some rows and columns."""
+        rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in shape)
+        size = rows.size - 1, columns.size - 1
+        return cls(rows, columns, np.zeros(size), np.zeros(size))
+
+    @classmethod
+    def of(cls, values: FloatArray) -> CellMap:
+        """Sum a whole map, (y, x); NaN where a pixel has no value."""
+        cells = cls.empty((values.shape[0], values.shape[1]))
+        cells.add(values)
+        return cells
+
+    def add(self, values: FloatArray, first: int = 0) -> None:
+        """Add rows of the map from the row ``first`` on, (y, x)."""
+        some = np.isfinite(values)
+        kept = np.where(some, np.clip(values, -_CLIP, _CLIP), 0.0)
+        at = np.searchsorted(self.rows, np.arange(first, first + values.shape[0]), side="right") - 1
+        for total, part in ((self.sums, kept), (self.counts, some.astype(np.float64))):
+            np.add.at(total, at, np.add.reduceat(part, self.columns[:-1], axis=1))
+
+    def mask(self, cells: BoolArray) -> BoolArray:
+        """Return the pixels of some cells, (y, x)."""
+        return np.repeat(np.repeat(cells, np.diff(self.rows), axis=0), np.diff(self.columns), axis=1)
+
+
+def sensor_place(name: str, cells: CellMap, significance: float) -> SensorPlace | None:
     """Return the part of the sensor where a map stands out most; None where it is everywhere alike.
 
     Args:
         name: of the map, as :func:`sensor_maps` calls it.
-        values: the map.
+        cells: the map.
         significance: largest probability of a chance.
     """
-    coarse, usable, edges = _coarse(values)
+    usable = cells.counts > 0
+    # standard normal as the pixels are
+    scaled = cells.sums / np.sqrt(np.maximum(cells.counts, 1.0))
     places = scan_map(
-        coarse, usable, significance=significance, most=1, single=False, next_along=_NEXT_ALONG.get(name)
+        scaled, usable, significance=significance, most=1, single=False, next_along=_NEXT_ALONG.get(name)
     )
     if not places:
         return None
-    cells = places[0].region.mask(coarse.shape)
-    mask = np.repeat(np.repeat(cells, np.diff(edges[0]), axis=0), np.diff(edges[1]), axis=1)
-    some = np.isfinite(values)
-    inside, outside = some & mask, some & ~mask
-    if not (inside.any() and outside.any()):
+    inside = places[0].region.mask((usable.shape[0], usable.shape[1]))
+    if not (usable[inside].any() and usable[~inside].any()):
         return None
-    means = [float(np.clip(values[part], -_CLIP, _CLIP).mean()) for part in (inside, outside)]
-    return SensorPlace(Region.of_mask(mask), places[0].p, means[0], means[1])
-
-
-def _coarse(values: FloatArray) -> tuple[FloatArray, BoolArray, tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Return a map of cells, standard normal as its pixels are, which of them have any, and their edges."""
-    ny, nx = values.shape
-    rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in (ny, nx))
-    some = np.isfinite(values)
-    kept = np.where(some, np.clip(values, -_CLIP, _CLIP), 0.0)
-
-    def summed(of: NDArray[np.float64]) -> FloatArray:
-        return np.asarray(np.add.reduceat(np.add.reduceat(of, rows[:-1], axis=0), columns[:-1], axis=1))
-
-    count = summed(some.astype(np.float64))
-    return summed(kept) / np.sqrt(np.maximum(count, 1.0)), count > 0, (rows, columns)
+    means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]
+    return SensorPlace(Region.of_mask(cells.mask(inside)), places[0].p, means[0], means[1])

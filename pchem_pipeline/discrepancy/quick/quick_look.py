@@ -23,7 +23,13 @@ from scipy import special
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
-from pchem_pipeline.discrepancy.quick.places import SensorPlace, block_deviations, sensor_maps, sensor_place
+from pchem_pipeline.discrepancy.quick.places import (
+    CellMap,
+    SensorPlace,
+    block_deviations,
+    sensor_maps,
+    sensor_place,
+)
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -141,7 +147,8 @@ _LOCAL = ("neighbours_x", "neighbours_y", "lag")
 def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
     maps = sensor_maps(sums)
-    places = {name: sensor_place(name, values, SIGNIFICANCE / len(maps)) for name, values in maps.items()}
+    limit = SIGNIFICANCE / len(maps)
+    places = {name: sensor_place(name, CellMap.of(values), limit) for name, values in maps.items()}
     found = []
     for check in checks:
         place = places.get(_MAP_OF.get(check.name, ""))

@@ -4,7 +4,7 @@ Three kinds of sums are looked at. Those of the stage ``histogram`` say whether 
 samples resemble each other and whether levels wander; the histograms of all pixels, against the law of their
 fit, say whether shapes and tails differ by place; and one more pass over the frames says whether the pixels
 of a row, a column or a frame move together in some place. Rows are done in bands, so that the tables of their
-pixels and a block of frames take no more memory than a gigabyte, whatever the sensor.
+pixels and a block of frames take the memory that the run may have, or no more than 1.4 GB, whatever the sensor.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
-from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples
+from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples, pairs_bytes
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import SensorPlace, sensor_maps, sensor_place
+from pchem_pipeline.discrepancy.quick.places import CellMap, SensorPlace, sensor_maps, sensor_place
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
@@ -43,8 +45,14 @@ IntArray = NDArray[np.int64]
 _SIGNIFICANCE = 1e-3
 #: The same of shapes: they rest on fits, whose errors are not quite normal.
 _SIGNIFICANCE_OF_SHAPES = 1e-6
-#: Codes of the tables of a band at most (two numbers of four bytes each), and rows at least.
+#: Codes of the tables of a band at most, and rows at least.
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 16
+#: Bytes of a band for each code of a law, for each pixel, and for each sample that is looked at at once.
+_CODE_BYTES, _PIXEL_BYTES, _SAMPLE_BYTES = 20, 800, 28
+#: Codes of a law: so many times those between the smallest and the largest sample, and some more.
+_SUPPORT, _PEAK_CODES = 1.2, 8
+#: Such samples at most.
+_MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
 _MOST_SAMPLES = 1 << 31
 _BLOCK = 64  # frames that are read at a time where not all are
@@ -107,7 +115,9 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
     done = all(_complete(context, stage) for stage in ("histogram", "fit"))
     if math.prod(shape) <= compared or not done or model is None:
         return found
-    here, shares = places_of_bands(store, source, plain=not model.effects)
+    limit = context.config.compute.max_memory
+    memory = None if limit is None else (limit << 20) - resident_bytes()
+    here, shares = places_of_bands(store, source, plain=not model.effects, memory=memory)
     return Survey({**found.places, **here}, {**found.shares, **shares})
 
 
@@ -125,17 +135,16 @@ def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, 
     """
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
-    maps = sensor_maps(sums)
-    return _places(maps, _SIGNIFICANCE)
+    return _places({name: CellMap.of(v) for name, v in sensor_maps(sums).items()}, _SIGNIFICANCE)
 
 
-def _places(maps: Mapping[str, FloatArray], significance: float) -> dict[str, SensorPlace]:
-    found = {name: sensor_place(name, values, significance / len(maps)) for name, values in maps.items()}
+def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, SensorPlace]:
+    found = {name: sensor_place(name, cells, significance / len(maps)) for name, cells in maps.items()}
     return {name: place for name, place in found.items() if place is not None}
 
 
 def places_of_bands(
-    store: RunStore, source: FrameSource, *, plain: bool = True
+    store: RunStore, source: FrameSource, *, plain: bool = True, memory: int | None = None
 ) -> tuple[dict[str, SensorPlace], dict[str, float]]:
     """Return where histograms and pairs of pixels stand out, and the share of the samples looked at.
 
@@ -143,20 +152,26 @@ def places_of_bands(
         store: the run, with histograms and fit.
         source: its frames.
         plain: the pixels were fitted without effects, so that their histograms follow the plain law.
+        memory: bytes that this may take: lower bands; None: what the highest ones take.
+
+    Raises:
+        ConfigError: it is not enough for the lowest ones.
     """
     n, ny, nx = source.shape
-    rows = max(_FEWEST_ROWS, _MOST_CODES // (nx * store.array("histogram/counts").shape[2]))
+    rows, at_once = _band_size(store, (ny, nx), memory)
     bands = [(first, min(first + rows, ny)) for first in range(0, ny, rows)]
     numbers = _spread_frames(n, _MOST_SAMPLES // (ny * nx))
-    maps = {name: np.full((ny, nx), np.nan) for name in (*(f"score.{s}" for s in SCORES), "goodness")}
+    maps = {name: CellMap.empty((ny, nx)) for name in (*(f"score.{s}" for s in SCORES), "goodness")}
     places: dict[str, SensorPlace] = {}
     for first, last in bands:
         fitted, laws = _laws(store, (first, last))
         for name, values in _shapes(laws, fitted.usable.shape).items():
-            maps[name][first:last] = values
+            maps[name].add(values, first)
         if not laws.good.any():
             continue
         samples = Samples.by_laws(_Band(source, (first, last), numbers), laws, fitted)
+        samples = replace(samples, most=at_once)
+        del laws
         for each in scan_pairs(samples, significance=_SIGNIFICANCE / len(bands), most=1):
             name = f"pairs.{each.mode}.{CHANNELS[each.channel]}"
             mask = np.zeros((ny, nx), np.bool_)
@@ -175,6 +190,38 @@ def places_of_bands(
         places |= _places(maps, _SIGNIFICANCE_OF_SHAPES)
         shares[SHAPES] = 1.0
     return places, shares
+
+
+def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> tuple[int, int]:
+    """Return the rows of a band, and the samples of its frames that are looked at at once.
+
+    Args:
+        store: the run.
+        shape: rows and columns of the sensor.
+        memory: bytes that both may take; None: as much as they can use.
+
+    Raises:
+        ConfigError: it is not enough.
+    """
+    ny, nx = shape
+    counts = store.array("histogram/counts")
+    fewest = min(ny, _FEWEST_ROWS)
+    rows = max(fewest, min(ny, _MOST_CODES // (nx * counts.shape[2])))
+    if memory is None:
+        return rows, _MOST_AT_ONCE
+    span = store.read("histogram/maximum") - store.read("histogram/minimum")
+    codes = float(span.mean(axis=1).max()) * _SUPPORT + _PEAK_CODES
+    pixel = counts.shape[2] * counts.dtype.itemsize + codes * _CODE_BYTES + _PIXEL_BYTES + _SAMPLE_BYTES
+    left = memory - pairs_bytes((rows, nx))
+    at_once = min(_MOST_AT_ONCE, max(left, 0) // 4 // _SAMPLE_BYTES)
+    rows = min(rows, int((left - at_once * _SAMPLE_BYTES) / (nx * pixel)))
+    if rows < fewest:
+        lacking = fewest * nx * pixel * 4 / 3 - left
+        raise ConfigError(
+            f"discrepancy looks at {fewest} rows of the sensor at least, and lacks {math.ceil(lacking / 2**20)} "
+            "MiB for them: raise compute.max_memory (--max-memory)"
+        )
+    return rows, at_once
 
 
 def _spread_frames(n: int, most: int) -> IntArray:

@@ -1,10 +1,14 @@
 """Every pixel and every frame of a run is looked at for places that stand out."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from helpers.quick_stacks import stack, sums_of
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
+from pchem_pipeline.discrepancy.observe.pairs import pairs_bytes
 from pchem_pipeline.discrepancy.verdict import Examined
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -37,7 +41,7 @@ class Store:
     def __init__(self, values):
         histograms = histogram_frames(values)
         maps = fitted_maps(values, np.zeros(values.shape[1:], bool))
-        names = ("counts", "origin", "under", "over")
+        names = ("counts", "origin", "under", "over", "minimum", "maximum")
         self.arrays = {f"histogram/{name}": getattr(histograms, name) for name in names}
         for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn"):
             self.arrays[f"fit/{name}"] = getattr(maps, name)
@@ -94,6 +98,27 @@ def test_frames_are_spread_over_the_run_where_not_all_can_be_looked_at_and_it_is
     assert 0.5 < shares[PAIRS] < 0.7
     assert SHAPES not in shares
     assert set(places) == {"pairs.row.readout"}
+
+
+def test_bands_are_as_high_as_the_memory_allows_and_keep_to_it(tap):
+    source, store = tap
+    places_of_bands(store, source)  # compiled
+    for memory in (pairs_bytes(SHAPE) + (6 << 20), pairs_bytes(SHAPE) + (40 << 20)):
+        source.read[:] = 0
+        tracemalloc.start()
+        places, _ = places_of_bands(store, source, memory=memory)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < memory
+        assert source.read.min() >= 1
+        assert places["pairs.row.readout"].region.mask(SHAPE)[:, 20:28].any()
+
+
+def test_too_little_memory_for_the_lowest_band_is_told_in_one_line(tap):
+    source, store = tap
+    for memory in (-1 << 20, 1 << 16, pairs_bytes(SHAPE)):
+        with pytest.raises(ConfigError, match=r"16 rows .* lacks \d+ MiB .*--max-memory"):
+            places_of_bands(store, source, memory=memory)
 
 
 def test_nothing_stands_out_of_nothing_nor_does_what_all_pixels_share():
