@@ -116,6 +116,9 @@ class FrameStream:
             if number + 1 < self.n_blocks:
                 pending = self._request(number + 1)
             yield self._frames(number)[0], parts
+            del parts
+        del pending
+        self._buffers = []
 
     def _request(self, number: int) -> tuple[list[NDArray[Any]], Future[None]]:
         t0, t1 = self._frames(number)

@@ -206,6 +206,7 @@ class StackCounter:
                     for rows, part in zip(self._bands, parts, strict=True)
                 ]
             call_all(tasks, self._workers)
+            del parts, tasks  # the frames are not held any more while results are written
         call_all([counter.finish for counter in self._counters], self._workers)
 
     def _copy(self, start: int, rows: Rows, part: NDArray[Any]) -> None:
@@ -253,11 +254,16 @@ class _BandCounter:
         """Write all that was not written on the way."""
         state = self._counter.open_sums()
         histograms, covariances = self._counter.finish()
+        # it knows this one, and this one it: what both hold would wait for the search for cyclic garbage
+        del self._counter
         for each in self._series.values():
             each.flush()
         opened = open_store(self._store)
         for name, values in vars(histograms).items():
-            opened.write(f"histogram/{name}", (self._rows, *(slice(None),) * (values.ndim - 1)), values)
+            # chunk by chunk: of each that is written there are copies in memory
+            step = opened.array(f"histogram/{name}").chunks[1]
+            for x in range(0, values.shape[1], step):
+                opened.write(f"histogram/{name}", (self._rows, slice(x, x + step)), values[:, x : x + step])
         if covariances is not None:
             for name, values in vars(covariances).items():
                 opened.write(f"summary/{name}", (self._rows, slice(None)), values)

@@ -150,7 +150,9 @@ def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStre
     job = CountJob(
         context.store.path, frames.shape, bins, config.histogram, copies=config.input.mode == "copy"
     )
-    StackCounter(job, stream.bands, workers).count(itertools.chain([first], blocks), context.stop.check)
+    everything = itertools.chain([first], blocks)
+    del first  # so that nothing holds the frames when they are counted
+    StackCounter(job, stream.bands, workers).count(everything, context.stop.check)
     return True
 
 
