@@ -82,6 +82,11 @@ class Replicate:
         return int(n_frames * self.maps.usable.size)
 
     @property
+    def memory(self) -> int:
+        """Bytes that it takes, about: for each sample, and for the histogram and the law of each pixel."""
+        return 8 * self.samples + (self.maps.usable.size << 13)
+
+    @property
     def fits(self) -> int:
         """How often its pixels are fitted."""
         return 1 if self.acquisition.other is None else 3

@@ -238,7 +238,7 @@ def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
 
 
 def pairs_bytes(shape: tuple[int, int]) -> int:
-    """Return the memory that :func:`pairs_of` takes for a sensor of some rows and columns, beside its frames."""
+    """Return the memory that :func:`pairs_of` takes for a sensor (rows, columns), beside its frames."""
     y, x = (min(n, _CELLS) for n in shape)
     v, u = (-(-n // 2) if n > _CELLS // 2 else n for n in (y, x))
     return _COPIES * 8 * (y * x * (y + x) + (v * u) ** 2)

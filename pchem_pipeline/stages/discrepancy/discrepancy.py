@@ -170,7 +170,12 @@ class _Mapper:
         self.total += len(units)
         try:
             summaries = self.context.run_units(
-                list(units.values()), _simulate, unit_name="stack", by_tiles=False, total=self.total
+                list(units.values()),
+                _simulate,
+                unit_name="stack",
+                by_tiles=False,
+                total=self.total,
+                unit_bytes=max((r.memory for r in replicates), default=0),
             )
         except Exception as error:
             raise _Ended(error) from error

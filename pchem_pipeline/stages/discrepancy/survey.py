@@ -4,7 +4,7 @@ Three kinds of sums are looked at. Those of the stage ``histogram`` say whether 
 samples resemble each other and whether levels wander; the histograms of all pixels, against the law of their
 fit, say whether shapes and tails differ by place; and one more pass over the frames says whether the pixels
 of a row, a column or a frame move together in some place. Rows are done in bands, so that the tables of their
-pixels and a block of frames take the memory that the run may have, or no more than 1.4 GB, whatever the sensor.
+pixels and a block of frames take the memory that the run may have, or no more than 1.4 GB.
 """
 
 from __future__ import annotations
@@ -216,10 +216,10 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
     at_once = min(_MOST_AT_ONCE, max(left, 0) // 4 // _SAMPLE_BYTES)
     rows = min(rows, int((left - at_once * _SAMPLE_BYTES) / (nx * pixel)))
     if rows < fewest:
-        lacking = fewest * nx * pixel * 4 / 3 - left
+        lacking = math.ceil((fewest * nx * pixel * 4 / 3 - left) / 2**20)
         raise ConfigError(
-            f"discrepancy looks at {fewest} rows of the sensor at least, and lacks {math.ceil(lacking / 2**20)} "
-            "MiB for them: raise compute.max_memory (--max-memory)"
+            f"discrepancy looks at {fewest} rows of the sensor at least, and lacks {lacking} MiB "
+            "for them: raise compute.max_memory (--max-memory)"
         )
     return rows, at_once
 
