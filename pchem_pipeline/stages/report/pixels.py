@@ -222,7 +222,10 @@ def _poor(fit: Mapping[str, NDArray[Any]], status: NDArray[Any]) -> list[tuple[s
 
 
 def _smallest(values: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    """Return the places of the n smallest values in their order, of equal ones the first."""
     known = np.flatnonzero(np.isfinite(values))
+    if known.size > n:  # sorting all pixels takes ten times as long
+        known = known[values[known] <= np.partition(values[known], n - 1)[n - 1]]
     order = np.argsort(values[known], kind="stable")[:n]
     return np.asarray(known[order], dtype=np.int64)
 
