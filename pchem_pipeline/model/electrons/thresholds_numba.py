@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.ensemble.ensemble_numba import capacity, poisson_weights
+from pchem_pipeline.model.ensemble.ensemble_numba import capacity, occupied, poisson_weights
 from pchem_pipeline.model.law.normal_numba import NARROW, REACH, normal_mass
 from pchem_pipeline.model.law.simd_math_numba import simd_tail
 from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, simd_load, simd_store
@@ -20,6 +20,7 @@ IntArray = NDArray[np.int64]
 
 _LEAST_VARIANCE = 1e-6  # DN^2
 _LEAST_LIKELY = 1e-17  # of an electron number
+_NEGLIGIBLE = 1e-13  # of what is expected of an electron number
 _SURE = 0.02  # of a code: thresholds of densities and of masses are nearer to each other
 _INFINITE = 1e300
 _EDGE, _TAIL = 0, 1
@@ -48,11 +49,13 @@ def sum_by_thresholds(
     """
     weights = np.zeros(capacity(parameters[:, 0]))
     rows = np.empty((2, weights.size + 1 + 2 * SIMD_WIDTH))
+    logs = np.log(np.arange(1.0, weights.size + 1.0))
     beyond = np.int64(0)
     for p in range(origin.size):
         exposure, step, bias = parameters[p, 0], 1.0 / parameters[p, 1], parameters[p, 2]
         variance = max(parameters[p, 3] * parameters[p, 3] - QUANTISATION_VARIANCE, _LEAST_VARIANCE)
         low, high = poisson_weights(exposure, weights)
+        log_exposure = math.log(exposure) if exposure > 0.0 else -_INFINITE
         while low < high and weights[low] < _LEAST_LIKELY:
             low += 1
         while high > low and weights[high] < _LEAST_LIKELY:
@@ -60,34 +63,55 @@ def sum_by_thresholds(
         rows[_EDGE, 0] = -_INFINITE
         for k in range(low, high):
             rows[_EDGE, k + 1 - low] = max(
-                _last_code(k, exposure, step, bias, variance, weights) + 0.5, rows[_EDGE, k - low]
+                _last_code(k, logs[k] - log_exposure, step, bias, variance, weights) + 0.5,
+                rows[_EDGE, k - low],
             )
         n, sd, right = high + 1 - low, math.sqrt(variance), 0.0
         rows[_EDGE, n : n + 1 + SIMD_WIDTH] = _INFINITE
         for j in range(n):
+            if weights[low + j] < _NEGLIGIBLE:  # all to its own number
+                right += weights[low + j]
+                if low + j < expected.size:
+                    expected[low + j] += weights[low + j]
+                continue
             right += _spread(rows, j, n, bias + (low + j) * step, sd, weights[low + j], low, expected)
         errors[p] = 1.0 - right
         # farther from all levels than any sample of the law: the nearest
         ends = bias + low * step, bias + high * step
         farthest = max(_reach(weights[low]) * sd, step), max(_reach(weights[high]) * sd, step)
         bottom, top = ends[0] - farthest[0] - 0.5, ends[1] + farthest[1] + 0.5
-        j = 0
-        for b in range(counts.shape[1]):
-            c = np.int64(counts[p, b])
-            if c == 0:
-                continue
-            dn = float(origin[p] + b)
-            while dn > rows[_EDGE, j + 1]:
-                j += 1
-            k = low + j
-            if exposure > 0.0 and not bottom <= dn <= top:
-                k = max(math.floor((dn - bias) / step + 0.5), 0)
-            k = min(k, largest)
-            if k < observed.size:
-                observed[k] += c
-            else:
-                beyond += c
+        begin, end = occupied(counts, p)
+        if exposure > 0.0:
+            while begin < end and origin[p] + begin < bottom:
+                beyond += _add_nearest(counts[p, begin], origin[p] + begin, bias, step, largest, observed)
+                begin += 1
+            while begin < end and origin[p] + end - 1 > top:
+                end -= 1
+                beyond += _add_nearest(counts[p, end], origin[p] + end, bias, step, largest, observed)
+        for j in range(n):
+            stop = int(min(max(np.floor(rows[_EDGE, j + 1]) - origin[p] + 1.0, float(begin)), float(end)))
+            samples = np.int64(0)
+            for b in range(begin, stop):
+                samples += np.int64(counts[p, b])
+            beyond += _add(samples, low + j, largest, observed)
+            begin = stop
     return beyond
+
+
+@kernel(borrows=True)
+def _add(samples: int, k: int, largest: int, observed: IntArray) -> int:
+    """Add samples of an electron number; return them where there is no place for it."""
+    k = min(k, largest)
+    if k >= observed.size:
+        return samples
+    observed[k] += samples
+    return 0
+
+
+@kernel(borrows=True)
+def _add_nearest(samples: int, dn: int, bias: float, step: float, largest: int, observed: IntArray) -> int:
+    """Add samples of a code to the electron number whose level is the nearest."""
+    return _add(np.int64(samples), max(math.floor((dn - bias) / step + 0.5), 0), largest, observed)
 
 
 @kernel
@@ -97,17 +121,15 @@ def _reach(likely: float) -> float:
 
 
 @kernel(borrows=True)
-def _last_code(
-    k: int, exposure: float, step: float, bias: float, variance: float, weights: FloatArray
-) -> float:
-    """Return the last code at which k is more probable than k + 1.
+def _last_code(k: int, odds: float, step: float, bias: float, variance: float, weights: FloatArray) -> float:
+    """Return the last code at which k is more probable than k + 1; ``odds`` is the logarithm of (k + 1) / H.
 
     Where the densities are equal (Hendrickson et al. 2023, eq. demarg_K_eqn); the masses of the code decide
     where that is too near to a whole code.
     """
     middle = bias + (k + 0.5) * step
     spread = variance + (QUANTISATION_VARIANCE if variance > NARROW else 0.0)
-    shift = spread / step * math.log((k + 1.0) / exposure) if exposure > 0.0 else _INFINITE
+    shift = spread / step * odds if odds < _INFINITE else _INFINITE
     code = math.floor(min(middle + shift, _INFINITE))
     part = middle + shift - code
     near = _SURE * (1.0 + abs(shift))

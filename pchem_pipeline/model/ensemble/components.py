@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
+#: Expected number of samples of k electrons, in one frame of all pixels, below which their tails decide.
+_FEW_ELECTRONS = 1e-12
 _SYMBOLS = ("H", "g", "mu", "sigma2")
 
 #: Parameters held constant in each of the sixteen cases of Appendix B, from none to all four.
@@ -172,22 +175,32 @@ def component_widths(pixels: UsablePixels, n_k: int) -> Components:
     step = 1.0 / gain
     centres = (float(bias.mean()), float(step.mean()))
     mu, a = bias - centres[0], step - centres[1]
-    table = np.stack([sigma**2, mu, a, mu * mu, mu * a, a * a, pixels.read_noise_e**2])
-    constant_h = table.mean(axis=1)
+    table = np.stack([sigma**2, mu, a, mu * mu, mu * a, a * a, pixels.read_noise_e**2], axis=1)
+    constant_h, moments = table.mean(axis=0), _weighted_moments(exposure, table, n_k)
     mean, nuced, variance = np.empty(n_k), np.empty(n_k), np.empty((len(COMPONENT_CASES), n_k))
-    with np.errstate(divide="ignore"):
-        log_exposure = np.log(exposure)
-    for k in range(n_k):
-        log_weight = (k * log_exposure if k else 0.0) - exposure
-        largest = log_weight.max()
-        weight = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
-        weighted = table @ weight / weight.sum()
+    for k, weighted in enumerate(moments):
         mean[k] = centres[0] + weighted[1] + k * (centres[1] + weighted[2])
         nuced[k] = weighted[6]
         for row, case in enumerate(COMPONENT_CASES):
             chosen = constant_h if "H" in case else weighted
             variance[row, k] = _case_variance(chosen, case, k, float(constant_h[0]))
     return Components(mean, variance, nuced)
+
+
+def _weighted_moments(exposure: FloatArray, table: FloatArray, n_k: int) -> FloatArray:
+    """Return the means of each column of a table of pixels, weighted with P(K = k), shape (n_k, columns)."""
+    sums = np.zeros((n_k, table.shape[1] + 1))
+    room = np.zeros(max(n_k, int(ensemble_numba.capacity(exposure))))
+    ensemble_numba.sum_moments(exposure, table, room, sums)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = sums[:, 1:] / sums[:, :1]
+        log_exposure = np.log(exposure)
+    for k in np.flatnonzero(sums[:, 0] < _FEW_ELECTRONS):  # the ratios of the weights are left
+        log_weight = (k * log_exposure if k else 0.0) - exposure
+        largest = log_weight.max()
+        weight = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
+        found[k] = weight @ table / weight.sum()
+    return found
 
 
 def _case_variance(moments: FloatArray, case: tuple[str, ...], k: int, mean_variance: float) -> float:

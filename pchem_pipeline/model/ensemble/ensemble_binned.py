@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.ensemble import ensemble_numba
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_pmf
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, IntArray, NucedAxis, electron_pmf
 from pchem_pipeline.model.law.normal_numba import NARROW, REACH
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
+#: Cells for each pixel up to which a table of all of them is faster than sorting.
+_MOST_CELLS = 4
 #: Analog noise (DN) to which narrower cells are widened in the inversion.
 _NARROWEST = 0.05
 #: Longest signal (DN) that the inversion keeps from wrapping round; only a pixel of absurd gain is beyond.
@@ -70,25 +72,33 @@ def joint_cells(columns: Sequence[FloatArray], choice: HistogramChoice) -> Cells
         At most n cells.
     """
     index: NDArray[np.int64] = np.zeros(columns[0].size, dtype=np.int64)
-    coordinates, edges = [], []
-    for column in columns:
-        edge = _edges(column, choice)
-        place = np.searchsorted(edge, column, side="right") - 1
-        place[column == edge[-1]] = edge.size - 2  # the last bin is closed
-        edges.append(edge)
-        coordinates.append(place)
-        index = index * (edge.size + 1) + place + 1
-    _, first, inverse, occupants = np.unique(
-        index, return_index=True, return_inverse=True, return_counts=True
-    )
+    edges = [_edges(column, choice) for column in columns]
+    for column, edge in zip(columns, edges, strict=True):
+        place = np.searchsorted(edge, column, side="right")
+        place[column == edge[-1]] = edge.size - 1  # the last bin is closed
+        index *= edge.size + 1
+        index += place
+    shape = tuple(edge.size + 1 for edge in edges)
+    cells, inverse = _occupied(index, math.prod(shape))
+    occupants = np.bincount(inverse)
     values = np.empty((len(columns), occupants.size))
-    for d, column in enumerate(columns):
+    places = np.unravel_index(cells, shape)
+    for d, (column, edge, place) in enumerate(zip(columns, edges, places, strict=True)):
         values[d] = np.bincount(inverse, weights=column) / occupants
         if choice.representative == "centre":
-            place = coordinates[d][first]
-            inner = (place >= 0) & (place < edges[d].size - 1)
-            values[d, inner] = 0.5 * (edges[d][place[inner]] + edges[d][place[inner] + 1])
+            inner = (place > 0) & (place < edge.size)
+            values[d, inner] = 0.5 * (edge[place[inner] - 1] + edge[place[inner]])
     return Cells(occupants / columns[0].size, values)
+
+
+def _occupied(index: IntArray, n_cells: int) -> tuple[IntArray, IntArray]:
+    """Return the cells that occur, in order, and for each pixel which of them is its own."""
+    if n_cells > _MOST_CELLS * index.size:
+        return np.unique(index, return_inverse=True)
+    cells = np.flatnonzero(np.bincount(index, minlength=n_cells))
+    number = np.zeros(n_cells, dtype=np.int64)
+    number[cells] = np.arange(cells.size)
+    return cells, number[index]
 
 
 def _edges(column: FloatArray, choice: HistogramChoice) -> FloatArray:

@@ -26,6 +26,8 @@ _ERROR_SHARE = 1e-10  # of a pixel's highest component: less is not seen in an e
 _ROOM = 2 * SIMD_WIDTH  # after the last place, for loops that write some places at a time
 _PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 _LEAST_EXPONENT = -700.0
+_SCANNED = 16  # bins that are looked at together
+_GROUPS = 16  # of places that follow from the first
 
 
 @kernel
@@ -44,11 +46,11 @@ def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
     weights[mode] = peak
     low = mode
     while low > 0 and weights[low] > SMALLEST * peak:
-        weights[low - 1] = weights[low] * low / mean
+        weights[low - 1] = weights[low] * (low / mean)
         low -= 1
     high = mode
     while high < top and weights[high] > SMALLEST * peak:
-        weights[high + 1] = weights[high] * mean / (high + 1.0)
+        weights[high + 1] = weights[high] * (mean / (high + 1.0))
         high += 1
     return low, high
 
@@ -83,6 +85,7 @@ def sum_pcd_pixels(
     """
     weights = np.zeros(capacity(exposure))
     row = np.zeros((1, total.size + _ROOM))
+    places, held = np.zeros(total.size, np.int32), np.zeros(nuced.size + 2)
     for p in range(exposure.size):
         low, high = poisson_weights(exposure[p], weights)
         step = 1.0 / gain[p]
@@ -94,34 +97,43 @@ def sum_pcd_pixels(
         part = row[0, first : last + 1]
         part[:] = 0.0
         base = float(dn_start + first)
+        decay = math.exp(-((SIMD_WIDTH / sigma[p]) ** 2)) if sigma[p] >= NARROW else 0.0
         for k in range(low, high + 1):
             centre = bias[p] + k * step
             if sigma[p] >= NARROW:
-                _add_bell(row, centre - dn_start, sigma[p], weights[k], total.size)
+                _add_bell(row, centre - dn_start, sigma[p], weights[k], decay, total.size)
             else:
                 add_component(part, base, weights[k], centre, sigma[p])
         for i in range(part.size):
             total[first + i] += part[i]
             total_square[first + i] += part[i] * part[i]
         if width > 0.0:
-            _add_nuced(part, base, gain[p], bias[p], width, nuced_start, nuced, nuced_square)
+            _add_nuced(part, base, gain[p], bias[p], width, nuced_start, nuced, nuced_square, places, held)
 
 
 @kernel(borrows=True)
-def _add_bell(row: FloatArray, centre: float, sigma: float, weight: float, n: int) -> None:
-    """Add a component of the PCD at the places 0 ... n - 1 of a row; a few after these are written, too."""
+def _add_bell(row: FloatArray, centre: float, sigma: float, weight: float, decay: float, n: int) -> None:
+    """Add a component of the PCD at the places 0 ... n - 1 of a row; a few after these are written, too.
+
+    From one group of w places to the next a Gaussian changes by a ratio, and the ratio by ``decay = exp(-(w /
+    sigma)^2)``: two products instead of an exponential, begun anew before their roundings add up.
+    """
     if weight <= 0.0:
         return
     reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(weight), 0.0)) * sigma
-    inverse = 1.0 / sigma
-    peak = weight * _PER_ROOT_2PI * inverse
-    for i in range(max(0, math.ceil(centre - reach)), min(n, math.floor(centre + reach) + 1), SIMD_WIDTH):
-        z = (counting() + (i - centre)) * inverse
+    inverse, end = 1.0 / sigma, min(n, math.floor(centre + reach) + 1)
+    peak, pace = weight * _PER_ROOT_2PI * inverse, SIMD_WIDTH * inverse
+    for begin in range(max(0, math.ceil(centre - reach)), end, _GROUPS * SIMD_WIDTH):
+        z = (counting() + (begin - centre)) * inverse
         value = peak * simd_exp(most(z * z * -0.5, _LEAST_EXPONENT))
-        simd_store(row, 0, i, value + simd_load(row, 0, i))
+        ratio = simd_exp(most((z + 0.5 * pace) * -pace, _LEAST_EXPONENT))
+        for i in range(begin, min(end, begin + _GROUPS * SIMD_WIDTH), SIMD_WIDTH):
+            simd_store(row, 0, i, value + simd_load(row, 0, i))
+            value = value * ratio
+            ratio = ratio * decay
 
 
-@kernel
+@kernel(borrows=True)
 def _add_nuced(
     part: FloatArray,
     base: float,
@@ -131,21 +143,33 @@ def _add_nuced(
     nuced_start: int,
     nuced: FloatArray,
     nuced_square: FloatArray,
+    places: NDArray[np.int32],
+    held: FloatArray,
 ) -> None:
-    """Add one pixel's masses to the NUCed bins; bins fill in increasing order, so one at a time is open."""
-    bin_open = 0
-    held = 0.0
+    """Add one pixel's masses to the NUCed bins.
+
+    Args:
+        part: masses of successive DN.
+        base: first of these.
+        gain: g.
+        bias: mu.
+        width: of a bin, e-.
+        nuced_start: index of the first bin.
+        nuced: in and out, sums of the masses.
+        nuced_square: in and out, sums of their squares.
+        places: working memory, as long as ``part``.
+        held: working memory, all 0 before and after; one longer than ``nuced`` at either end.
+    """
+    low, high = nuced_start - 1.0, nuced_start + float(nuced.size)
     for i in range(part.size):
-        b = math.floor((base + i - bias) * gain / width + 0.5) - nuced_start
-        if b != bin_open:
-            if 0 <= bin_open < nuced.size:
-                nuced[bin_open] += held
-                nuced_square[bin_open] += held * held
-            bin_open, held = b, 0.0
-        held += part[i]
-    if 0 <= bin_open < nuced.size:
-        nuced[bin_open] += held
-        nuced_square[bin_open] += held * held
+        value = np.floor((base + i - bias) * gain / width + 0.5)
+        places[i] = np.int32(min(max(value, low), high) - low)
+    for i in range(part.size):
+        held[places[i]] += part[i]
+    for j in range(max(places[0], 1), min(places[part.size - 1], nuced.size) + 1):
+        nuced[j - 1] += held[j]
+        nuced_square[j - 1] += held[j] * held[j]
+    held[places[0] : places[part.size - 1] + 1] = 0.0
 
 
 @kernel
@@ -181,6 +205,7 @@ def sort_masses(
         nuced_square: out, sums of their squares.
         moments: out, sums over pixels of the mean of the NUCed value and of its square.
     """
+    places, held = np.zeros(total.size, np.int32), np.zeros(nuced.size + 2)
     for p in range(first.size):
         begin = start[p] + max(0, dn_start - first[p])
         end = min(start[p + 1], start[p] + dn_start + total.size - first[p])
@@ -193,7 +218,8 @@ def sort_masses(
             moments[1] += part[i] * value * value
             total[base + i - dn_start] += part[i]
             total_square[base + i - dn_start] += part[i] * part[i]
-        _add_nuced(part, float(base), gain[p], bias[p], width, nuced_start, nuced, nuced_square)
+        start_dn = float(base)
+        _add_nuced(part, start_dn, gain[p], bias[p], width, nuced_start, nuced, nuced_square, places, held)
 
 
 @kernel
@@ -349,6 +375,44 @@ def sum_poisson(share: FloatArray, exposure: FloatArray, out: FloatArray) -> Non
 
 
 @kernel
+def sum_moments(exposure: FloatArray, moments: FloatArray, weights: FloatArray, out: FloatArray) -> None:
+    """Add moments of pixels weighted by their probability of k electrons.
+
+    Args:
+        exposure: H, shape (n,).
+        moments: of each pixel, shape (n, m).
+        weights: working memory, at least as long as ``out``.
+        out: in and out, the sums of the weights, then of the weighted moments, shape (n_k, m + 1).
+    """
+    for p in range(exposure.size):
+        low, high = poisson_weights(exposure[p], weights)
+        for k in range(low, min(high, out.shape[0] - 1) + 1):
+            out[k, 0] += weights[k]
+            for i in range(moments.shape[1]):
+                out[k, 1 + i] += weights[k] * moments[p, i]
+
+
+@kernel(borrows=True)
+def occupied(counts: NDArray[Any], p: int) -> tuple[int, int]:
+    """Return a first bin of a pixel's histogram and an end between which all of its samples lie."""
+    begin, end = 0, counts.shape[1]
+    while begin + _SCANNED <= end and _samples_of(counts, p, begin) == 0:
+        begin += _SCANNED
+    while begin + _SCANNED <= end and _samples_of(counts, p, end - _SCANNED) == 0:
+        end -= _SCANNED
+    return begin, end
+
+
+@kernel(borrows=True)
+def _samples_of(counts: NDArray[Any], p: int, first: int) -> int:
+    """Return the samples of some successive bins."""
+    total = np.int64(0)
+    for b in range(_SCANNED):
+        total += np.int64(counts[p, first + b])
+    return total
+
+
+@kernel
 def tally_counts(
     counts: NDArray[Any],
     origin: IntArray,
@@ -369,25 +433,33 @@ def tally_counts(
     Returns:
         How many samples fell outside of the DN axis, and outside of the NUCed axis.
     """
-    outside = np.int64(0)
-    nuced_outside = np.int64(0)
+    outside, nuced_outside = np.int64(0), np.int64(0)
+    places, held = np.zeros(counts.shape[1], np.int32), np.zeros(nuced.size + 2, np.int64)
+    low, high = nuced_start - 1.0, nuced_start + float(nuced.size)
     for p in range(counts.shape[0]):
-        for b in range(counts.shape[1]):
+        begin, end = occupied(counts, p)
+        offset, total = origin[p] - bias[p], np.int64(0)
+        first, second = np.int64(0), np.int64(0)
+        for b in range(begin, end):
             c = np.int64(counts[p, b])
-            if c == 0:
-                continue
-            dn = origin[p] + b
-            i = dn - dn_start
-            if 0 <= i < raw.size:
-                raw[i] += c
-            else:
-                outside += c
-            value = (dn - bias[p]) * gain[p]
-            nuced_sums[p, 0] += c * value
-            nuced_sums[p, 1] += c * value * value
-            j = math.floor(value / width + 0.5) - nuced_start
-            if 0 <= j < nuced.size:
-                nuced[j] += c
-            else:
-                nuced_outside += c
+            total += c
+            first += c * b
+            second += c * b * b
+            value = np.floor((origin[p] + b - bias[p]) * gain[p] / width + 0.5)
+            places[b] = np.int32(min(max(value, low), high) - low)
+        mean = first + offset * total
+        nuced_sums[p, 0] = gain[p] * mean
+        nuced_sums[p, 1] = gain[p] * gain[p] * (second + offset * (first + mean))
+        shift = origin[p] - dn_start
+        inside = min(max(begin, -shift), end), max(min(end, raw.size - shift), begin)
+        for b in range(inside[0], inside[1]):
+            c = np.int64(counts[p, b])
+            raw[b + shift] += c
+            total -= c
+        outside += total
+        for b in range(begin, end):
+            held[places[b]] += np.int64(counts[p, b])
+    for j in range(nuced.size):
+        nuced[j] += held[j + 1]
+    nuced_outside += held[0] + held[nuced.size + 1]
     return outside, nuced_outside

@@ -26,10 +26,11 @@ from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
+from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
 from pchem_pipeline.model.ensemble.moments import moment_rows
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
-from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.histogram.count_numba import count_frames
+from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
@@ -299,10 +300,7 @@ def _sum_tile(
         for name in (*(f"fit/{each}" for each in PARAMETERS), *(f"histogram/{each}" for each in _HISTOGRAM))
     )
     outside = under + over
-    covariance = None
-    if store.has("fit/correlation"):
-        stderr = [store.read(f"fit/{name}_stderr", tile.region) for name in PARAMETERS]
-        covariance = np.stack(stderr, axis=-1), store.read("fit/correlation", tile.region)
+    errors = _errors(store, tile)
     rows = []
     for part in parts_told(tile.parts()):
         everything = _histograms(counts[part], outside[part])
@@ -316,18 +314,34 @@ def _sum_tile(
             job.axes,
             fitted_law(store, of_pixels, place),
             fitted_satellites(store, place),
-            None if covariance is None else _covariance(covariance[0][part], covariance[1][part]),
+            None if errors is None else errors.of(_inside(tile, part)),
         )
         rows.append(row)
     return np.sum([row[0] for row in rows], axis=0), np.sum([row[1] for row in rows], axis=0)
 
 
 def _histograms(counts: NDArray[Any], outside: NDArray[Any]) -> PixelHistograms:
-    return PixelHistograms(counts.reshape(outside.size, -1), outside.ravel())
+    return PixelHistograms(kernel_counts(counts).reshape(outside.size, -1), outside.ravel())
 
 
-def _covariance(stderr: NDArray[np.float64], correlation: NDArray[np.float64]) -> NDArray[np.float64]:
-    return covariance_from(stderr, correlation).reshape(-1, 4, 4)
+def _errors(store: RunStore, tile: Tile) -> PixelErrors | None:
+    """Return the errors of the pixels of a tile in C order; None where they are not known."""
+    if not store.has("fit/correlation"):
+        return None
+    ny, nx = store.array("fit/correlation").shape[:2]
+    stderr = [store.read(f"fit/{name}_stderr", tile.region).ravel() for name in PARAMETERS]
+    correlation = store.read("fit/correlation", tile.region)
+    place = np.arange(tile.y0, tile.y1)[:, None] * nx + np.arange(tile.x0, tile.x1)
+    share = min(1.0, WANTED / (ny * nx))
+    flat = correlation.reshape(-1, correlation.shape[2])
+    return PixelErrors(np.stack(stderr, axis=1), flat, place.ravel(), share)
+
+
+def _inside(tile: Tile, part: tuple[slice, slice]) -> NDArray[np.bool_]:
+    """Return which pixels of a tile, in C order, are in a part of it."""
+    mask = np.zeros((tile.y1 - tile.y0, tile.x1 - tile.x0), np.bool_)
+    mask[part] = True
+    return mask.ravel()
 
 
 def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
 from pchem_pipeline.model.electrons.thresholds import numbers_by_thresholds
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, mass_sums, tally
+from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -50,7 +51,7 @@ def ensemble_tile(
     axes: EnsembleAxes,
     law: SampleLaw | None = None,
     satellites: tuple[FloatArray, FloatArray] | None = None,
-    covariance: FloatArray | None = None,
+    errors: PixelErrors | None = None,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return what some pixels add to the ensemble.
 
@@ -62,7 +63,7 @@ def ensemble_tile(
         axes: axes of the ensemble, ``extended`` where the law is that of a model with effects.
         law: of the samples; None: that of the PCD.
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
-        covariance: of the maps, shape (n, 4, 4); None: not known.
+        errors: of the maps; None: not known.
 
     Returns:
         A row of integers and a row of floats, in the places that ``axes`` gives.
@@ -77,12 +78,14 @@ def ensemble_tile(
     same, origin = chosen is everything, origin[mask]
     chosen = chosen.of(mask)
     everything = chosen if same else everything.of(mask)
-    if covariance is not None and not axes.extended:
-        errors = curve_errors(pixels, covariance[mask], axes.dn, axes.nuced)
-        for name, variance in zip(MODEL_ERRORS, errors, strict=True):
+    samples = chosen.samples
+    samples_all = samples if same else everything.samples
+    if errors is not None and not axes.extended:
+        some, covariance = errors.of(mask).sampled(pixels, samples_all)
+        found = curve_errors(pixels.of(some), covariance, axes.dn, axes.nuced)
+        for name, variance in zip(MODEL_ERRORS, found, strict=True):
             floats[axes.floats[name]] = variance
-    samples, samples_all = chosen.samples, everything.samples
-    for n, n_all in sorted({*zip(samples.tolist(), samples_all.tolist(), strict=True)}):
+    for n, n_all in _numbers_of_samples(samples, samples_all):
         if n == 0:
             continue
         group = (samples == n) & (samples_all == n_all)
@@ -96,6 +99,13 @@ def ensemble_tile(
         for name, summed in parts.items():
             floats[axes.floats[name]] += summed
     return integers, floats
+
+
+def _numbers_of_samples(chosen: NDArray[np.int64], everything: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return the pairs of numbers of samples that occur; of frames all pixels have the same."""
+    if np.all(chosen == chosen[:1]) and np.all(everything == everything[:1]):
+        return [(int(chosen[0]), int(everything[0]))] if chosen.size else []
+    return sorted({*zip(chosen.tolist(), everything.tolist(), strict=True)})
 
 
 def _numbers(
