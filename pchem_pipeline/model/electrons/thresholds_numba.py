@@ -111,7 +111,9 @@ def _add(samples: int, k: int, largest: int, observed: IntArray) -> int:
 @kernel(borrows=True)
 def _add_nearest(samples: int, dn: int, bias: float, step: float, largest: int, observed: IntArray) -> int:
     """Add samples of a code to the electron number whose level is the nearest."""
-    return _add(np.int64(samples), max(math.floor((dn - bias) / step + 0.5), 0), largest, observed)
+    k = max(math.floor((dn - bias) / step + 0.5), 0)
+    beyond: int = _add(np.int64(samples), k, largest, observed)
+    return beyond
 
 
 @kernel

@@ -404,7 +404,7 @@ def occupied(counts: NDArray[Any], p: int) -> tuple[int, int]:
 
 
 @kernel(borrows=True)
-def _samples_of(counts: NDArray[Any], p: int, first: int) -> int:
+def _samples_of(counts: NDArray[Any], p: int, first: int) -> np.int64:
     """Return the samples of some successive bins."""
     total = np.int64(0)
     for b in range(_SCANNED):

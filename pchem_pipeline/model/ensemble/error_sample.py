@@ -74,4 +74,4 @@ class PixelErrors:
             2.0 / noise,
         )
         known = np.nan_to_num(self.stderr**2, posinf=0.0)
-        return samples / _ORDINARY * np.sum(known.T * np.stack(per_sample), axis=0)
+        return np.asarray(samples / _ORDINARY * np.sum(known.T * np.stack(per_sample), axis=0))

@@ -30,7 +30,7 @@ class PixelHistograms:
         outside: samples outside of the bins, shape (n,).
     """
 
-    counts: NDArray[np.unsignedinteger[Any]]
+    counts: NDArray[np.integer[Any]]
     outside: NDArray[np.integer[Any]]
 
     def of(self, mask: NDArray[np.bool_]) -> PixelHistograms:
