@@ -25,7 +25,7 @@ def verdict(took: Took, limit: int) -> str:
     if took.code in (0, 3):
         return "kept" if took.tree <= ALLOWED * limit else "NOT KEPT"
     line = took.words.strip().splitlines()[-1]
-    if took.code == 2 and re.search(r"\d+ MiB", line) and "Traceback" not in took.words:
+    if took.code in (2, 4) and re.search(r"\d+ MiB", line) and "Traceback" not in took.words:
         return f"refused: {line}"
     return f"WRONG: {took.code}: {line}"
 
