@@ -10,10 +10,12 @@ from helpers.sensor_of_modes import drawn_truth, seen, taken
 from hidden.chain import hide
 from pydantic import ValidationError
 
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.effects.adc.black_clamp import BlackClamp
 from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -48,6 +50,12 @@ def test_a_window_has_its_part_of_the_clamp():
     seen_again = found.seen_in(*window, shape)
     assert (seen_again.rows, seen_again.columns, seen_again.follow) == ((0, 20), (0, 4), 0.3)
     assert found.seen_in((10, 30), (20, 40), shape).follow == 0.0
+    part = Part(Region(rows=((5, 15),)))
+    looked_at = SensorWindow(*window, shape)
+    placed = looked_at.found(BlackClamp(follow=0.3, rows=(0, 4)), Part(looked_at.on_sensor(part.region)))
+    assert (placed.rows, placed.columns, placed.region) == ((15, 19), (0, 20), Region(rows=((15, 25),)))
+    [acting] = looked_at.effects([placed])
+    assert (acting.rows, acting.columns) == ((5, 9), (0, 20))
     whole = BlackClamp(follow=0.3, rows=(0, 4))
     assert whole.found_in((0, 40), (0, 60), shape) == whole
 
