@@ -68,7 +68,7 @@ _REFUSED, _REFUSED_CELLS = 3e-5, 1e-2  # after a step that was refused
 _INDEFINITE_CELLS = (
     1.0  # where the information is not positive definite: most of the step is the damping matrix's
 )
-_SURELY_LOWER = 1e-3  # nats still to rise, where that much cannot reach the likelihood that is known
+_SURELY_LOWER = 1e-4  # nats still to rise, where that much cannot reach the likelihood that is known
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken, where there is one
 _MOST_SHARE = 1e9
 _BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
