@@ -37,6 +37,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     SetFit,
     choose,
     fit_set,
+    share_place,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
@@ -237,7 +238,12 @@ class FrameExplainer:
         shifts = (z.train - null.mean, z.test - null.mean)
         apart = self.frames.seen_apart(self.plain)
         own = (self.plain, *self.evidence[:2])
-        guesses = simulator.guesses(self.classes, own, apart, self._beside(null, z))
+        found = [h.effect for this in self.rounds for h in this.added.hypotheses]
+        guesses = [
+            guess
+            for guess in simulator.guesses(self.classes, own, apart, self._beside(null, z))
+            if not share_place((*found, guess))
+        ]
         placebo = placebo_for(guesses, self.classes)
         hypotheses = simulator.fingerprints([*guesses, *placebo])
         hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
