@@ -133,7 +133,8 @@ def best_stitch(evidence: Evidence) -> list[Stitch]:
         return []
     share = np.cumsum(curve.expected) / curve.expected.sum()
     inside = np.flatnonzero((share > _END) & (share < 1.0 - _END))
-    levels = curve.edges[inside[:: max(1, inside.size // _LEVELS)]]
+    # between two edges: which of them a step moves would otherwise depend on its sign
+    levels = curve.edges[inside[:: max(1, inside.size // _LEVELS)]] - 0.5
     if not levels.size:
         return []
     beyond = curve.edges - levels[:, None]
