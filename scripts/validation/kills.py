@@ -206,7 +206,7 @@ def stop(process: subprocess.Popen[str], number: int) -> str:
     # 0 and 3: it had ended; a negative code: before it, or its interpreter, listened
     if number == signal.SIGKILL or process.returncode in (0, 3, -number):
         return ""
-    ours = words.strip().splitlines()[-1:]
+    ours = words.strip().splitlines()[-1:] or ["pchem: "]  # typer says nothing before the command begins
     if process.returncode != 128 + number or "Traceback" in words or not ours[0].startswith("pchem: "):
         return f"{name}: code {process.returncode} after {seconds:.1f} s: {words[-2000:]}"
     return ""
