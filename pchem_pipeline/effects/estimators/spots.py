@@ -19,7 +19,7 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
 _RADII = (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6)
 _CENTRES = 17  # along either side
-_LEAST_SEEN = 0.05  # of a spot's peak, in the cell that has most of it
+_LEAST_SEEN = 0.05  # of a spot's peak, in a cell as well known as the best one
 _CELLS = 32  # groups of lines along either side
 # of a mixture of frames with and without a burst: shares, and heights in standard deviations
 _SHARES = np.array([0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4])
@@ -107,12 +107,11 @@ def _fitted(
 
     def fits(centres: list[tuple[float, float]], radius: float, falloff: Falloff) -> FloatArray:
         """Return by how much each spot lowers chi2, and its peak, (2, n)."""
-        images = np.stack([spot_image(*places, shape, centre, radius, falloff) for centre in centres])
-        shown = seen(images)
+        shown = seen(np.stack([spot_image(*places, shape, centre, radius, falloff) for centre in centres]))
         overlap, size = (inverse * shown * target).sum(axis=1), (inverse * shown**2).sum(axis=1)
+        # between the cells, where no pixel can be used, or all but like what may be beside it: any peak fits
+        there = (overlap > 0) & (size > _LEAST_SEEN**2 * inverse.max())
         size = np.maximum(size, 1e-300)
-        # of a spot between the cells only its far tail is seen, which says nothing about its peak
-        there = (overlap > 0) & (images.max(axis=(1, 2)) > _LEAST_SEEN)
         return np.stack([np.where(there, overlap**2 / size, 0.0), overlap / size])
 
     grid = [(float(y), float(x)) for y in np.linspace(0, 1, _CENTRES) for x in np.linspace(0, 1, _CENTRES)]

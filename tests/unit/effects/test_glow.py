@@ -96,8 +96,13 @@ def test_relatives_glow_nowhere():
     assert Glow.estimate(replace(evidence, time=None)) == []
 
 
-def test_a_spot_between_the_cells_is_no_guess() -> None:
+def test_a_spot_that_no_cell_shows_is_no_guess() -> None:
     rng = np.random.default_rng(5)
+    lost = np.full((4, 4), 0.01)
+    lost[:2] = np.inf  # no usable pixel in the upper half
+    for _ in range(12):
+        spot = best_spot(rng.normal(0.0, 0.01, (4, 4)), lost, np.ones((4, 4)), (64, 64))
+        assert spot is None or spot.peak < 1.0
     for _ in range(12):
         # cells far wider than the narrowest spot, and noise only: its far tail would fit with any peak
         noise = rng.normal(0.0, 0.01, (2, 2))
