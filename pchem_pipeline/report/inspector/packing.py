@@ -25,6 +25,8 @@ _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 _TAIL = 1e-3
 #: Positive values that spread over more than this factor are stored as logarithms.
 _DECADES = 30.0
+#: Values from which quantiles are taken, at least.
+_ENOUGH = 500_009
 #: Step of logarithmic maps: 2.3 %.
 _LOG_STEP = 0.01
 
@@ -61,12 +63,14 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
         step: wanted step, in the unit of the map; 0: a 64th of the robust standard deviation.
         coarse: factor on the step, for maps that must be smaller.
     """
-    known = np.asarray(values)[np.isfinite(values)].astype(np.float64)
+    flat = np.asarray(values).ravel()
+    if flat.dtype.kind in "iub" and flat.size:
+        low, high = float(flat.min()), float(flat.max())
+        return Scale(low, max(1.0, np.ceil((high - low) / (_LAST - _FIRST))))
+    known = some_of(flat)
+    known = known[np.isfinite(known)].astype(np.float64)
     if known.size == 0:
         return Scale(0.0, 1.0)
-    if np.asarray(values).dtype.kind in "iub":
-        low, high = float(known.min()), float(known.max())
-        return Scale(low, max(1.0, np.ceil((high - low) / (_LAST - _FIRST))))
     log = False
     if known.min() >= 0 and (known > 0).any():
         bulk = np.quantile(known[known > 0], [0.01, 0.99])
@@ -83,6 +87,14 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     return Scale(float(first) - shift * wide, wide, log)
 
 
+def some_of(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of a flat array, of many every k-th: enough for a quantile that only sets a scale.
+
+    k is odd: no column of a sensor is left out for good.
+    """
+    return values[:: max(values.size // _ENOUGH, 1) | 1]
+
+
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7.
 
@@ -91,15 +103,22 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
         scale: from :func:`choose_scale`.
     """
     flat = np.asarray(values, dtype=np.float64).ravel()
-    known = np.isfinite(flat)
+    unknown = ~np.isfinite(flat)
     with np.errstate(divide="ignore", invalid="ignore"):
-        work = np.log10(flat) if scale.log else flat
-        place = np.rint((work - scale.low) / scale.step) + _FIRST
-    place = np.where(place < _FIRST, _BELOW, np.where(place > _LAST, _ABOVE, place))
-    codes = np.where(known & ~np.isnan(place), place, _NONE).astype("<u2")
+        place = np.log10(flat) - scale.low if scale.log else flat - scale.low
+    place /= scale.step
+    np.rint(place, out=place)
+    place += _FIRST
+    with np.errstate(invalid="ignore"):
+        below, above = place < _FIRST, place > _LAST
+    unknown |= np.isnan(place)
+    place[below], place[above], place[unknown] = _BELOW, _ABOVE, _NONE
+    codes = place.astype("<u2")
+    odd = below | above
+    odd &= ~unknown
     if scale.log:  # zeros, which may be many, need no place in the list
-        codes[known & (flat == 0)] = _BELOW
-    odd = np.flatnonzero(((codes == _BELOW) & ~(scale.log & (flat == 0))) | (codes == _ABOVE))
+        odd &= flat != 0
+    odd = np.flatnonzero(odd)
     planes = [codes & 255, codes >> 8]
     content = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()

@@ -22,7 +22,7 @@ from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
-from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map
+from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map, some_of
 from pchem_pipeline.stages.report.stored import FittedModel
 
 if TYPE_CHECKING:
@@ -215,7 +215,8 @@ def _coarse(n_pixels: int) -> tuple[float, str]:
 
 
 def _median(values: NDArray[Any]) -> float:
-    known = values[np.isfinite(values)]
+    some = some_of(values.ravel())
+    known = some[np.isfinite(some)]
     return float(np.median(known)) if known.size else 0.0
 
 
