@@ -114,11 +114,10 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     unknown |= np.isnan(place)
     place[below], place[above], place[unknown] = _BELOW, _ABOVE, _NONE
     codes = place.astype("<u2")
-    odd = below | above
-    odd &= ~unknown
+    outside = (below | above) & ~unknown
     if scale.log:  # zeros, which may be many, need no place in the list
-        odd &= flat != 0
-    odd = np.flatnonzero(odd)
+        outside &= flat != 0
+    odd = np.flatnonzero(outside)
     planes = [codes & 255, codes >> 8]
     content = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
