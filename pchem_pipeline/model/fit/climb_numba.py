@@ -422,11 +422,12 @@ def climb(
         elif not em_step(pixel, theta, at, limits, trial):
             return NOT_CONVERGED, loglik, used
         risen = -math.inf
+        # a step out of bounds counts, too: damped and not damped in turn it may be refused for ever
+        used += 1
         if sensible(trial, pixel.longest_step, limits.cells):
             risen = evaluate(pixel, trial, False, scratch, ahead)
-            used += 1
         elif not limits.cells:
-            return DEGENERATE, loglik, used
+            return DEGENERATE, loglik, used - 1
         if newton and not risen >= loglik - 1e-11 * abs(loglik):
             damping = max(4.0 * share, _REFUSED_CELLS if limits.cells else _REFUSED)
             if damping > _MOST_SHARE:
