@@ -70,6 +70,8 @@ def start(sample, names="squared, cubed", cache=None):
         **os.environ,
         "NUMBA_CACHE_DIR": str(cache or sample.parents[1] / "cache"),
         "PYTHONPATH": os.pathsep.join(map(str, path)),
+        # Python tells files of one size that change within a second apart by nothing
+        "PYTHONDONTWRITEBYTECODE": "1",
     }
     command = [sys.executable, "-c", CALLS.format(names=names)]
     return subprocess.Popen(
