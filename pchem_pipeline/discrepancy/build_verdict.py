@@ -312,7 +312,7 @@ def _nearly(found: Findings) -> str:
             f"{Place.of(name, z=0.0).sentence or name}, by chance in one of {1.0 / p:,.0f} such runs"
         )
     if not found.before.at_floor:
-        words.append("all statistics together are farther from it than chance makes in 19 of 20 such runs")
+        words.append(f"taken together the {found.samples} are farther from it than in 19 of 20 such runs")
     return f"; near the limit: {'; '.join(words)}; more frames would tell" if words else ""
 
 

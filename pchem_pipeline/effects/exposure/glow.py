@@ -21,7 +21,7 @@ from pchem_pipeline.effects.estimators.spots import Spot, best_bursts, best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.spot import Falloff, spot_image
+from pchem_pipeline.effects.framework.spot import Falloff, spot_found_in, spot_image, spot_seen_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -85,34 +85,11 @@ class Glow(Effect):
 
     def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted from these rows and columns, and the size that it has there."""
-        centre, size = (self.centre_y, self.centre_x), (rows[1] - rows[0], columns[1] - columns[0])
-        nearest = [
-            np.array([min(max(int(c * n), low), high - 1)])
-            for c, n, (low, high) in zip(centre, shape, (rows, columns), strict=True)
-        ]
-        left = spot_image(nearest[0], nearest[1], shape, centre, self.radius, self.falloff)
-        moved = [
-            (c * n - low) / m for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True)
-        ]
-        return self._moved(moved, max(shape) / max(size), float(left[0, 0]))
+        return self.model_copy(update=spot_seen_in(vars(self), self.falloff, rows, columns, shape))
 
     def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted on the sensor."""
-        centre, size = (self.centre_y, self.centre_x), (rows[1] - rows[0], columns[1] - columns[0])
-        moved = [
-            (c * m + low) / n for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True)
-        ]
-        return self._moved(moved, max(size) / max(shape), 1.0)
-
-    def _moved(self, centre: list[float], radius: float, peak: float) -> Self:
-        return self.model_copy(
-            update={
-                "centre_y": centre[0],
-                "centre_x": centre[1],
-                "radius": self.radius * radius,
-                "peak_e": self.peak_e * peak,
-            }
-        )
+        return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
 
     def pattern(self, rows: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the spot in some rows relative to its brightest pixel, shape (rows, columns)."""

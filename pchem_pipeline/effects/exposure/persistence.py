@@ -19,7 +19,8 @@ from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_
 from pchem_pipeline.effects.estimators.spots import best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.spot import spot_image
+from pchem_pipeline.effects.framework.region import Span
+from pchem_pipeline.effects.framework.spot import spot_found_in, spot_image, spot_seen_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,6 +97,18 @@ class Persistence(Effect):
         if min(values) < 0 or max(values) == 0:
             raise ValueError("persistence: image needs numbers >= 0 and one above 0; correct it")
         return self
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with its spot counted from these rows and columns; an image is left as it is."""
+        if self.image:
+            return self
+        return self.model_copy(update=spot_seen_in(vars(self), "gaussian", rows, columns, shape))
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with its spot counted on the sensor; an image is left as it is."""
+        if self.image:
+            return self
+        return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
 
     def pattern(self, rows: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.float64]:
         """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pchem_pipeline.effects.framework.region import Span
 
 Falloff = Literal["gaussian", "exponential"]
 
@@ -40,3 +42,36 @@ def spot_image(
     if falloff == "gaussian":
         return np.asarray(np.exp(0.5 * (least - away)))
     return np.asarray(np.exp(np.sqrt(least) - np.sqrt(away)))
+
+
+def spot_seen_in(
+    spot: dict[str, Any], falloff: Falloff, rows: Span, columns: Span, shape: tuple[int, int]
+) -> dict[str, float]:
+    """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
+
+    Args:
+        spot: ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect, and whatever else it has.
+        falloff: see :func:`spot_image`.
+        rows: first, and behind the last.
+        columns: likewise.
+        shape: rows and columns of the sensor.
+    """
+    centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
+    # the brightest of these pixels is the one nearest to the centre
+    nearest = [
+        np.array([min(max(int(c * n), low), high - 1)])
+        for c, n, (low, high) in zip(centre, shape, (rows, columns), strict=True)
+    ]
+    left = spot_image(nearest[0], nearest[1], shape, centre, spot["radius"], falloff)
+    y, x = ((c * n - low) / m for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True))
+    radius = spot["radius"] * max(shape) / max(size)
+    return {"centre_y": y, "centre_x": x, "radius": radius, "peak_e": spot["peak_e"] * float(left[0, 0])}
+
+
+def spot_found_in(
+    spot: dict[str, Any], rows: Span, columns: Span, shape: tuple[int, int]
+) -> dict[str, float]:
+    """Return on the sensor a spot that was found in some of its rows and columns; see `spot_seen_in`."""
+    centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
+    y, x = ((c * m + low) / n for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True))
+    return {"centre_y": y, "centre_x": x, "radius": spot["radius"] * max(size) / max(shape)}

@@ -291,5 +291,5 @@ def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
     assert words[True, True] == "The frames agree with the model in every statistic tested."
     assert "by chance in one of" in words[False, True]
     assert "more frames would tell" in words[True, False]
-    assert "all statistics together" in words[True, False]
-    assert "all statistics together" not in words[False, True]
+    assert "taken together the frames" in words[True, False]
+    assert "taken together the frames" not in words[False, True]

@@ -13,6 +13,7 @@ from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.estimators.spots import best_spot
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.glow import Glow
+from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.spot import spot_image
 
 SHAPE = (10, 14)
@@ -45,8 +46,12 @@ def test_a_spot_is_1_in_its_brightest_pixel_and_falls_with_the_distance():
     assert spot[4, 4 + 3] == pytest.approx(np.exp(-3 / (0.2 * 9)))
 
 
-def test_a_window_sees_its_part_of_the_glow():
-    effect = Glow(peak_e=2.0, centre_y=0.1, centre_x=0.6, radius=0.3, falloff="gaussian")
+@pytest.mark.parametrize("effect", [
+    Glow(peak_e=2.0, centre_y=0.1, centre_x=0.6, radius=0.3, falloff="gaussian"),
+    Glow(peak_e=2.0, centre_y=0.1, centre_x=0.6, radius=0.3, falloff="exponential"),
+    Persistence(peak_e=2.0, centre_y=0.1, centre_x=0.6, radius=0.3, decay_frames=100.0),
+])  # fmt: skip
+def test_a_window_sees_its_part_of_the_glow(effect):
     image = effect.peak_e * effect.pattern(np.arange(40), (40, 60))
     for rows, columns in (((0, 20), (20, 50)), ((16, 40), (0, 30)), ((0, 40), (0, 60))):
         part = effect.seen_in(rows, columns, (40, 60))
