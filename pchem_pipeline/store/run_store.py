@@ -365,7 +365,7 @@ def _remove_blank(path: Path) -> None:
 def _strangers(path: Path) -> bool:
     """Tell whether there is more at a path than a store that has just begun, or is being made."""
     if not path.is_dir():
-        return path.exists()
+        return path.exists() and not path.is_dir()  # another process may make the folder meanwhile
     names = (each.name for each in path.iterdir())
     return any(name != _DESCRIPTION and not name.startswith(f".{_DESCRIPTION}.") for name in names)
 

@@ -1,6 +1,7 @@
 import errno
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,6 +117,22 @@ def test_several_processes_that_make_the_same_store_at_once_have_it_all(tmp_path
         _, words = maker.communicate(timeout=120)
         assert maker.returncode == 0, words
     assert len(list(tmp_path.glob("*.zarr/zarr.json"))) == 40
+
+
+def test_a_folder_that_another_process_makes_meanwhile_is_no_stranger(tmp_path, monkeypatch):
+    asked, is_dir = [], Path.is_dir
+
+    def meanwhile(path: Path) -> bool:
+        found = is_dir(path)
+        if path.name == "run.zarr" and not found:
+            asked.append(path)
+            if len(asked) == 2:  # once it was looked for something blank, before it is looked for strangers
+                path.mkdir()
+        return found
+
+    monkeypatch.setattr(Path, "is_dir", meanwhile)
+    RunStore.create(tmp_path / "run.zarr")
+    assert len(asked) == 2
 
 
 def test_second_process_finds_the_run_locked_and_a_killed_one_frees_it(store):
