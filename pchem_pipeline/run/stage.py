@@ -33,6 +33,7 @@ from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
+from pchem_pipeline.store.turn import check_turn, in_turn, take_turn
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -93,7 +94,8 @@ def open_store(path: Path) -> RunStore:
 class MarkedTask:
     """A task that sets the markers of its unit once it is done, in the worker.
 
-    ``tell`` hears by key what share of a unit is done, where the worker shares the memory.
+    ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not,
+    it may be overtaken: ``turn`` is the number of the turn that it writes in.
     """
 
     store: Path
@@ -101,14 +103,17 @@ class MarkedTask:
     fingerprint: str
     task: Callable[[Any], Mapping[str, Any] | None]
     tell: Callable[[str, float], None] | None = None
+    turn: str | None = None
 
     def __call__(self, unit: Unit) -> Mapping[str, Any]:
         """Do the unit, then mark it."""
-        with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-            summary = dict(self.task(unit) or {})
-        records = open_store(self.store).records
-        for key in unit.keys:
-            records.mark(self.stage, self.fingerprint, key, summary)
+        store = open_store(self.store)
+        with in_turn(store.turn_file, self.turn):
+            with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
+                summary = dict(self.task(unit) or {})
+            check_turn()
+            for key in unit.keys:
+                store.records.mark(self.stage, self.fingerprint, key, summary)
         return summary
 
 
@@ -333,7 +338,8 @@ class StageContext:
 
             self.stop.check()
             heard = tell if executor.shares_memory else None
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard)
+            turn = None if executor.shares_memory else take_turn(self.store.turn_file)
+            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard, turn)
             try:
                 executor.map(marked, todo, on_result)
             except Stop:

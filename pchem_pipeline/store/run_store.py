@@ -6,7 +6,7 @@ run.zarr/
   frames/ histogram/ summary/ fit/ maps/ ensemble/ electrons/ truth/
   model/                 0001.json ...: versions of the model, their arrays in groups; current.json
   report.html, report.json, figures/
-  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock,
+  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock, turn,
                          progress.json while a command works on it
 ```
 
@@ -35,6 +35,7 @@ from pchem_pipeline.store.files import is_blank, remove_file, remove_folder, sto
 from pchem_pipeline.store.lease import check_lease, leased
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused
+from pchem_pipeline.store.turn import check_turn
 
 if TYPE_CHECKING:
     import zarr
@@ -217,8 +218,10 @@ class RunStore:
         """Write ``data`` into a region made of whole chunks.
 
         Raises:
+            LockedError: the work of this thread was overtaken, see :mod:`.turn`.
             StoreError: the file system refused.
         """
+        check_turn()
         with self._translated(name, region):
             self.array(name)[region] = data
 
@@ -271,6 +274,11 @@ class RunStore:
             return (self.path / _PRIVATE / "config.yaml").read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
+
+    @property
+    def turn_file(self) -> Path:
+        """The file that says whose turn it is to write, see :mod:`.turn`."""
+        return self.path / _PRIVATE / "turn"
 
     def sync(self, part: Path | None = None) -> None:
         """Wait until the arrays that this process wrote are on the disk, before a marker says that they are.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.commands import sigint
 
-from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
+from pchem_pipeline.base.errors import ConfigError, InputError, LockedError, StoreError
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.load import parse_config
 from pchem_pipeline.run import runner
@@ -102,6 +102,38 @@ def test_a_changed_setting_redoes_the_stages_that_read_it(make):
     assert status(FAKES["maps"], changed).words() == "stale - fit was done again"
     execute("maps", changed)
     assert changed.store.read("maps/bias")[0, 0] == 14
+
+
+class Elsewhere(SerialExecutor):
+    """Works as other processes would; the first unit hangs, and is kept for later."""
+
+    shares_memory = False
+
+    def __init__(self):
+        self.hanging = None
+
+    def map(self, function, items, on_result):
+        first, *rest = items
+        self.hanging = functools.partial(function, first)
+        super().map(function, rest, on_result)
+
+
+def test_a_worker_that_wakes_after_another_run_writes_nothing(make):
+    context = make()
+    context.executor = Elsewhere()
+    execute("fit", context)
+    assert np.isnan(context.store.read("fit/bias")[0, 0])  # it hangs
+    changed = make("fit: {gap_threshold: 7}")
+    changed.executor = other = Elsewhere()
+    execute("fit", changed)
+    with pytest.raises(LockedError, match="taken over by a later"):
+        context.executor.hanging()
+    assert np.isnan(context.store.read("fit/bias")[0, 0])
+    assert not context.store.records.done("fit", context.fingerprint)
+    other.hanging()  # nobody came after this one
+    assert context.store.read("fit/bias")[0, 0] == 7
+    assert len(changed.store.records.done("fit", changed.fingerprint)) == 12
+    context.store.write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))  # this thread has no turn
 
 
 def test_a_setting_that_no_stage_reads_redoes_nothing(make):
