@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 # rows and columns of the grids: to find something, and to describe it
 _GRIDS = (8, 16)
+#: cells along a side of an image that was found in a part of the sensor: it stands in the YAML
+_MOST_CELLS = 48
 # time constants tried, in lengths of the run
 _DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
 
@@ -99,27 +101,58 @@ class Persistence(Effect):
         return self
 
     def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with its spot counted from these rows and columns; an image is left as it is."""
+        """Return it with its spot or image counted from these rows and columns."""
         if self.image:
-            return self
+            return self._seen_image(rows, columns, shape)
         return self.model_copy(update=spot_seen_in(vars(self), "gaussian", rows, columns, shape))
 
     def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with its spot counted on the sensor; an image is left as it is."""
+        """Return it with its spot or image counted on the sensor; an image is dark elsewhere."""
         if self.image:
-            return self
+            return self._found_image(rows, columns, shape)
         return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
+
+    def _seen_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with the image as a grid over the window, as fine as that over the sensor."""
+        spans = (rows, columns)
+        cells = (len(self.image), len(self.image[0]))
+        places = [
+            (low + (np.arange(n) + 0.5) * (high - low) / n) / size
+            for (low, high), n, size in zip(spans, cells, shape, strict=True)
+        ]
+        values = self._image_at(*places)
+        brightest = float(values.max())
+        grid = _numbers(values / brightest) if brightest > 0 else ((1.0,),)
+        return self.model_copy(update={"image": grid, "peak_e": self.peak_e * brightest})
+
+    def _found_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with the image as a grid over the sensor, as fine where that takes few cells."""
+        parts, cells = [], (len(self.image), len(self.image[0]))
+        for (low, high), n, size in zip((rows, columns), cells, shape, strict=True):
+            many = min(-(-n * size // (high - low)), _MOST_CELLS)
+            parts.append(((np.arange(many) + 0.5) / many * size - low) / (high - low))
+        y, x = parts
+        values = self._image_at(y, x) * ((y > 0) & (y < 1))[:, None] * ((x > 0) & (x < 1))
+        brightest = float(values.max())
+        if not brightest > 0:  # it lies between the centres of cells
+            values[np.abs(y - 0.5).argmin(), np.abs(x - 0.5).argmin()] = brightest = 1.0
+        return self.model_copy(
+            update={"image": _numbers(values / brightest), "peak_e": self.peak_e * brightest}
+        )
+
+    def _image_at(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the image, relative to its largest value, at places 0..1 of the sensor."""
+        grid = np.asarray(self.image)
+        values: NDArray[np.float64] = (
+            _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
+        )
+        return values
 
     def pattern(self, rows: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.float64]:
         """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""
         columns = np.arange(shape[1])
         if self.image:
-            grid = np.asarray(self.image)
-            y, x = (rows + 0.5) / shape[0], (columns + 0.5) / shape[1]
-            result: NDArray[np.float64] = (
-                _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
-            )
-            return result
+            return self._image_at((rows + 0.5) / shape[0], (columns + 0.5) / shape[1])
         return spot_image(rows, columns, shape, (self.centre_y, self.centre_x), self.radius)
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
@@ -187,12 +220,16 @@ class Persistence(Effect):
         bright = finer.image()
         peak = float(bright.max())
         if peak > 0:
-            rows = tuple(tuple(float(round(v / peak, 3)) for v in row) for row in bright)
-            found.append(cls(peak_e=peak * fading.scale, image=rows, **fields))
+            found.append(cls(peak_e=peak * fading.scale, image=_numbers(bright / peak), **fields))
         spot = best_spot(finer.amplitude, finer.noise, finer.exposure, exposure.shape)
         if spot is not None:
             found.append(cls(peak_e=spot.peak * fading.scale, **(fields | spot.place)))
         return found
+
+
+def _numbers(image: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+    """Return a grid for the YAML."""
+    return tuple(tuple(float(round(v, 3)) for v in row) for row in image)
 
 
 def _hats(position: NDArray[np.float64], n: int) -> NDArray[np.float64]:

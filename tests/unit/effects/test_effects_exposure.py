@@ -83,6 +83,28 @@ def test_pixels_that_blink_at_a_small_fraction_blink_alike_at_a_larger_one():
     assert np.array_equal(small[:, blinks], large[:, blinks])
 
 
+def test_an_image_in_a_part_of_the_sensor_stays_at_its_place():
+    y, x = np.mgrid[0:8, 0:12] + 0.5
+    smooth = np.exp(-((y - 3.0) ** 2 + (x - 8.0) ** 2) / 18.0)
+    effect = Persistence(peak_e=2.0, decay_frames=9.0, image=tuple(map(tuple, smooth.tolist())))
+    whole = 2.0 * effect.pattern(np.arange(40), (40, 60))
+    for rows, columns in (((0, 20), (20, 50)), ((16, 40), (0, 30)), ((0, 40), (0, 60))):
+        size = (rows[1] - rows[0], columns[1] - columns[0])
+        part = effect.seen_in(rows, columns, (40, 60))
+        own = part.peak_e * part.pattern(np.arange(size[0]), size)
+        assert np.abs(own - whole[slice(*rows), slice(*columns)]).max() < 0.1
+        back = part.found_in(rows, columns, (40, 60))
+        seen = back.peak_e * back.pattern(np.arange(40), (40, 60))
+        middle = (slice(rows[0] + 4, rows[1] - 4), slice(columns[0] + 4, columns[1] - 4))
+        assert np.abs(seen - whole)[middle].max() < 0.2
+        seen[slice(*rows), slice(*columns)] = 0.0
+        beside = seen.copy()
+        beside[max(rows[0] - 5, 0) : rows[1] + 5, max(columns[0] - 5, 0) : columns[1] + 5] = 0.0
+        assert not beside.any()
+    tiny = effect.found_in((20, 21), (30, 31), (4000, 6000))
+    assert np.isfinite(tiny.pattern(np.arange(40), (4000, 6000))).all()
+
+
 def test_the_ghost_of_an_image_fades():
     effect = Persistence(
         peak_e=2.0,
