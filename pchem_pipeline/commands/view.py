@@ -29,7 +29,13 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.report.inspector.inspector import served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.stages.report.inspector import Listed, deciding_parameters, listed_maps, packed_map
+from pchem_pipeline.stages.report.inspector import (
+    Listed,
+    StoredMaps,
+    deciding_parameters,
+    listed_maps,
+    packed_map,
+)
 from pchem_pipeline.stages.report.pixels import bin_masses
 from pchem_pipeline.stages.report.stored import read_histograms, read_model
 from pchem_pipeline.store.run_store import RunStore
@@ -158,7 +164,7 @@ class RunView:
         asked = query.get("path", [])
         if len(query) != 1 or len(asked) != 1 or asked[0] not in self._maps:
             return _text(HTTPStatus.NOT_FOUND, "this run has no such map")
-        packed = packed_map(self.store, self._maps[asked[0]].variable)
+        packed = packed_map(StoredMaps(self.store), self._maps[asked[0]].variable)
         scale = packed.scale
         content = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
         return _json({**content, "data": base64.b64encode(packed.data).decode("ascii")})

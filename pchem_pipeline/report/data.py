@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
+from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
 
@@ -226,6 +228,8 @@ class ReportData:
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None
     samples: Samples | None = None
+    _summaries: dict[tuple[str, bool], MapSummary] = field(default_factory=dict, init=False, repr=False)
+    _errors: dict[tuple[str, bool], float | None] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def noun(self) -> str:
@@ -237,7 +241,7 @@ class ReportData:
         """Tell whether this is a line of so few channels that a histogram over them says nothing."""
         return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
-    @property
+    @cached_property
     def unfitted(self) -> NDArray[np.bool_]:
         """Pixels that no fit has reached yet: neither a value nor a reason; shape ``shape``."""
         status, gain = self.fit.get("fit_status"), self.maps.get("conversion_gain")
@@ -245,7 +249,7 @@ class ReportData:
             return np.zeros(self.shape, dtype=bool)
         return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
 
-    @property
+    @cached_property
     def flagged(self) -> NDArray[np.bool_]:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
         status = self.fit.get("fit_status")
@@ -253,7 +257,12 @@ class ReportData:
             return np.zeros(self.shape, dtype=bool)
         return np.asarray((status & self.failed_mask == 0) & (status & self.flagged_mask != 0))
 
-    @property
+    @cached_property
+    def any_flagged(self) -> bool:
+        """Whether a pixel is flagged."""
+        return bool(self.flagged.any())
+
+    @cached_property
     def flagged_share(self) -> float:
         """Share of flagged pixels among those with a value."""
         status = self.fit.get("fit_status")
@@ -280,4 +289,38 @@ class ReportData:
 
     def has_values(self, name: str) -> bool:
         """Tell whether a map exists and at least one pixel has a value in it."""
-        return name in self.maps and bool(np.isfinite(self.maps[name]).any())
+        return name in self.maps and self.summary(name, with_flagged=True).n_valid > 0
+
+    def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
+        """Describe a map by order statistics, once: the map is large, and many ask.
+
+        Args:
+            name: of the map.
+            with_flagged: of all pixels with a value; else flagged ones are left out.
+        """
+        key = name, with_flagged or not self.any_flagged
+        if key not in self._summaries:
+            self._summaries[key] = summarise(
+                self.maps[name],
+                left_out=None if key[1] else self.flagged,
+                percentiles=tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0))),
+                outlier_sigmas=self.outlier_sigmas,
+            )
+        return self._summaries[key]
+
+    def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
+        """Return the median standard error of a pixel in a map; None where it is not known.
+
+        Args:
+            name: of the map.
+            with_flagged: of all pixels; else flagged ones are left out.
+        """
+        errors = self.maps.get(f"{name}_stderr")
+        if errors is None:
+            return None
+        key = name, with_flagged or not self.any_flagged
+        if key not in self._errors:
+            known = np.isfinite(errors) if key[1] else np.isfinite(errors) & ~self.flagged
+            values = errors[known].astype(np.float64, copy=False)
+            self._errors[key] = float(np.median(values, overwrite_input=True)) if values.size else None
+        return self._errors[key]

@@ -23,7 +23,7 @@ from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import display_transform
 from pchem_pipeline.report.style.wording import measured, short, symbol
-from pchem_pipeline.stages.report.inspector import packed_map
+from pchem_pipeline.stages.report.inspector import StoredMaps, packed_map
 from pchem_pipeline.store.run_store import RunStore
 
 playwright = pytest.importorskip(
@@ -145,7 +145,7 @@ def shown_value(store: RunStore, name: str, i: int) -> str:
 
 def as_shown(store: RunStore, path: str) -> np.ndarray:
     """The map as the page has it where it has no exact values."""
-    return unpack_map(packed_map(store, VARIABLES[path]), (NY, NX))
+    return unpack_map(packed_map(StoredMaps(store), VARIABLES[path]), (NY, NX))
 
 
 def selected(tab: Tab) -> int:
@@ -299,7 +299,7 @@ def test_typed_ends_select_the_right_pixels(tab: Tab, store: RunStore) -> None:
     assert selected(tab) == inside.sum()
     tab.show("maps/bias")
     bias = as_shown(store, "maps/bias")
-    step = packed_map(store, VARIABLES["maps/bias"]).scale.step
+    step = packed_map(StoredMaps(store), VARIABLES["maps/bias"]).scale.step
     found = re.search(r"Median bias ([\d.]+) DN, of all ([\d.]+)", tab.text("#inspector-selection"))
     assert found is not None
     for text, values in ((found[1], bias[inside]), (found[2], bias[np.isfinite(bias)])):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.parameters import FloatArray
+from pchem_pipeline.model.maps.ordered import Ordered
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
 
@@ -130,7 +131,7 @@ def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
 
 
 def summarise(
-    values: FloatArray,
+    values: FloatArray | Ordered,
     *,
     left_out: NDArray[np.bool_] | None = None,
     percentiles: tuple[float, ...] = (1, 5, 25, 50, 75, 95, 99),
@@ -142,44 +143,41 @@ def summarise(
     either side: the median's rank has that standard deviation, whatever the distribution.
 
     Args:
-        values: the map; NaN where there is no value.
-        left_out: pixels whose values do not count, same shape; None: none.
+        values: the map, NaN where there is no value; or its values in order.
+        left_out: pixels whose values do not count, same shape; None: none, or done already.
         percentiles: in %.
         outlier_sigmas: outliers lie beyond so many ``1.4826 MAD`` of the median.
 
     Returns:
         The summary; NaN throughout where no pixel has a value.
     """
-    known = np.isfinite(values)
-    kept = known if left_out is None else known & ~left_out
-    ordered = np.sort(values[kept], axis=None)
-    n, missing = ordered.size, values.size - int(np.count_nonzero(known))
-    without = values.size - missing - n
+    ordered = Ordered.of(values, left_out)
+    n, missing, without = ordered.size, ordered.n_missing, ordered.n_left_out
     if n == 0:
         nan = float("nan")
         return MapSummary(0, missing, without, nan, nan, nan, dict.fromkeys(percentiles, nan), nan, nan, 0, 0)
-    median = float(np.median(ordered))
-    half = 0.5 * np.sqrt(n)
-    ranks = np.arange(n)
-    low, high = np.interp([0.5 * (n - 1) - half, 0.5 * (n - 1) + half], ranks, ordered)
-    robust_sd = 1.4826 * float(np.median(np.abs(ordered - median)))
+    median, robust_sd = ordered.median, ordered.robust_sd
+    middle, half = 0.5 * (n - 1), 0.5 * np.sqrt(n)
     limit = outlier_sigmas * robust_sd
+    found = ordered.quantiles(np.asarray(percentiles) / 100.0)
     return MapSummary(
         n_valid=n,
         n_missing=missing,
         n_left_out=without,
         median=median,
-        median_stderr=0.5 * float(high - low) if n > 1 else float("nan"),
+        median_stderr=0.5 * (ordered.at_rank(middle + half) - ordered.at_rank(middle - half))
+        if n > 1
+        else float("nan"),
         robust_sd=robust_sd,
-        percentiles=dict(zip(percentiles, map(float, np.percentile(ordered, percentiles)), strict=True)),
-        minimum=float(ordered[0]),
-        maximum=float(ordered[-1]),
-        n_low=int(np.count_nonzero(ordered < median - limit)),
-        n_high=int(np.count_nonzero(ordered > median + limit)),
+        percentiles=dict(zip(percentiles, found.tolist(), strict=True)),
+        minimum=float(ordered.values[0]),
+        maximum=float(ordered.values[-1]),
+        n_low=ordered.n_below(median - limit),
+        n_high=ordered.n_above(median + limit),
     )
 
 
-def display_transform(values: FloatArray) -> FloatArray:
+def display_transform(values: FloatArray, ordered: Ordered | None = None) -> FloatArray:
     """Shape a map's histogram into a Beta(2,2) for display (Hendrickson et al. 2023, Appendix C).
 
     ``x' = F^-1(F~(x))`` with the empirical distribution function F~ and the quantile function of Beta(2,2),
@@ -187,17 +185,15 @@ def display_transform(values: FloatArray) -> FloatArray:
     transform is symmetric under a change of sign.
 
     Args:
-        values: the map; NaN where there is no value.
+        values: the map, or some of its pixels; NaN where there is no value.
+        ordered: all values of the map; None: these.
 
     Returns:
         Values in 0..1, same shape, in the same order; NaN stays NaN.
     """
     shown = np.full(values.shape, np.nan)
     valid = np.isfinite(values)
-    if not valid.any():
-        return shown
-    _, inverse, counts = np.unique(values[valid], return_inverse=True, return_counts=True)
-    rank = (np.cumsum(counts) - 0.5 * counts) / inverse.size
+    rank = (ordered or Ordered.of(values)).shares(values[valid])
     # the root of 3 q^2 - 2 q^3 = p in 0..1, in closed form
-    shown[valid] = (0.5 - np.sin(np.arcsin(1.0 - 2.0 * rank) / 3.0))[inverse]
+    shown[valid] = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * rank) / 3.0)
     return shown

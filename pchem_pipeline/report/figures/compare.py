@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.checks.run_differences import FAR, MapDifference
 from pchem_pipeline.report.comparison import Pair, RunFacts
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import is_strip, show_map
+from pchem_pipeline.report.figures.maps import is_strip, show_map, shown_pixels
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, plain, styled
@@ -136,7 +136,8 @@ def draw_difference(look: Look, *, z: FloatArray, n_far: int, title: str, same_d
         top.plot(np.arange(z.size), z.ravel() / unit, "o", color=colours.blue, markersize=3)
         top.set(xlabel="channel", ylabel=label, xlim=(-0.5, z.size - 0.5))
     else:
-        image = show_map(top, z / unit, cmap=DIVERGING, vmin=-limit / unit, vmax=limit / unit)
+        ends = {"vmin": -limit / unit, "vmax": limit / unit}
+        image = show_map(top, shown_pixels(look, z) / unit, z.shape, cmap=DIVERGING, **ends)
         bar = figure.colorbar(image, ax=top, fraction=0.05, pad=0.02, aspect=25, extend="both")
         bar.set_label(label)
     top.set_title(plain(title), fontsize=7.5)

@@ -15,13 +15,13 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.maps.maps import summarise
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import DisplayRange, finite, histogram_edges, robust_range
 from pchem_pipeline.report.style.stretch import stretch_map
-from pchem_pipeline.report.style.style import Drawing, Look, colours_of, note, plain, styled
+from pchem_pipeline.report.style.style import Drawing, Look, colours_of, inches, look_of, note, plain, styled
 from pchem_pipeline.report.style.wording import count, measured, percent, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
@@ -30,6 +30,8 @@ FloatArray = NDArray[np.float64]
 _STRIP = 2
 #: Images longer than this ratio are stretched to fit instead of keeping square pixels.
 _LONGEST_RATIO = 4.0
+#: Height of an image over the width of the figure, at most.
+_TALLEST = 1.6
 #: Rows or columns of an image up to which a vector file keeps each pixel.
 _MOST_KEPT = 800
 
@@ -78,12 +80,7 @@ def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
 
 def _map_alt(data: ReportData, name: str, what: str) -> str:
     _, words, unit = symbol(name)
-    summary = summarise(
-        data.maps[name],
-        left_out=data.flagged,
-        percentiles=(5.0, 95.0),
-        outlier_sigmas=data.outlier_sigmas,
-    )
+    summary = data.summary(name)
     low, high = summary.percentiles[5.0], summary.percentiles[95.0]
     return (
         f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
@@ -167,8 +164,9 @@ def histogram_table(values: NDArray[Any], name: str, most: int, part: str = "") 
         most: largest number of bins.
         part: of the figure.
     """
-    edges = histogram_edges(values, robust_range(values), most=most)
-    counts = np.histogram(finite(values), edges)[0]
+    known = Ordered.of(values)
+    edges = histogram_edges(known, robust_range(known), most=most)
+    counts = known.histogram(edges)
     columns = {f"{name} from": edges[:-1], f"{name} to": edges[1:], "pixels": counts}
     return DataTable(columns, dict.fromkeys(list(columns)[:2], stored_unit(name)), part)
 
@@ -192,16 +190,17 @@ def draw_map(
         name: name of the map in the store.
         stretch: colours by rank (``beta``) or by value (``linear``).
     """
-    full = tables[0][name].astype(np.float64)
+    full = tables[0][name]
     sign, words, unit = symbol(name)
     label = f"{words} {sign} ({unit})"
     if is_strip(full.shape):
-        return _draw_channels(look, tables, full.ravel(), label)
+        return _draw_channels(look, tables, full.ravel().astype(np.float64), label)
     map_height = _map_height(full.shape, look.width_mm - 24.0)
     figure = look.empty(34.0 + map_height)
     top, bottom = figure.subplots(2, 1, height_ratios=(30.0, map_height))
-    _draw_histogram(top, full, tables[1], label)
-    _draw_image(figure, bottom, full, f"{sign} ({unit})", stretch)
+    known = Ordered.of(full)
+    _draw_histogram(top, known, tables[1], label)
+    _draw_image(figure, bottom, full, known, f"{sign} ({unit})", stretch)
     return figure
 
 
@@ -209,14 +208,13 @@ def _map_height(shape: tuple[int, ...], width_mm: float) -> float:
     ratio = shape[0] / shape[1]
     if ratio > _LONGEST_RATIO or ratio < 1.0 / _LONGEST_RATIO:
         ratio = 1.0
-    return float(np.clip(width_mm * ratio, 28.0, 1.6 * width_mm)) + 10.0
+    return float(np.clip(width_mm * ratio, 28.0, _TALLEST * width_mm)) + 10.0
 
 
-def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str) -> DisplayRange:
+def _draw_histogram(axes: Axes, known: Ordered, bins: DataTable, label: str) -> DisplayRange:
     """Draw the histogram of a map with its median; return the range drawn."""
     colours = colours_of(axes)
-    shown = robust_range(values)
-    known = finite(values)
+    shown = robust_range(known)
     axes.set(xlabel=label, ylabel="pixels")
     if known.size == 0:
         axes.set_yticks([])
@@ -226,8 +224,7 @@ def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str)
         axes.set_xscale("log")
     low, high, counts = (bins[name] for name in bins.columns)
     axes.stairs(counts, [*low, high[-1]], fill=True, color=colours.bars)
-    median = float(np.median(known))
-    axes.axvline(median, color=colours.blue, linewidth=1.0)
+    axes.axvline(known.median, color=colours.blue, linewidth=1.0)
     axes.set_xlim(shown.low, shown.high)
     if not shown.logarithmic:
         axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -236,13 +233,18 @@ def _draw_histogram(axes: Axes, values: FloatArray, bins: DataTable, label: str)
 
 
 def _draw_image(
-    figure: Drawing, axes: Axes, values: FloatArray, label: str, stretch: Literal["beta", "linear"]
+    figure: Drawing,
+    axes: Axes,
+    values: NDArray[Any],
+    known: Ordered,
+    label: str,
+    stretch: Literal["beta", "linear"],
 ) -> None:
-    drawn = stretch_map(values, stretch)
-    image = show_map(axes, drawn.colour, vmin=0.0, vmax=1.0)
-    n_missing = int(np.isnan(drawn.colour).sum())
-    if n_missing:
-        words = f"no value: {count(n_missing, 'pixel')}"
+    some = shown_pixels(figure.look, values)
+    drawn = stretch_map(some, stretch, known)
+    image = show_map(axes, drawn.colour, values.shape, vmin=0.0, vmax=1.0)
+    if known.n_missing:
+        words = f"no value: {count(known.n_missing, 'pixel')}"
         patch = Patch(facecolor=figure.look.palette.no_value, edgecolor="#888888", label=words)
         figure.legend(handles=[patch], loc="outside lower left")
     if drawn.levels:
@@ -252,22 +254,42 @@ def _draw_image(
         bar.set_label(label)
 
 
-def show_map(axes: Axes, colour: NDArray[Any], **options: Any) -> AxesImage:
+def shown_pixels(look: Look, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the rows and columns of a map that an image can show: every k-th where there are more."""
+    step = _step(look, values.shape)
+    return values[::step, ::step]
+
+
+def _step(look: Look, shape: tuple[int, ...]) -> int:
+    dots = inches(look.width_mm) * look.dpi
+    return max(1, int(shape[1] / dots), int(shape[0] / (_TALLEST * dots)))
+
+
+def show_map(axes: Axes, colour: NDArray[Any], shape: tuple[int, ...], **options: Any) -> AxesImage:
     """Draw an image of the pixels, square unless the sensor is very long; NaN has the colour of no value.
 
     Args:
         axes: where.
-        colour: what the colour stands for, (y, x).
+        colour: what the colour stands for, (y, x), of the pixels of :func:`shown_pixels`.
+        shape: of the sensor.
         options: of matplotlib's ``imshow``.
     """
-    ny, nx = colour.shape
+    ny, nx = shape
     square = 1.0 / _LONGEST_RATIO <= ny / nx <= _LONGEST_RATIO
     axes.set_facecolor(colours_of(axes).no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
     kept = "none" if max(ny, nx) <= _MOST_KEPT else "nearest"
+    step = _step(look_of(axes), shape)
+    bottom, right = (step * n - 0.5 for n in colour.shape)
     image = axes.imshow(
-        colour, origin="upper", interpolation=kept, aspect="equal" if square else "auto", **options
+        colour,
+        origin="upper",
+        interpolation=kept,
+        aspect="equal" if square else "auto",
+        extent=(-0.5, right, bottom, -0.5),
+        **options,
     )
+    axes.set(xlim=(-0.5, nx - 0.5), ylim=(ny - 0.5, -0.5))
     image.set_cmap(image.get_cmap().with_extremes(bad=colours_of(axes).no_value))
     axes.set(xlabel="x (pixel)", ylabel="y (pixel)")
     for axis in (axes.xaxis, axes.yaxis):
@@ -284,7 +306,7 @@ def _draw_channels(look: Look, tables: Sequence[DataTable], values: FloatArray, 
     figure = look.empty(92.0 if many else 52.0)
     if many:
         top, axes = figure.subplots(2, 1, height_ratios=(1.0, 1.4))
-        _draw_histogram(top, values, tables[1], label)
+        _draw_histogram(top, Ordered.of(values), tables[1], label)
     else:
         axes = figure.add_subplot()
     known = np.isfinite(values)
@@ -340,11 +362,11 @@ def draw_read_noise(look: Look, *, values: NDArray[Any], bins: DataTable) -> Dra
     figure, colours = look.empty(56.0), look.palette
     axes = figure.add_subplot()
     sign, words, unit = symbol("read_noise_e")
-    known = finite(values)
-    shown = _draw_histogram(axes, np.asarray(values, np.float64), bins, f"{words} {sign} ({unit})")
+    known = Ordered.of(values)
+    shown = _draw_histogram(axes, known, bins, f"{words} {sign} ({unit})")
     axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
     if known.size:
-        median = f"median {short(float(np.median(known)))} {unit}"
+        median = f"median {short(known.median)} {unit}"
         axes.set_title("; ".join(filter(None, (median, shown.remark()))), fontsize=6.5, color=colours.faint)
     if known.size and shown.low < 0.5 < shown.high:
         axes.axvline(0.5, color=colours.vermilion, linewidth=0.9, linestyle=":")
@@ -352,7 +374,7 @@ def draw_read_noise(look: Look, *, values: NDArray[Any], bins: DataTable) -> Dra
             0.5, 0.03, " 0.5 e⁻", color=colours.vermilion, fontsize=6.5, transform=axes.get_xaxis_transform()
         )
     if known.size > 1 and not shown.logarithmic:
-        low, high = (float(q) for q in np.quantile(known, [0.05, 0.95]))
+        low, high = known.quantiles([0.05, 0.95]).tolist()
         axes.axvspan(low, high, color=colours.sky, alpha=0.18, linewidth=0, zorder=0)
         axes.text(
             low,
@@ -375,13 +397,14 @@ def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tu
         fit_status: status words, any shape.
         words: bit to sentence.
     """
-    status = np.asarray(fit_status).astype(np.int64).ravel()
+    found = np.bincount(np.asarray(fit_status).ravel())
+    status = np.flatnonzero(found)
     known = {int(bit): text for bit, text in words.items() if int(bit)}
     rest = int(np.bitwise_or.reduce(status, initial=0))
     for bit in known:
         rest &= ~bit
     known |= {1 << i: f"status bit {1 << i}" for i in range(rest.bit_length()) if rest >> i & 1}
-    counts = [(bit, text, int(((status & bit) != 0).sum())) for bit, text in known.items()]
+    counts = [(bit, text, int(found[status[(status & bit) != 0]].sum())) for bit, text in known.items()]
     return [row for row in counts if row[2]]
 
 
@@ -403,15 +426,17 @@ def draw_status(
         rows: of :func:`status_counts`.
         unfitted: pixels that no fit has reached yet (y, x).
     """
-    status = np.asarray(status).astype(np.int64)
     c = look.palette
     palette = [c.band, c.vermilion, c.ink, c.orange, c.purple, c.blue, c.sky, c.green, c.yellow, "#8C8C8C"]
     last = len(palette) - 1
     missing = np.zeros(status.shape, dtype=bool) if unfitted is None else unfitted
-    colour = np.where(missing & (status == 0), last, 0)
+    strip = is_strip(status.shape)
+    some, gone = (each if strip else shown_pixels(look, each) for each in (status.astype(np.int64), missing))
+    colour = np.where(gone & (some == 0), last, 0)
     for index in range(len(rows), 0, -1):
-        colour[(status & rows[index - 1][0]) != 0] = min(index, last - 1)
-    legend = [(palette[0], f"good fit: {_share(int((colour == 0).sum()), status.size)}")]
+        colour[(some & rows[index - 1][0]) != 0] = min(index, last - 1)
+    good = int(np.count_nonzero(status == 0)) - int(np.count_nonzero(missing & (status == 0)))
+    legend = [(palette[0], f"good fit: {_share(good, status.size)}")]
     if missing.any():
         legend.append((palette[last], f"not fitted yet: {_share(int(missing.sum()), status.size)}"))
     legend += [
@@ -420,7 +445,7 @@ def draw_status(
     ]
     legend = [(colour_, plain(textwrap.fill(text, int(look.width_mm * 0.62)))) for colour_, text in legend]
     legend_mm = 3.6 * sum(1 + text.count("\n") for _, text in legend) + 5.0
-    if is_strip(status.shape):
+    if strip:
         figure = look.empty(30.0 + legend_mm)
         axes = figure.add_subplot()
         axes.bar(
@@ -436,7 +461,7 @@ def draw_status(
         figure = look.empty(_map_height(status.shape, look.width_mm - 14.0) + legend_mm)
         axes = figure.add_subplot()
         norm = BoundaryNorm(np.arange(len(palette) + 1) - 0.5, len(palette))
-        show_map(axes, colour, cmap=ListedColormap(palette), norm=norm)
+        show_map(axes, colour, status.shape, cmap=ListedColormap(palette), norm=norm)
     figure.legend(
         handles=[Patch(facecolor=c, edgecolor="#888888", label=text) for c, text in legend],
         loc="outside lower left",

@@ -54,7 +54,7 @@ class PaperFigure:
 def draw_paper_figure(wanted: PaperFigure) -> dict[str, bytes]:
     """Draw a figure and return its files and those of its tables by name; pure."""
     figure, files = wanted.figure, {}
-    drawing = figure.draw(Look.of_sheet(wanted.width_mm or figure.width_mm, wanted.sheet))
+    drawing = figure.draw(Look.of_sheet(wanted.width_mm or figure.width_mm, wanted.sheet, wanted.dpi))
     for kind in wanted.formats:
         content = drawing_bytes(drawing, kind, dpi=wanted.dpi, title=figure.title)
         files[f"{figure.name}.{kind}"] = content

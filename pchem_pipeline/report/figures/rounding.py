@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -35,11 +34,11 @@ _CAPTION = (
 
 def rounding_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     """Return the bias by rounding against 1/g."""
-    curves = rounding_curves(data.maps, data.n_frames)
+    curves = rounding_curves(data)
     if not curves or not data.has_values("conversion_gain"):
         return []
     gain = data.maps["conversion_gain"]
-    step = 1.0 / float(np.median(finite(gain)))
+    step = 1.0 / data.summary("conversion_gain", with_flagged=True).median
     words = [f"{name} {short(float(np.interp(step, curves['1/g'], curves[name])), 2)}" for name in _NAMES]
     table = DataTable(curves, {"1/g": "DN/e-", **dict.fromkeys(_NAMES, "standard errors")})
     return [
@@ -55,21 +54,20 @@ def rounding_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     ]
 
 
-def rounding_curves(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, NDArray[np.float64]]:
+def rounding_curves(data: ReportData) -> dict[str, NDArray[np.float64]]:
     """Return the largest bias by rounding of each parameter against 1/g, at the median H and read noise.
 
     Args:
-        maps: of the run; the medians of H, g and the read noise are taken.
-        n_frames: frames of a pixel.
+        data: of the run; the medians of H, g and the read noise are taken.
 
     Returns:
         ``1/g``, DN per electron, and for each parameter the bias in standard errors of a pixel; empty where
         the run does not know what is needed.
     """
-    needed = [finite(maps[name]) for name in _NEEDED if name in maps]
-    if len(needed) < len(_NEEDED) or not n_frames or any(values.size == 0 for values in needed):
+    n_frames = data.n_frames
+    if not n_frames or not all(data.has_values(name) for name in _NEEDED):
         return {}
-    exposure, gain, total = (float(np.median(values)) for values in needed)
+    exposure, gain, total = (data.summary(name, with_flagged=True).median for name in _NEEDED)
     noise = np.sqrt(max(total**2 - gain**2 * QUANTISATION_VARIANCE, _LEAST_NOISE**2))
     steps = np.repeat(_STEPS, _PHASES)
     phases = np.tile(np.arange(_PHASES) / _PHASES, _STEPS.size)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.checks.multiple_testing import misfit
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import is_strip, show_map
+from pchem_pipeline.report.figures.maps import is_strip, show_map, shown_pixels
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, note, styled
@@ -100,7 +99,7 @@ def left_out_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
 
 def uncertainty_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     """Return the part of the maps that is noise, and the error of the predicted ensemble."""
-    shares = noise_shares(data.maps, _UNCERTAIN)
+    shares = noise_shares(data, _UNCERTAIN)
     arrays = data.ensemble
     if not shares or "epcd_exact" not in arrays:
         return []
@@ -124,25 +123,23 @@ def uncertainty_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     ]
 
 
-def noise_shares(maps: Mapping[str, FloatArray], names: tuple[str, ...]) -> dict[str, float]:
+def noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
     """Return, by map, the part of its variance over the pixels that the errors of the estimates make.
 
     Both are robust: the median squared standard error over ``(1.4826 MAD)^2``.
 
     Args:
-        maps: ``name`` and ``name_stderr``, (y, x).
+        data: with the maps.
         names: maps to look at; those that do not exist or have fewer than 8 values are left out.
     """
     found = {}
     for name in names:
-        if name not in maps or f"{name}_stderr" not in maps:
+        error = data.pixel_error(name, with_flagged=True)
+        if error is None or not data.has_values(name):
             continue
-        values, errors = finite(maps[name]), finite(maps[f"{name}_stderr"])
-        if values.size < 8 or not errors.size:
-            continue
-        spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-        if spread > 0:
-            found[name] = float(np.median(errors) ** 2 / spread**2)
+        summary = data.summary(name, with_flagged=True)
+        if summary.n_valid >= 8 and summary.robust_sd > 0:
+            found[name] = float(error**2 / summary.robust_sd**2)
     return found
 
 
@@ -174,7 +171,8 @@ def draw_goodness(look: Look, *, table: DataTable, false_discovery_rate: float) 
         right.set(xlabel="channel", ylabel="misfit (σ)")
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         return figure
-    image = show_map(right, np.clip(deviate, *_DEVIATES), vmin=-4.0, vmax=6.0)
+    shown = np.clip(shown_pixels(look, deviate), *_DEVIATES)
+    image = show_map(right, shown, deviate.shape, vmin=-4.0, vmax=6.0)
     if len(marked) <= _MOST_MARKS:
         right.plot(marked[:, 1], marked[:, 0], "o", markersize=5, mec=colours.vermilion, mfc="none", mew=0.8)
     bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
@@ -225,9 +223,10 @@ def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Dra
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         return figure
     # nothing is white, a single sample is seen
-    shown = np.where(samples > 0, samples, np.nan)
-    top = max(float(np.nanmax(shown, initial=1.0)), 1.0)
-    image = show_map(right, shown, cmap=colours.from_paper, vmin=0.0, vmax=top)
+    some = shown_pixels(look, samples)
+    shown = np.where(some > 0, some, np.nan)
+    top = max(float(np.max(hit, initial=1.0)), 1.0)
+    image = show_map(right, shown, samples.shape, cmap=colours.from_paper, vmin=0.0, vmax=top)
     right.set_facecolor(colours.paper)
     bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
     bar.set_label(label)

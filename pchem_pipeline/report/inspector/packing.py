@@ -27,6 +27,8 @@ _TAIL = 1e-3
 _DECADES = 30.0
 #: Values from which quantiles are taken, at least.
 _ENOUGH = 500_009
+#: Values whose codes are made at a time.
+_AT_ONCE = 1 << 17
 #: Step of logarithmic maps: 2.3 %.
 _LOG_STEP = 0.01
 
@@ -102,26 +104,31 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
         values: shape (ny, nx); NaN where there is no value.
         scale: from :func:`choose_scale`.
     """
-    flat = np.asarray(values, dtype=np.float64).ravel()
-    unknown = ~np.isfinite(flat)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        place = np.log10(flat) - scale.low if scale.log else flat - scale.low
-    place /= scale.step
-    np.rint(place, out=place)
-    place += _FIRST
-    with np.errstate(invalid="ignore"):
-        below, above = place < _FIRST, place > _LAST
-    unknown |= np.isnan(place)
-    place[below], place[above], place[unknown] = _BELOW, _ABOVE, _NONE
-    codes = place.astype("<u2")
-    outside = (below | above) & ~unknown
+    flat = np.asarray(values).ravel()
+    codes = np.empty(flat.size, "<u2")
+    for start in range(0, flat.size, _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        codes[part] = _codes(flat[part].astype(np.float64, copy=False), scale)
+    outside = (codes == _BELOW) | (codes == _ABOVE)
     if scale.log:  # zeros, which may be many, need no place in the list
         outside &= flat != 0
     odd = np.flatnonzero(outside)
-    planes = [codes & 255, codes >> 8]
-    content = b"".join(plane.astype(np.uint8).tobytes() for plane in planes)
+    content = b"".join((codes >> shift).astype(np.uint8).tobytes() for shift in (0, 8))
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
     return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0))
+
+
+def _codes(values: FloatArray, scale: Scale) -> FloatArray:
+    """Return the code of each value."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = np.log10(values) if scale.log else values.copy()
+        place -= scale.low
+        place /= scale.step
+    np.rint(place, out=place)
+    place += _FIRST
+    np.clip(place, _BELOW, _ABOVE, out=place)
+    place[~np.isfinite(values) | np.isnan(place)] = _NONE
+    return place
 
 
 def varints(values: NDArray[Any]) -> bytes:

@@ -9,7 +9,6 @@ from importlib import metadata
 import numpy as np
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.pages.criteria import map_summary
 from pchem_pipeline.report.pages.summary import pixel_counts
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import count, measured, percent, symbol
@@ -110,7 +109,7 @@ def _result_sentence(data: ReportData) -> str:
     parts = []
     for name in ("read_noise_e", "conversion_gain", "charge_rate", "dark_current"):
         if data.has_values(name):
-            summary = map_summary(data, name)
+            summary = data.summary(name)
             _, words, unit = symbol(name)
             value = measured(summary.median, summary.median_stderr, unit)
             parts.append(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import percent, short
@@ -36,16 +35,6 @@ class Criterion:
 _Found = tuple[float, str] | None
 
 
-def map_summary(data: ReportData, name: str) -> MapSummary:
-    """Describe a map by order statistics, flagged pixels left out."""
-    return summarise(
-        data.maps[name],
-        left_out=data.flagged,
-        percentiles=data.percentiles,
-        outlier_sigmas=data.outlier_sigmas,
-    )
-
-
 def criteria(data: ReportData) -> list[Criterion]:
     """Judge the sensor by each criterion that has a limit and can be judged."""
     found = []
@@ -61,7 +50,7 @@ def criteria(data: ReportData) -> list[Criterion]:
 def _read_noise(data: ReportData) -> _Found:
     if not data.has_values("read_noise_e"):
         return None
-    median = map_summary(data, "read_noise_e").median
+    median = data.summary("read_noise_e").median
     return (median, "median read noise") if np.isfinite(median) else None
 
 
@@ -81,7 +70,7 @@ def _hot(data: ReportData) -> _Found:
     """Return the share of hot pixels; a flagged one is hot, too, whatever electrons it is open by."""
     if data.few_channels or not data.has_values("quanta_exposure"):
         return None
-    summary = map_summary(data, "quanta_exposure")
+    summary = data.summary("quanta_exposure")
     if not summary.n_valid:
         return None
     values = finite(data.maps["quanta_exposure"])
@@ -96,7 +85,7 @@ def _outlying(data: ReportData) -> _Found:
     shares = []
     for name in ("conversion_gain", "bias", "read_noise_e"):
         if data.has_values(name):
-            summary = map_summary(data, name)
+            summary = data.summary(name)
             share = (summary.n_low + summary.n_high) / max(summary.n_valid, 1)
             shares.append((share, f"outliers in {name.removesuffix('_e').replace('_', ' ')}"))
     return max(shares, default=None)
@@ -106,11 +95,10 @@ def _gain_spread(data: ReportData) -> _Found:
     """Return the spread of the gain between pixels over its median, without that of the pixels' errors."""
     if data.few_channels or not data.has_values("conversion_gain"):
         return None
-    summary = map_summary(data, "conversion_gain")
+    summary = data.summary("conversion_gain")
     if summary.n_valid < 2:
         return None
-    errors = finite(np.where(data.flagged, np.nan, data.maps.get("conversion_gain_stderr", np.nan)))
-    own = float(np.median(errors)) if errors.size else 0.0
+    own = data.pixel_error("conversion_gain") or 0.0
     spread = np.sqrt(max(summary.robust_sd**2 - own**2, 0.0))
     return float(spread / summary.median), "non-uniformity of the gain"
 

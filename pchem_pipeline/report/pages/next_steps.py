@@ -8,7 +8,6 @@ import numpy as np
 
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.pages.criteria import map_summary
 
 #: Stands for the run in a command.
 RUN = "RUN"
@@ -74,7 +73,7 @@ def _read_noise(data: ReportData) -> str:
     """Return the read noise to plan for, e-: the median's, or where most pixels are open a guess above it."""
     if data.mostly_flagged or not data.has_values("read_noise_e"):
         return "0.6"
-    return f"{map_summary(data, 'read_noise_e').median:.2g}"
+    return f"{data.summary('read_noise_e').median:.2g}"
 
 
 def _coarse(data: ReportData) -> bool:

@@ -60,7 +60,9 @@ def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
         figure: the figure.
         settings: formats and resolution.
     """
-    drawing = figure.draw(Look(figure.width_mm))
+    # the SVG is both a file and what the page embeds, where files are asked for
+    dpi = settings.dpi if settings.figure_formats else _PAGE_DPI
+    drawing = figure.draw(Look(figure.width_mm, dpi=dpi))
     files = {
         f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=settings.dpi, title=figure.title)
         for kind in settings.figure_formats

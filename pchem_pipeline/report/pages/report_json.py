@@ -80,14 +80,13 @@ def report_json(data: ReportData) -> str:
 def _summary(data: ReportData) -> dict[str, Any]:
     found = {}
     for name, summary in summaries(data).items():
-        errors = finite(np.where(data.flagged, np.nan, data.maps.get(f"{name}_stderr", np.nan)))
         found[name] = {
             "unit": stored_unit(name),
             "median": summary.median,
             "median_stderr": summary.median_stderr,
             "robust_sd": summary.robust_sd,
-            "pixel_stderr": float(np.median(errors)) if errors.size else None,
-            "percentiles": {f"{p:g}": value for p, value in summary.percentiles.items()},
+            "pixel_stderr": data.pixel_error(name),
+            "percentiles": {f"{p:g}": summary.percentiles[p] for p in data.percentiles},
             "minimum": summary.minimum,
             "maximum": summary.maximum,
             "n_pixels": summary.n_valid,

@@ -10,10 +10,10 @@ import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.model.fit.status import FLAGGED
-from pchem_pipeline.model.maps.maps import MapSummary, summarise
+from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
-from pchem_pipeline.report.pages.criteria import Criterion, criteria, map_summary
+from pchem_pipeline.report.pages.criteria import Criterion, criteria
 from pchem_pipeline.report.pages.quick_look import check_sentence, nothing_found
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
@@ -79,7 +79,7 @@ def pixel_counts(data: ReportData) -> PixelCounts:
 
 def summaries(data: ReportData) -> dict[str, MapSummary]:
     """Describe every map by order statistics, flagged pixels left out."""
-    return {name: map_summary(data, name) for name in data.maps if not name.endswith("_stderr")}
+    return {name: data.summary(name) for name in data.maps if not name.endswith("_stderr")}
 
 
 def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
@@ -92,23 +92,22 @@ def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumb
     """
     if data.mostly_flagged and not with_flagged:
         return []
-    left_out = np.zeros(data.shape, dtype=bool) if with_flagged else data.flagged
     found = []
     which = f" of unflagged {data.noun}s" if data.often_flagged and not with_flagged else ""
     for name in _KEY_MAPS:
         if not data.has_values(name):
             continue
         _, words, unit = symbol(name)
-        summary = summarise(data.maps[name], left_out=left_out, percentiles=(5.0, 95.0))
+        summary = data.summary(name, with_flagged=with_flagged)
         low, high = summary.percentiles[5.0], summary.percentiles[95.0]
-        errors = finite(np.where(left_out, np.nan, data.maps.get(f"{name}_stderr", np.nan)))
+        error = data.pixel_error(name, with_flagged=with_flagged)
         found.append(
             KeyNumber(
                 name,
                 f"{words}{which}",
                 measured(summary.median, summary.median_stderr, unit),
                 f"{short(low)} to {short(high)} {unit}",
-                f"± {short(float(np.median(errors)), 2)} {unit}" if errors.size else "",
+                "" if error is None else f"± {short(error, 2)} {unit}",
             )
         )
     return found
@@ -149,7 +148,7 @@ def _medians(data: ReportData) -> str:
     parts = []
     for name in ("read_noise_e", "conversion_gain", *CHARGE_RATES):
         if data.has_values(name):
-            summary = map_summary(data, name)
+            summary = data.summary(name)
             unit = symbol(name)[2]
             parts.append(f"{symbol(name)[1]} {measured(summary.median, summary.median_stderr, unit)}")
     left_out = f" ({count(flagged, 'flagged one')} left out)" if flagged else ""
@@ -333,12 +332,12 @@ def _conditions(data: ReportData) -> list[Flag]:
         for part in ("charge_rate", "ensemble")
         if part in data.missing
     ]
-    noisy = data.has_values("read_noise_e") and map_summary(data, "read_noise_e").median > _TOO_NOISY
+    noisy = data.has_values("read_noise_e") and data.summary("read_noise_e").median > _TOO_NOISY
     if data.samples is None and noisy:
         found.append(
             Flag("caution", "Read noise above 0.5 e⁻: one exposure tells little; take several exposures.")
         )
-    if data.has_values("conversion_gain") and map_summary(data, "conversion_gain").median > 0.4:
+    if data.has_values("conversion_gain") and data.summary("conversion_gain").median > 0.4:
         found.append(
             Flag(
                 "caution",
@@ -423,7 +422,7 @@ def _sensor(data: ReportData) -> Answer:
     if pixels.failed > data.allowed_failed * pixels.total:
         return Answer(question, "serious", "No", text, judged)
     if any(each.setting == "read_noise_e" for each in missed):
-        noisy = map_summary(data, "read_noise_e").median > _TOO_NOISY
+        noisy = data.summary("read_noise_e").median > _TOO_NOISY
         word = "Too noisy to count electrons" if noisy else "Too noisy"
         return Answer(question, "caution", word, text, judged)
     if data.often_flagged:

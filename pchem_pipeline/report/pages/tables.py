@@ -109,14 +109,14 @@ def _parameters(data: ReportData) -> Table:
     found = summaries(data)
     for name, summary in ((name, found[name]) for name in _ORDER if data.has_values(name)):
         _, words, unit = symbol(name)
-        errors = finite(np.where(data.flagged, np.nan, data.maps.get(f"{name}_stderr", np.nan)))
-        values = [short(value, 4) for value in summary.percentiles.values()]
+        error = data.pixel_error(name)
+        values = [short(summary.percentiles[p], 4) for p in data.percentiles]
         rows.append(
             (
                 f"{words} ({unit})",
                 measured(summary.median, summary.median_stderr),
                 short(summary.robust_sd),
-                short(float(np.median(errors)), 2) if errors.size else "not known",
+                "not known" if error is None else short(error, 2),
                 *values,
                 f"{summary.n_low + summary.n_high:,}",
                 f"{summary.n_valid:,}",
@@ -149,7 +149,7 @@ def _left_out(data: ReportData) -> str:
 def _flagged(data: ReportData) -> Table:
     """Return what flagged pixels read; their errors are no errors and are not shown."""
     rows = []
-    for name in _ORDER if data.flagged.any() else ():
+    for name in _ORDER if data.any_flagged else ():
         if not data.has_values(name):
             continue
         summary = summarise(data.maps[name], left_out=~data.flagged, percentiles=(5.0, 95.0))
@@ -379,22 +379,22 @@ def _misfits(data: ReportData) -> Table:
 
 def _intervals(data: ReportData) -> Table:
     rows = []
-    shares = noise_shares(data.maps, _ORDER)
-    for name in (name for name in _ORDER if data.has_values(name) and f"{name}_stderr" in data.maps):
+    shares = noise_shares(data, _ORDER)
+    for name in (name for name in _ORDER if data.has_values(name)):
         _, words, unit = symbol(name)
-        values, errors = data.maps[name], data.maps[f"{name}_stderr"]
-        known = finite(errors)
-        if not known.size:
+        error = data.pixel_error(name, with_flagged=True)
+        if error is None:
             continue
         ends = ["", ""]
         if name in data.intervals:
+            values, errors = data.maps[name], data.maps[f"{name}_stderr"]
             low, high = data.intervals[name]
             ends = [short(float(np.nanmedian(part / errors)), 3) for part in (values - low, high - values)]
         rows.append(
             (
                 f"{words} ({unit})",
-                short(float(np.median(known)), 3),
-                percent(float(np.median(known)), abs(float(np.median(finite(values))))),
+                short(error, 3),
+                percent(error, abs(data.summary(name, with_flagged=True).median)),
                 percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
                 *(ends if data.intervals else ()),
             )

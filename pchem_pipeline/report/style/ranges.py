@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.maps.ordered import Ordered
+
 FloatArray = NDArray[np.float64]
 
 #: A positive range that spans more than this factor is drawn on a logarithmic axis.
@@ -53,7 +55,9 @@ def finite(values: NDArray[Any]) -> FloatArray:
     return flat[np.isfinite(flat)]
 
 
-def robust_range(values: NDArray[Any], *, tail: float = 0.01, allow_log: bool = True) -> DisplayRange:
+def robust_range(
+    values: NDArray[Any] | Ordered, *, tail: float = 0.01, allow_log: bool = True
+) -> DisplayRange:
     """Choose the range of an axis from the bulk of the values.
 
     The range between the quantiles ``tail`` and ``1 - tail``, widened by 0.3 of it on each side (on a
@@ -65,12 +69,11 @@ def robust_range(values: NDArray[Any], *, tail: float = 0.01, allow_log: bool = 
         tail: quantile at which each tail begins.
         allow_log: whether a logarithmic axis may be chosen.
     """
-    known = finite(values)
-    n_missing = int(np.size(values) - known.size)
+    known = Ordered.of(values)
     if known.size == 0:
-        return DisplayRange(0.0, 1.0, 0, 0, n_missing, False)
-    smallest, largest = float(known.min()), float(known.max())
-    bulk_low, bulk_high = (float(q) for q in np.quantile(known, [tail, 1.0 - tail]))
+        return DisplayRange(0.0, 1.0, 0, 0, known.n_missing, False)
+    smallest, largest = float(known.values[0]), float(known.values[-1])
+    bulk_low, bulk_high = known.quantiles([tail, 1.0 - tail]).tolist()
     logarithmic = allow_log and bulk_low > 0 and bulk_high / bulk_low > _DECADES
     if logarithmic:
         low, high = np.exp(_widened(np.log(bulk_low), np.log(bulk_high)))
@@ -82,7 +85,7 @@ def robust_range(values: NDArray[Any], *, tail: float = 0.01, allow_log: bool = 
         pad = max(abs(low) * 0.05, 1e-9)
         low, high = low - pad, high + pad
     return DisplayRange(
-        low, high, int((known < low).sum()), int((known > high).sum()), n_missing, bool(logarithmic)
+        low, high, known.n_below(low), known.n_above(high), known.n_missing, bool(logarithmic)
     )
 
 
@@ -91,7 +94,7 @@ def _widened(low: float, high: float) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def histogram_edges(values: NDArray[Any], shown: DisplayRange, *, most: int = 128) -> FloatArray:
+def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, *, most: int = 128) -> FloatArray:
     """Return 6 to ``most`` bins over the drawn range, by the rule of Freedman and Diaconis.
 
     Args:
@@ -99,14 +102,14 @@ def histogram_edges(values: NDArray[Any], shown: DisplayRange, *, most: int = 12
         shown: range from :func:`robust_range`.
         most: largest number of bins.
     """
-    known = finite(values)
-    known = known[(known >= shown.low) & (known <= shown.high)]
+    known = Ordered.of(values).within(shown.low, shown.high)
     low, high = shown.low, shown.high
     if shown.logarithmic:
-        known, low, high = np.log(known), float(np.log(low)), float(np.log(high))
+        known = Ordered(np.log(known.values))
+        low, high = float(np.log(low)), float(np.log(high))
     bins = 6
     if known.size > 1:
-        q25, q75 = np.quantile(known, [0.25, 0.75])
+        q25, q75 = known.quantiles([0.25, 0.75])
         width = 2.0 * float(q75 - q25) / known.size ** (1.0 / 3.0)
         bins = int(np.clip(np.ceil((high - low) / width), 6, most)) if width > 0 else 6
     edges = np.linspace(low, high, bins + 1)

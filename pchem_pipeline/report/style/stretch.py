@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.maps import display_transform
-from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.style.wording import short
 
 FloatArray = NDArray[np.float64]
@@ -33,7 +33,9 @@ class StretchedMap:
     labels: tuple[str, ...]
 
 
-def stretch_map(values: NDArray[Any], stretch: Literal["beta", "linear"] = "beta") -> StretchedMap:
+def stretch_map(
+    values: NDArray[Any], stretch: Literal["beta", "linear"] = "beta", ordered: Ordered | None = None
+) -> StretchedMap:
     """Return colour levels of a map and the labels of its colour bar.
 
     ``beta`` is the transform of Hendrickson et al. 2023, Appendix C: the level is the Beta(2,2) quantile of
@@ -42,21 +44,22 @@ def stretch_map(values: NDArray[Any], stretch: Literal["beta", "linear"] = "beta
     end colours.
 
     Args:
-        values: map (y, x), NaN where there is no value.
+        values: map (y, x), or some of its rows and columns; NaN where there is no value.
         stretch: which of the two.
+        ordered: all values of the map; None: these.
     """
     full = np.asarray(values, dtype=np.float64)
-    known = finite(full)
+    known = ordered or Ordered.of(full)
     if known.size == 0:
         return StretchedMap(np.full(full.shape, np.nan), (), ())
-    if known.min() == known.max():
+    if known.values[0] == known.values[-1]:
         colour = np.where(np.isfinite(full), 0.5, np.nan)
-        return StretchedMap(colour, (0.5,), (short(float(known[0])),))
+        return StretchedMap(colour, (0.5,), (short(float(known.values[0])),))
     level = np.asarray(STRETCH_LEVELS)
     if stretch == "beta":
-        physical = np.quantile(known, level**2 * (3.0 - 2.0 * level))
-        return StretchedMap(display_transform(full), STRETCH_LEVELS, _labels(physical))
-    low, high = (float(q) for q in np.quantile(known, [0.01, 0.99]))
+        physical = known.quantiles(level**2 * (3.0 - 2.0 * level))
+        return StretchedMap(display_transform(full, known), STRETCH_LEVELS, _labels(physical))
+    low, high = known.quantiles([0.01, 0.99]).tolist()
     span = high - low if high > low else 1.0
     physical = low + level * span
     signs = ["≤ ", "", "", "", "≥ "]

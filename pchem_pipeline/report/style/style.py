@@ -78,16 +78,18 @@ class Look:
         width_mm: width; panels stand side by side on a page, one above the other on a column.
         palette: colours.
         sheet: parameters of matplotlib that prevail over the style of this package.
+        dpi: dots per inch that images are drawn for at most.
     """
 
     width_mm: float = COLUMN_MM
     palette: Palette = LIGHT
     sheet: Mapping[str, Any] = field(default_factory=dict)
+    dpi: int = 300
 
     @classmethod
-    def of_sheet(cls, width_mm: float, sheet: Mapping[str, Any]) -> Look:
+    def of_sheet(cls, width_mm: float, sheet: Mapping[str, Any], dpi: int = 300) -> Look:
         """Return the look that a user's style sheet asks for."""
-        return cls(width_mm, palette_of(sheet), sheet)
+        return cls(width_mm, palette_of(sheet), sheet, dpi)
 
     @property
     def wide(self) -> bool:
@@ -189,12 +191,17 @@ def inches(millimetres: float) -> float:
     return millimetres / 25.4
 
 
-def colours_of(axes: Axes) -> Palette:
-    """Return the palette in which the axes are drawn."""
+def look_of(axes: Axes) -> Look:
+    """Return the look in which the axes are drawn."""
     figure = axes.figure
     while not isinstance(figure, Drawing):
         figure = figure.figure  # from a part of a figure to the whole
-    return figure.look.palette
+    return figure.look
+
+
+def colours_of(axes: Axes) -> Palette:
+    """Return the palette in which the axes are drawn."""
+    return look_of(axes).palette
 
 
 def note(axes: Axes, text: str, *, where: str = "upper right") -> None:

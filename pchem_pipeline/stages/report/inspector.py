@@ -80,6 +80,8 @@ _FIRST = (
 #: Groups in the order of the list; what a group of ``fit`` repeats of ``maps`` is left out.
 _GROUPS = ("maps", "fit", "discrepancy", "summary", "histogram", "truth")
 _MANY_PIXELS = 1_000_000
+#: Pixels of which two maps are compared at a time.
+_AT_ONCE = 1 << 20
 _WORDS = re.compile(r"(\d+) ([^,;:]+)")
 
 
@@ -136,7 +138,10 @@ def _flag_texts(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
 
 
 def read_maps(
-    store: RunStore, shape: tuple[int, int], index: NDArray[np.int64]
+    store: RunStore,
+    shape: tuple[int, int],
+    index: NDArray[np.int64],
+    loaded: Mapping[str, NDArray[Any]] | None = None,
 ) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
     """Read every stored map: packed as far as they fit into the page, and exact for some pixels.
 
@@ -144,6 +149,7 @@ def read_maps(
         store: the run.
         shape: of the sensor.
         index: ``y * nx + x`` of the pixels that are held in full.
+        loaded: maps that were read already, by path; None: none.
 
     Returns:
         The maps, in the order of the list, and by path of those that fit their values, shape (n,).
@@ -151,9 +157,39 @@ def read_maps(
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    entries = _packed(store, listed_maps(store, shape), shape)
+    maps = StoredMaps(store, loaded)
+    entries = _packed(maps, listed_maps(store, shape), shape)
     here = [entry.path for entry in entries if entry.packed is not None or entry.same_as is not None]
-    return entries, {path: store.read(path).reshape(-1)[index].astype(np.float64) for path in here}
+    return entries, {path: maps.read(path).reshape(-1)[index].astype(np.float64) for path in here}
+
+
+class StoredMaps:
+    """Maps of a run, of which some are at hand.
+
+    Attributes:
+        store: the run.
+        loaded: maps that need not be read, by path.
+    """
+
+    def __init__(self, store: RunStore, loaded: Mapping[str, NDArray[Any]] | None = None) -> None:
+        self.store, self.loaded = store, loaded or {}
+        self._last: tuple[str, NDArray[Any]] = ("", np.empty(0))
+
+    def has(self, path: str) -> bool:
+        """Tell whether there is such a map."""
+        return path in self.loaded or self.store.has(path)
+
+    def read(self, path: str) -> NDArray[Any]:
+        """Return a map; the last one is kept.
+
+        Raises:
+            StoreError: it is missing or corrupt.
+        """
+        if path in self.loaded:
+            return self.loaded[path]
+        if path != self._last[0]:
+            self._last = path, self.store.read(path)
+        return self._last[1]
 
 
 def inspector_data(
@@ -165,7 +201,7 @@ def inspector_data(
     )
 
 
-def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
+def _packed(maps: StoredMaps, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
     """Pack maps, the important ones first, until the budget is spent."""
     n = shape[0] * shape[1]
     budget = min(_MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER, _MOST_BYTES)
@@ -173,12 +209,12 @@ def _packed(store: RunStore, listed: Sequence[Listed], shape: tuple[int, int]) -
     found: dict[str, MapEntry] = {}
     for each in order:
         entry = map_entry(each)
-        alike = _multiple_of_exposure(store, each.variable)
+        alike = _multiple_of_exposure(maps, each.variable)
         if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
             found[entry.path] = replace(entry, same_as=alike)
             continue
         # packing takes long where pixels are many: there the first map that does not fit is the last tried
-        packed = packed_map(store, each.variable) if budget > 0 else None
+        packed = packed_map(maps, each.variable) if budget > 0 else None
         size = math.inf if packed is None else 4 * len(packed.data) / 3
         fits = size <= budget
         budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
@@ -193,19 +229,19 @@ def _importance(path: str) -> tuple[int, int]:
     return 1 + (_GROUPS.index(group) if group in _GROUPS else 1), 0
 
 
-def packed_map(store: RunStore, variable: Variable) -> PackedMap:
+def packed_map(maps: StoredMaps, variable: Variable) -> PackedMap:
     """Return a stored map, quantised well below its standard error.
 
     Raises:
         StoreError: it is missing or corrupt.
     """
-    values = store.read(variable.path)
+    values = maps.read(variable.path)
     coarse, _ = _coarse(values.size)
     step = 0.0
     if variable.name.endswith("_stderr"):
         step = _STEP_OF_ERRORS * _median(values)
-    elif store.has(f"{variable.path}_stderr"):
-        step = _median(store.read(f"{variable.path}_stderr")) / _STEPS_PER_ERROR
+    elif maps.has(f"{variable.path}_stderr"):
+        step = _median(maps.read(f"{variable.path}_stderr")) / _STEPS_PER_ERROR
     return pack_map(values, choose_scale(values, step=step, coarse=coarse))
 
 
@@ -220,21 +256,29 @@ def _median(values: NDArray[Any]) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def _multiple_of_exposure(store: RunStore, variable: Variable) -> tuple[str, float] | None:
+def _multiple_of_exposure(maps: StoredMaps, variable: Variable) -> tuple[str, float] | None:
     """Return the map of H, or of its error, with the factor that makes it this one; None for other maps."""
     rate = next((name for name in CHARGE_RATES if variable.path.startswith(f"maps/{name}")), None)
     if rate is None:
         return None
     other = variable.path.replace(rate, "quanta_exposure")
-    if not store.has(other):
+    if not maps.has(other):
         return None
-    current, exposure = store.read(variable.path), store.read(other)
-    known = np.isfinite(current) & np.isfinite(exposure) & (exposure > 0)
-    if not known.any() or (np.isfinite(current) != np.isfinite(exposure)).any():
-        return None
-    factor = float(np.median(current[known] / exposure[known]))
-    same = np.allclose(current[known], factor * exposure[known], rtol=1e-9, atol=0.0)
+    current, exposure = maps.read(variable.path), maps.read(other)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = _median(some_of(current.ravel()) / some_of(exposure.ravel()))
+    rows = max(1, _AT_ONCE // current.shape[1])
+    bands = [np.s_[y : y + rows] for y in range(0, current.shape[0], rows)]
+    same = factor != 0 and all(_proportional(current[band], exposure[band], factor) for band in bands)
     return (other, factor) if same else None
+
+
+def _proportional(values: NDArray[Any], others: NDArray[Any], factor: float) -> bool:
+    """Tell whether values are others times a factor, and are known where these are."""
+    known = np.isfinite(values)
+    if (known != np.isfinite(others)).any():
+        return False
+    return np.allclose(values[known], factor * others[known], rtol=1e-9, atol=0.0)
 
 
 def deciding_parameters(

@@ -16,13 +16,17 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
+from pchem_pipeline.report.inspector.packing import some_of
 from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.report.stored import FittedModel, PixelHistograms
 
 #: Pixels for each reason: a flag, a poor fit, an extreme value, a large standard error.
 _FLAGGED, _POOR, _EXTREME, _UNSURE = 40, 60, 12, 8
 _SEED = 20_231
+#: Ranks, of 1, about those that are sought among which a pixel is looked for first.
+_REACH = 0.02
 #: Sensors with fewer pixels have all of them in the file; of a larger one so many.
 _ALL_PIXELS, _SOME_PIXELS = 4096, 2400
 
@@ -62,22 +66,41 @@ def choose_pixels(
         places = [divmod(int(first[i]), fit_status.shape[1]) for i in order]
         return [("no fit", y, x) for (y, x), _ in zip(places, words[order], strict=True)]
     good = known & (fit_status == 0)
-    where = np.argwhere(good if good.sum() >= len(_CORNERS) else known)
-    noise, exposure = (_ranks(values[tuple(where.T)]) for values in (read_noise_e, quanta_exposure))
+    free = good if good.sum() >= len(_CORNERS) else known
+    maps = read_noise_e, quanta_exposure
+    ordered = [Ordered.of(values, ~free) for values in maps]
     chosen: list[Chosen] = []
-    free = np.ones(len(where), dtype=bool)
-    for label, at_noise, at_exposure in _CORNERS[: len(where)]:
-        distance = (noise - at_noise) ** 2 + (exposure - at_exposure) ** 2
-        best = int(np.argmin(np.where(free, distance, np.inf)))
+    for label, *ranks in _CORNERS[: ordered[0].size]:
+        best = _nearest(maps, ordered, ranks, free)
         free[best] = False
-        chosen.append((label, int(where[best, 0]), int(where[best, 1])))
+        chosen.append((label, *best))
     return chosen
 
 
-def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    ranks = np.empty(values.size)
-    ranks[np.argsort(values, kind="stable")] = (np.arange(values.size) + 0.5) / values.size
-    return ranks
+def _nearest(
+    maps: Sequence[NDArray[np.float64]],
+    ordered: Sequence[Ordered],
+    ranks: Sequence[float],
+    free: NDArray[np.bool_],
+) -> tuple[int, int]:
+    """Return the free pixel whose values have ranks nearest to given ones; ranks are in 0..1.
+
+    Looked at are the pixels with ranks about these, twice as far until the nearest lies among them.
+    """
+    reach = _REACH
+    while True:
+        inside = free.copy()
+        for values, known, rank in zip(maps, ordered, ranks, strict=True):
+            low, high = known.quantiles(np.clip([rank - reach, rank + reach], 0.0, 1.0))
+            inside &= (values >= low) & (values <= high)
+        y, x = np.nonzero(inside)
+        distance = np.zeros(y.size)
+        for values, known, rank in zip(maps, ordered, ranks, strict=True):
+            distance += (known.shares(values[y, x]) - rank) ** 2
+        if reach >= 1.0 or np.min(distance, initial=np.inf) < (reach - 1.0 / free.size) ** 2:
+            best = int(np.argmin(distance))
+            return int(y[best]), int(x[best])
+        reach *= 2.0
 
 
 def pixel_index(chosen: Sequence[Chosen], shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -223,9 +246,11 @@ def _poor(fit: Mapping[str, NDArray[Any]], status: NDArray[Any]) -> list[tuple[s
 
 def _smallest(values: NDArray[np.float64], n: int) -> NDArray[np.int64]:
     """Return the places of the n smallest values in their order, of equal ones the first."""
-    known = np.flatnonzero(np.isfinite(values))
-    if known.size > n:  # sorting all pixels takes ten times as long
-        known = known[values[known] <= np.partition(values[known], n - 1)[n - 1]]
+    some = some_of(values)
+    some = some[np.isfinite(some)]
+    # of all pixels there are as many below the n-th of some, and few more: sorting all takes long
+    limit = np.partition(some, n - 1)[n - 1] if some.size > n else np.inf
+    known = np.flatnonzero(np.isfinite(values) & (values <= limit))
     order = np.argsort(values[known], kind="stable")[:n]
     return np.asarray(known[order], dtype=np.int64)
 

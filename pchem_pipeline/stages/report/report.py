@@ -150,7 +150,8 @@ def gather(
     full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
     index = np.concatenate([pixel_index(shown, shape), full.index])
     histograms = read_histograms(store, index, shape, run.model)
-    maps, exact = read_maps(store, shape, full.index)
+    loaded = {f"maps/{name}": values for name, values in run.maps.items()}
+    maps, exact = read_maps(store, shape, full.index, loaded)
     sums = read_sums(store)
     # from here on little is read
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
