@@ -121,8 +121,9 @@ def _block_maps(
 def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
     """Return the series behind the statistics, each about N(0, 1) where nothing is wrong, (n,).
 
-    ``frame.charge`` and ``frame.readout`` (means of the frames), ``row.readout`` and so on: how much the
-    means of the rows (columns) of a frame scatter.
+    ``frame.charge`` and ``frame.readout`` (means of the frames), ``scatter.charge`` and ``scatter.readout``
+    (how far each mean is off, to either side), ``row.readout`` and so on: how much the means of the rows
+    (columns) of a frame scatter.
     """
     time, usable = evidence.time, evidence.maps.usable
     if time is None:
@@ -133,6 +134,8 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
         "frame.charge": time.frame_charge * exposure / np.sqrt(charge.sum()),
         "frame.readout": time.frame_readout * usable.sum() / np.sqrt(readout.sum()),
     }
+    for channel in ("charge", "readout"):
+        found[f"scatter.{channel}"] = chi_square(found[f"frame.{channel}"] ** 2, 1.0)
     for line, axis, channel, values, variance in (
         ("row", 1, "charge", time.row_charge, charge),
         ("row", 1, "readout", time.row_readout, readout),
@@ -175,6 +178,9 @@ _MAP_OF = {
 _SERIES_OF = {
     "frame.charge": "frame.charge",
     "frame.readout": "frame.readout",
+    "frame.charge.variance": "scatter.charge",
+    "frame.readout.variance": "scatter.readout",
+    "frame.covariance": "scatter.charge",
     "space.row.charge": "row.charge",
     "space.row.readout": "row.readout",
     "space.x.rr": "row.readout",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition
+from pchem_pipeline.discrepancy.by_simulation.suspects import with_ends
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.splits import Splits, split_frames
@@ -75,6 +76,30 @@ class FrameStack:
         if window is not None:
             parts = tuple(Part(window.on_sensor(part.region), part.when) for part in parts)
         return replace(self, parts=parts, splits=splits)
+
+    def with_ends(self, maps: PixelMaps) -> FrameStack:
+        """Return it with its ranges of frames as those frames tell them that are seen now.
+
+        Shorter blocks leave less between them that is not seen.
+        """
+        stack, numbers = self.stack[self.seen], self.numbers[self.seen]
+
+        def told(part: Part) -> Part:
+            if part.when is None:
+                return part
+            evidence = part_evidence(
+                stack,
+                numbers,
+                maps,
+                Part(part.region),
+                n_run=self.n_run,
+                block_frames=self.splits.block_frames,
+                window=self.window,
+                fitted=False,
+            )
+            return with_ends(part, evidence)
+
+        return replace(self, parts=tuple(told(part) for part in self.parts))
 
     def effects(self, model: Sequence[Effect]) -> tuple[Effect, ...]:
         """Return the effects of a model as they act on these pixels, row 0 being the first of these."""

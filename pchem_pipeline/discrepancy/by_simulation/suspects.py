@@ -18,7 +18,7 @@ from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.places import FEWEST_FRAMES, FEWEST_PIXELS, Part
-from pchem_pipeline.discrepancy.scan import scan_series
+from pchem_pipeline.discrepancy.scan import scan_series, sharpest_range
 from pchem_pipeline.discrepancy.scan_pairs import Limits, Shared, scan_pairs
 from pchem_pipeline.discrepancy.where import frame_series, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
@@ -62,11 +62,27 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
         *(_Found(each.place.z, Part(each.place.region)) for each in shared),
     ]
     places = _apart(regions, usable.shape)
-    ranges = _told_apart(_stretches(evidence, time), time.frames)
+    ranges = [with_ends(part, evidence) for part in _told_apart(_stretches(evidence, time), time.frames)]
     crossings = [*_frames_of_places(shared, samples, time), *_places_of_frames(ranges, samples, frames, time)]
     if places and ranges and not crossings:
         crossings = [_Found(0.0, Part(places[0].region, ranges[0].when))]
     return (*places, *ranges, *(each.part for each in crossings[:1]))
+
+
+def with_ends(part: Part, evidence: Evidence) -> Part:
+    """Return a part with the ends of its range of frames as all series of the frames tell them."""
+    time = evidence.time
+    if time is None or part.when is None or len(part.when.range) != 1:
+        return part
+    at = np.flatnonzero(part.frames(time.frames))
+    # how far the means are off says nothing beside the means
+    known = frame_series(evidence).items()
+    series = np.array([values for name, values in known if not name.startswith("scatter.")])
+    if at.size < FEWEST_FRAMES or not np.isfinite(series).all():
+        return part
+    first, last = sharpest_range(series, int(at[0]), int(at[-1]) + 1, FEWEST_FRAMES)
+    when = When(range=((int(time.frames[first]), int(time.frames[last - 1]) + 1),))
+    return Part(part.region, _with_unseen(when, time.frames))
 
 
 def _apart(found: list[_Found], shape: tuple[int, ...]) -> list[Part]:
@@ -143,9 +159,6 @@ def _stretches(evidence: Evidence, time: TimeSeries) -> list[_Found]:
     """Return the frames of series that stand out, but for what goes on rising from end to end of the run."""
     found = []
     series = frame_series(evidence)
-    for channel in ("charge", "readout"):
-        # noise of the frames in some of them only
-        series[f"scatter.{channel}"] = (series[f"frame.{channel}"] ** 2 - 1.0) / np.sqrt(2.0)
     for name, values in series.items():
         limit = _SIGNIFICANCE / len(series)
         for one in scan_series(values, time.frames, significance=limit, shortest=FEWEST_FRAMES):
@@ -155,7 +168,7 @@ def _stretches(evidence: Evidence, time: TimeSeries) -> list[_Found]:
             some = some and (one.inside > one.outside or name.startswith("frame."))
             # levels that alternate or beat are effects in all frames, which have names
             some = some and not (one.when.every and name.startswith("frame."))
-            if some and abs(one.z) > _slope(values) / _TREND:
+            if some and _follows(values, one.when.frames(time.frames)) * _TREND > _slope(values):
                 found.append(_Found(abs(one.z), Part(None, _with_unseen(one.when, time.frames))))
     return found
 
@@ -171,6 +184,11 @@ def _with_unseen(when: When, seen: NDArray[np.int64]) -> When:
     return when.model_copy(update={"range": ((first, last),)})
 
 
+def _follows(values: FloatArray, form: NDArray[Any]) -> float:
+    """Return by how many standard deviations a series goes with another one."""
+    return float(abs(np.corrcoef(form, values)[0, 1]) * np.sqrt(values.size))
+
+
 def _slope(values: FloatArray) -> float:
     """Return by how many standard deviations a series rises or falls along the run."""
-    return float(abs(np.corrcoef(np.arange(values.size), values)[0, 1]) * np.sqrt(values.size))
+    return _follows(values, np.arange(values.size))

@@ -59,6 +59,7 @@ def observe(
     fit: FitSettings | None = None,
     exclude: NDArray[np.bool_] | None = None,
     start: PixelMaps | None = None,
+    fitted: bool = True,
 ) -> Evidence:
     """Return the evidence of a split of the frames.
 
@@ -70,6 +71,8 @@ def observe(
         fit: settings of the fit; the defaults if None.
         exclude: pixels not to look at, (y, x).
         start: parameters near those of these frames, where they are known: saves time.
+        fitted: take the parameters from a fit of these frames; False: take ``start`` as it is, for frames too
+            few to be fitted.
 
     Raises:
         InputError: the frames are fewer than four blocks, or not as described.
@@ -82,10 +85,14 @@ def observe(
     outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
     wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
     origin = histograms.origin.ravel().astype(np.int64)
-    result, parameters, usable = _fitted(counts, origin, outside, wanted.ravel(), fit, start)
     seen = _Seen(counts, origin, outside, histograms.minimum.ravel(), histograms.maximum.ravel())
+    if fitted or start is None:
+        result, parameters, usable = _fitted(counts, origin, outside, wanted.ravel(), fit, start)
+    else:
+        result, parameters = None, start.columns
+        usable = (wanted & start.usable).ravel() & _inside(counts, outside)
     evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]))
-    evidence = _with_fit(evidence, result)
+    evidence = evidence if result is None else _with_fit(evidence, result)
     edges = blocks_of(numbers, block_frames)
     maps = evidence.maps
     pixels = pixel_statistics(
@@ -243,8 +250,12 @@ def _fitted(
     result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
     parameters = result.columns
     usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
-    usable &= outside.sum(axis=1) <= _MOST_OUTSIDE * counts.sum(axis=1)
-    return result, parameters, usable
+    return result, parameters, usable & _inside(counts, outside)
+
+
+def _inside(counts: NDArray[Any], outside: FloatArray) -> NDArray[np.bool_]:
+    """Return which histograms hold nearly all samples of their pixel, (n,)."""
+    return np.asarray(outside.sum(axis=1) <= _MOST_OUTSIDE * counts.sum(axis=1))
 
 
 def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:

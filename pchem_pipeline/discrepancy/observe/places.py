@@ -1,8 +1,8 @@
 """The leading statistics in a part of the sensor or of the run, for data and replicates alike.
 
-A part is seen as a sensor of its own: its rows and columns moved together, its frames alone, refitted from
-the fit of the whole. An effect that acts there only moves these statistics as one that acts everywhere moves
-those of the whole, which tells the two apart.
+A part is seen as a sensor of its own: its rows and columns moved together, its frames alone, beside the fit
+of all frames, since those of a part may be too few for a fit of their own. An effect that acts there only
+moves these statistics as one that acts everywhere moves those of the whole, which tells the two apart.
 """
 
 from __future__ import annotations
@@ -124,6 +124,7 @@ def part_evidence(
     n_run: int,
     block_frames: int,
     window: SensorWindow | None = None,
+    fitted: bool = True,
 ) -> Evidence:
     """Return the evidence of a part alone, with the rows and columns of the whole.
 
@@ -135,6 +136,7 @@ def part_evidence(
         n_run: frames of the whole run.
         block_frames: frames of a block; shorter ones where the part has few.
         window: of the sensor that the frames are; None: all of it.
+        fitted: fit its pixels in its frames; False: take the maps as they are.
 
     Raises:
         PchEmError: it holds too few frames, or no usable pixel.
@@ -144,7 +146,15 @@ def part_evidence(
     stack = frames if chosen.all() else frames[chosen]
     window = window or SensorWindow.whole(frames.shape)
     exclude = ~(window.mask(part.region) & maps.usable)
-    return observe(stack, numbers[chosen], n_run=n_run, block_frames=length, exclude=exclude, start=maps)
+    return observe(
+        stack,
+        numbers[chosen],
+        n_run=n_run,
+        block_frames=length,
+        exclude=exclude,
+        start=maps,
+        fitted=fitted,
+    )
 
 
 def part_statistics(
@@ -172,7 +182,13 @@ def part_statistics(
         small = frames if mask.all() else frames[:, rows[:, None], columns]
         try:
             evidence = part_evidence(
-                small, numbers, own, Part(None, part.when), n_run=n_run, block_frames=block_frames
+                small,
+                numbers,
+                own,
+                Part(None, part.when),
+                n_run=n_run,
+                block_frames=block_frames,
+                fitted=False,
             )
         except (PchEmError, ConfigError):
             continue

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+from pchem_pipeline.discrepancy.by_simulation.candidates import serial
+from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, find_discrepancies
+from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
@@ -19,12 +22,12 @@ from pchem_pipeline.effects.framework.region import Region, When
 SHAPE, FRAMES = (32, 32), 1500
 
 
-def camera(seed, add, shape=SHAPE, n_frames=FRAMES):
+def camera(seed, add, shape=SHAPE, n_frames=FRAMES, noise=0.28):
     """Return frames of a sensor, Poisson electrons and Gaussian read noise, and ``add(rng, shape)`` DN."""
     rng = np.random.default_rng(seed)
     exposure = np.clip(1.5 * np.exp(0.4 * rng.standard_normal(shape)), 0.3, 5.0)
     step, bias = rng.normal(11.0, 0.8, shape), rng.normal(100.0, 4.0, shape)
-    noise = 0.28 * np.exp(0.12 * rng.standard_normal(shape))
+    noise = noise * np.exp(0.12 * rng.standard_normal(shape))
     charge = rng.poisson(exposure, (n_frames, *shape))
     x = bias + step * (charge + noise * rng.standard_normal(charge.shape))
     return np.rint(np.clip(x + add(rng, charge.shape), 0, 4095)).astype(np.uint16)
@@ -147,3 +150,44 @@ def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     assert told[0].region == {"columns": [[64, 69]]}
     assert told[0].shifted((512, 512), window.rows, window.columns) == told[0]
     assert step.place == "columns 64 to 68"
+
+
+def late_flicker(rng, shape):
+    offsets = np.zeros(shape)
+    offsets[1176:1336] = 4.0 * rng.standard_normal((160, 1, 1))
+    return offsets
+
+
+def split_of(frames):
+    explainer = FrameExplainer(stacked(frames), DiscrepancySettings(), (), serial)
+    explainer.split()
+    return explainer.frames
+
+
+def stacked(frames):
+    numbers = np.arange(len(frames))
+    splits = split_frames(numbers, block_length(len(frames)))
+    return FrameStack(frames, numbers, splits, len(frames), 12, 1.0)
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_the_ends_of_a_range_are_told_beyond_the_blocks_that_were_not_seen(seed):
+    frames = split_of(camera(seed, late_flicker, (16, 24), 1400))
+    [part] = frames.parts
+    assert part.region is None
+    assert part.when.overlap(When(range=((1176, 1336),)), 1400) >= 0.9
+    # none of the frames of the last word is looked at
+    assert np.intersect1d(frames.splits.final, frames.seen).size == 0
+
+
+def test_a_range_of_few_frames_of_poor_pixels_has_statistics():
+    frames = camera(13, lambda rng, shape: 3.0 * rows_of_frames(rng, shape), (16, 24), noise=0.42)
+    numbers = np.arange(FRAMES)
+    maps = observe(frames, numbers, n_run=FRAMES, block_frames=50).maps
+    some = np.flatnonzero(numbers // 20 % 3 == 0)
+    part = Part(when=When(range=((600, 760),)))
+    found = part_statistics(frames[some], numbers[some], maps, [part], n_run=FRAMES, block_frames=20)
+    assert found["space.row.readout.variance@frames=600:760"] > 5.0
+    quiet = Part(when=When(range=((900, 1060),)))
+    found = part_statistics(frames[some], numbers[some], maps, [quiet], n_run=FRAMES, block_frames=20)
+    assert abs(found["space.row.readout.variance@frames=900:1060"]) < 4.0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.scan import affected_share, scan_map, scan_series
+from pchem_pipeline.discrepancy.scan import affected_share, scan_map, scan_series, sharpest_range
 from pchem_pipeline.effects.framework.region import Region
 
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
@@ -112,6 +112,23 @@ def test_frames_are_found(chosen: Any, family: str) -> None:
     seen, wanted = found.when.frames(np.arange(100, 1600)), np.zeros(1500, bool)
     wanted[chosen] = True
     assert (seen & wanted).sum() / (seen | wanted).sum() > 0.9
+
+
+@pytest.mark.parametrize(("moved", "factor"), [(0.0, 3.0), (1.5, 1.0)])
+def test_the_ends_of_a_range_are_those_of_its_scatter_or_mean(moved: float, factor: float) -> None:
+    rng = np.random.default_rng(9)
+    off = []
+    for _ in range(20):
+        series = rng.standard_normal((3, 1500))
+        series[:2, 400:560] = moved + factor * rng.standard_normal((2, 160))
+        series[:, 1000] += 50.0  # one frame decides nothing
+        ends = np.array(sharpest_range(series, 450, 700, 64))
+        off.append(np.abs(ends - (400, 560)))
+    # a frame tells 0.9 nats in two series; the end is off by a few
+    assert np.mean(off) < 4.0
+    assert np.max(off) < 25
+    first, last = sharpest_range(rng.standard_normal((3, 300)), 100, 180, 64)
+    assert last - first >= 64
 
 
 def test_a_series_too_short_for_two_stretches_is_looked_at_all_the_same() -> None:
