@@ -172,8 +172,8 @@ class FrameExplainer:
                 f"{int(usable.sum())} of {usable.size} pixels have a usable fit, "
                 f"fewer than {_FEWEST_PIXELS}: nothing can be compared; see fit_status, or take more frames"
             )
-        parts = suspected_parts(self.plain, self.frames.stack[self.frames.seen])
-        self.frames = self.frames.with_parts(parts).with_ends(self.plain.maps)
+        found = suspected_parts(self.plain, self.frames.stack[self.frames.seen])
+        self.frames = self.frames.with_parts(found).with_ends(self.plain.maps)
         splits = self.frames.splits
         parts = splits.train, splits.test, splits.final
         self.evidence = tuple(self.frames.observe(part, self.plain.maps) for part in parts)
