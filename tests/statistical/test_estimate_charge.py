@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.charge_material import a_sensor, evidence_of
 
+from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
 from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
 from pchem_pipeline.effects.charge.charge_lag import ChargeLag
@@ -216,6 +217,42 @@ def test_tracks():
     assert abs(found.tracks_per_frame / 0.05 - 1) < 5 / np.sqrt(n)
     assert abs(found.length_um / 15.0 - 1) < 5 * 1.5 / np.sqrt(n) + 0.2
     assert abs(found.electrons_per_um / 80.0 - 1) < 5 * 0.5 / np.sqrt(n) + 0.2
+
+
+def frames_with(events, n_frames, shape=(24, 24), seed=3):
+    """Return frames in which tracks, and clouds of 12,000 e- and 0.9 pixels, were drawn by numpy alone."""
+    rng = np.random.default_rng(seed)
+    k = rng.poisson(2.0, (n_frames, *shape)).astype(float)
+    y, x = np.indices(shape) + 0.5
+    for is_cloud in events:
+        cy, cx, t = *rng.uniform(0, shape), rng.integers(n_frames)
+        if is_cloud:
+            mean = 12e3 / (2 * np.pi * 0.9**2) * np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / (2 * 0.9**2))
+        else:
+            along, angle = np.arange(0, rng.exponential(5.0), 0.05), rng.uniform(0, 2 * np.pi)
+            place = np.floor([cy + along * np.sin(angle), cx + along * np.cos(angle)]).astype(int)
+            inside = ((place >= 0) & (place < np.array(shape)[:, None])).all(axis=0)
+            mean = np.zeros(shape)
+            np.add.at(mean, tuple(place[:, inside]), 0.05 * 240)
+        k[t] += rng.poisson(mean)
+    return np.rint(100 + 10 * (k + 0.25 * rng.standard_normal(k.shape))).clip(0, 65535).astype(np.uint16)
+
+
+def test_round_clouds_among_tracks_have_their_own_share_and_size():
+    clouds, lines = 40, 80
+    frames = frames_with([True] * clouds + [False] * lines, n_frames=1500)
+    (found,) = CosmicRays.estimate(observe(frames, np.arange(1500), n_run=1500, block_frames=50))
+    share = clouds / (clouds + lines)
+    # at the edge some of either are cut, few merge
+    assert abs(found.cloud_share - share) < 0.05
+    assert abs(found.cloud_electrons / 12e3 - 1) < 0.15
+    assert abs(found.cloud_um / found.pixel_pitch_um / 0.9 - 1) < 0.15
+    # the clouds have forty times the charge of a track: left among the tracks they would be all of it
+    assert abs(found.electrons_per_um * found.pixel_pitch_um / 240 - 1) < 0.35
+    (alone,) = CosmicRays.estimate(
+        observe(frames_with([False] * lines, 1500), np.arange(1500), n_run=1500, block_frames=50)
+    )
+    assert alone.cloud_share < 0.02
 
 
 @pytest.mark.parametrize("shape", [(1, 30), (30, 1), (2, 5)])

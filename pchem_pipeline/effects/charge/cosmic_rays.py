@@ -1,18 +1,22 @@
-"""Cosmic rays and radioactivity: straight tracks of many electrons.
+"""Cosmic rays and radioactivity: straight tracks and round clouds of many electrons.
 
 A relativistic particle frees about 80 electrons per micrometre of silicon (Groom 2002, "Cosmic rays and
 other nonsense in astronomical CCD imagers"); muons at sea level come at one to two per square centimetre and
-minute. The tracks are independent, Poisson many per frame; what a track leaves in a pixel is Poisson about
-its share.
+minute. An alpha particle from the materials of the sensor stops in a few micrometres, and its charge
+spreads from there into a round cloud ("spots" among Groom's kinds). All are independent, Poisson many per
+frame; what one leaves in a pixel is Poisson about its share.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
+from scipy import special
+from scipy.sparse import coo_array, csgraph
+from scipy.spatial import KDTree
 
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
@@ -29,11 +33,33 @@ _POINTS = 8
 _MOST_HITS = 20_000
 # of a pixel's samples: enough for the fit to disregard those far off, too little to matter for the others
 _SHARE_OF_SAMPLES = 1e-6
+# standard deviations of a cloud out to which it is drawn: of some ten thousand electrons none is farther
+_REACH = 5.0
+# pixels beyond those that a straight line of the same height and width can cross, of a cloud
+_BEYOND_A_LINE = 2
+# variance of a place within its pixel, pixels^2
+_OF_A_PIXEL = 1.0 / 12.0
+
+
+class _Event(NamedTuple):
+    """Hits of a frame that touch each other.
+
+    Attributes:
+        pixels: number of them.
+        charge: sum, e-.
+        spread: standard deviation of the charge along an axis, pixels.
+        is_cloud: whether they are more than a straight line crosses.
+    """
+
+    pixels: int
+    charge: float
+    spread: float
+    is_cloud: bool
 
 
 @register_effect
 class CosmicRays(Effect):
-    """Straight tracks at random places and angles, of exponentially distributed length.
+    """Tracks at random places and angles, straight and of exponentially distributed length, or round clouds.
 
     Signature: few samples far above all that a pixel's law allows, next to each other in the same frame; the
     rest of the histogram as before.
@@ -51,7 +77,7 @@ class CosmicRays(Effect):
         "branching_counts": "the excess grows with the exposure: tracks do not",
     }
     tracks_per_frame: float = Field(
-        ge=0, le=100, description="mean number of tracks on the sensor in a frame"
+        ge=0, le=100, description="mean number of tracks and clouds on the sensor in a frame"
     )
     length_um: float = Field(
         default=15.0, gt=0, description="mean length of a track projected on the sensor, um"
@@ -60,6 +86,16 @@ class CosmicRays(Effect):
         default=80.0, gt=0, description="electrons freed per length of the projected track, e-/um"
     )
     pixel_pitch_um: float = Field(default=3.0, gt=0, description="distance between pixels, um")
+    cloud_share: float = Field(
+        default=0.0, ge=0, le=1, description="share of them that are round clouds, as alpha particles leave"
+    )
+    cloud_electrons: float = Field(default=2e4, gt=0, description="median of the electrons of a cloud, e-")
+    cloud_range: float = Field(
+        default=0.0, ge=0, le=3, description="standard deviation of the logarithm of its electrons, no unit"
+    )
+    cloud_um: float = Field(
+        default=3.0, gt=0, description="standard deviation of such a cloud along an axis, um"
+    )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return electron numbers (frame, y, x), e-, with those of the tracks; touches frames with tracks."""
@@ -70,7 +106,8 @@ class CosmicRays(Effect):
         for i in hit:
             random = context.random.generator(frame=int(context.frames[i]))
             for _ in range(_poisson_upper(float(u[i]), self.tracks_per_frame)):
-                y, x, electrons = self._track(context.shape, random)
+                is_cloud = self.cloud_share > 0 and random.random() < self.cloud_share
+                y, x, electrons = (self._cloud if is_cloud else self._track)(context.shape, random)
                 row = y - context.rows[0]
                 inside = (row >= 0) & (row < values.shape[1])
                 np.add.at(result[i], (row[inside], x[inside]), electrons[inside])
@@ -91,6 +128,26 @@ class CosmicRays(Effect):
         share = length / n * self.pixel_pitch_um * self.electrons_per_um
         return pixels[:, 0], pixels[:, 1], random.poisson(count * share)
 
+    def _cloud(
+        self, shape: tuple[int, int], random: np.random.Generator
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Return the same of a cloud; of more electrons it is wider, its density at the middle the same."""
+        middle = random.random(2) * shape
+        more = float(np.exp(self.cloud_range * random.standard_normal()))
+        width = self.cloud_um / self.pixel_pitch_um * np.sqrt(more)
+        ends = [
+            np.clip([c - _REACH * width, c + _REACH * width], 0, n)
+            for c, n in zip(middle, shape, strict=True)
+        ]
+        rows, columns = (np.arange(int(low), int(np.ceil(high))) for low, high in ends)
+        along_y, along_x = (
+            np.diff(special.ndtr((np.append(each, each[-1] + 1) - c) / width))
+            for each, c in zip((rows, columns), middle, strict=True)
+        )
+        electrons = random.poisson(self.cloud_electrons * more * np.outer(along_y, along_x))
+        i, j = np.nonzero(electrons)
+        return rows[i], columns[j], electrons[i, j]
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return it at one track in 80 frames."""
@@ -101,7 +158,8 @@ class CosmicRays(Effect):
         """Return rate, length and electrons from the samples far above their pixels' support.
 
         A frame with such samples counts as one with tracks (their number is Poisson); a track that covers
-        m pixels in the mean is about (m - 1) pi / 4 pixels long.
+        m pixels in the mean is about (m - 1) pi / 4 pixels long. Hits that touch each other are one event,
+        and a cloud where they are more than a straight line crosses.
         """
         time, maps = evidence.time, evidence.maps
         if time is None or time.hits.shape[0] < 3:
@@ -117,16 +175,27 @@ class CosmicRays(Effect):
             return ()
         n_hit = np.unique(time.hits[far, 0]).size
         tracks = -n_seen * np.log1p(-min(n_hit / n_seen, 1.0 - 0.5 / n_seen))
-        pixels = float(far.sum()) / tracks
         # tracks are longer than a pixel; hits that stay alone are something else
-        if pixels < 1.2:
+        if far.sum() / tracks < 1.2:
             return ()
-        pitch = float(cls.model_fields["pixel_pitch_um"].default)
-        length = (pixels - 1.0) * np.pi / 4.0 * pitch
-        per_um = float(charge[far].sum()) / tracks / length
-        if not per_um > 0:
-            return ()
-        return (cls(tracks_per_frame=float(tracks / n_seen), length_um=length, electrons_per_um=per_um),)
+        events = _events(time.hits[far, :3], charge[far])
+        found = cls(tracks_per_frame=float(tracks / n_seen))
+        lines = [event for event in events if not event.is_cloud]
+        clouds = [event for event in events if event.is_cloud]
+        update: dict[str, float] = {"cloud_share": len(clouds) / len(events)}
+        # few events merge: those that a frame has in all are as many as its tracks
+        pixels = sum(event.pixels for event in lines) / max(tracks * (1.0 - update["cloud_share"]), 1e-12)
+        if lines and pixels > 1.0:
+            update["length_um"] = (pixels - 1.0) * np.pi / 4.0 * found.pixel_pitch_um
+            update["electrons_per_um"] = (
+                sum(event.charge for event in lines) / len(lines) / update["length_um"]
+            )
+        if clouds:
+            sizes = np.log([event.charge for event in clouds])
+            update["cloud_electrons"] = float(np.exp(sizes.mean()))
+            update["cloud_range"] = min(float(sizes.std()), 3.0)
+            update["cloud_um"] = found.pixel_pitch_um * float(np.median([event.spread for event in clouds]))
+        return (found.model_copy(update=update),)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law in which a sample may, very rarely, be anything: how rarely does not matter."""
@@ -141,3 +210,27 @@ def _poisson_upper(u: float, mean: float) -> int:
         mass *= mean / n
         above -= mass
     return n
+
+
+def _events(hits: NDArray[np.int64], charge: NDArray[np.float64]) -> list[_Event]:
+    """Return the events of hits (frame, y, x), shape (n, 3), whose charges are of shape (n,), e-."""
+    # frames are two apart, so that only pixels of one frame touch each other
+    pairs = KDTree(hits * (2, 1, 1)).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    n = len(hits)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, label = csgraph.connected_components(graph, directed=False)
+    found = []
+    for members in np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1]):
+        place, weight = hits[members, 1:], charge[members]
+        off = place - np.average(place, axis=0, weights=weight)
+        variance = float(np.average((off**2).mean(axis=1), weights=weight))
+        line = int(np.ptp(place, axis=0).sum()) + 1
+        found.append(
+            _Event(
+                pixels=len(members),
+                charge=float(weight.sum()),
+                spread=float(np.sqrt(max(variance - _OF_A_PIXEL, _OF_A_PIXEL))),
+                is_cloud=len(members) > line + _BEYOND_A_LINE,
+            )
+        )
+    return found

@@ -47,6 +47,7 @@ KINDS = [
     Persistence(peak_e=1.0, decay_frames=9.0, slow_decay_frames=50.0, image=((1.0, 0.0), (0.5, 0.2))),
     DarkCurrentRts(fraction=0.4, steps="exponential", dwell_low_frames=3.0, dwell_high_frames=2.0),
     CosmicRays(tracks_per_frame=0.7),
+    CosmicRays(tracks_per_frame=0.7, cloud_share=0.5, cloud_range=0.4),
     OverdispersedCounts(relative_variance=0.3),
     BranchingCounts(branching=0.3),
 ]
@@ -250,6 +251,23 @@ def test_tracks_come_at_their_rate_and_leave_their_electrons():
     assert y.size > 3
     steps = abs(y[:, None] - y) + abs(x[:, None] - x) + 99 * np.eye(y.size)
     assert steps.min(axis=1).max() <= 2
+
+
+def test_clouds_of_particles_have_their_electrons_and_width():
+    effect = CosmicRays(tracks_per_frame=1e-2, cloud_share=1.0, cloud_electrons=9000.0, cloud_um=2.4)
+    frames = _electrons(effect, (60, 60), 0, 4000)
+    y, x = np.indices((60, 60))
+    inside, totals, variances = 0, [], []
+    for k in frames[frames.sum(axis=(1, 2)) > 0]:
+        cy, cx = (float((k * axis).sum() / k.sum()) for axis in (y, x))
+        if min(cy, cx) > 5 and max(cy, cx) < 54 and k[round(cy), round(cx)] > 500:
+            inside += 1
+            totals.append(k.sum())
+            variances.append((k * (x - cx) ** 2).sum() / k.sum())
+    assert inside > 10
+    assert abs(np.mean(totals) / 9000 - 1) < 5 / np.sqrt(9000 * inside) + 1e-3
+    # 0.8 pixels, and where in its pixel an electron is
+    assert abs(np.mean(variances) - 0.64 - 1 / 12) < 0.03
 
 
 def _electrons(effect, shape, first, last):
