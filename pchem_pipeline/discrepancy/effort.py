@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 # and of the mass of a code under one component
 _SAMPLE, _FIT, _REFIT, _LEARN, _MASS = 5.0e-8, 4.0e-5, 4.0e-5, 3.0e-4, 1.0e-7
 _MOST_LEARNT_FROM = 1000  # pixels
+_USUAL_EVALUATIONS = 15.0  # of the likelihood, in that fit with effects; more of them count for more
 #: By how many times as long the fit of a pixel takes more where its bias may be off by an electron: more
 #: starts, flat maxima and more electron numbers.
 _AMBIGUOUS = 4.0
@@ -75,9 +76,17 @@ class Effort:
         """Count a simulated stack, whose pixels are fitted so many times."""
         self.spent += _SAMPLE * samples + _FIT * self._hard * pixels * fits
 
-    def refit(self, pixels: int, components: int, tags: Iterable[str]) -> None:
-        """Count a fit of all pixels with effects, whose law has so many components, and what it teaches."""
-        self.spent += _REFIT * self._hard * pixels * components + _LEARN * min(pixels, _MOST_LEARNT_FROM)
+    def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
+        """Count a fit of all pixels with effects, and what it teaches.
+
+        Args:
+            pixels: that were fitted.
+            components: of their law.
+            evaluations: of the likelihood of a pixel, on average.
+            tags: of the effects.
+        """
+        work = _REFIT * self._hard * pixels * components * max(1.0, evaluations / _USUAL_EVALUATIONS)
+        self.spent += work + _LEARN * min(pixels, _MOST_LEARNT_FROM)
         self.tried |= set(tags)
 
     def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:

@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
     share_place,
 )
+from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere
@@ -112,6 +113,8 @@ def compare(
             tried.append(refitter.refined((*held, *members), best))
         except EffortSpentError:
             raise
+        except NotFittedError:
+            return
         # whatever a stranger's effect raises must not stop the others
         except Exception as error:
             failed[members[-1].tag] = error_words(error)

@@ -412,7 +412,8 @@ class FrameExplainer:
             return Refit(plain.maps, {}, plain.covariance)
         frames, numbers = self.frames.stack[self.frames.seen], self.frames.numbers[self.frames.seen]
         fit = refit_maps(frames, plain.maps, self.frames.effects(model), plain.covariance, numbers=numbers)
-        self.effort.refit(plain.maps.usable.size, fit.components, (effect.tag for effect in model))
+        tags = (effect.tag for effect in model)
+        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
         return fit
 
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:

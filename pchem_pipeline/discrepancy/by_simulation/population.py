@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
+from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -36,7 +36,6 @@ _EM_STEPS = 60
 _NEWTON_STEPS = 3  # of each pixel between two rounds of EM, and in the end
 _LAST_STEPS = 8
 _SETTLED = 0.02  # nats: a smaller rise of the marginal likelihood per pixel ends the rounds
-_LEAST_MASS = 1e-60
 _LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN per electron
 # scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
 _LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
@@ -44,7 +43,6 @@ _LOWEST_LOG_EXPOSURE, _LOWEST_LOG_VARIANCE = float(np.log(1e-5)), float(np.log(1
 # share of mistaken pixels up to which the fits are nearly the truth, and beyond which they are no start
 _HARDLY_ANY, _MANY = 0.003, 0.3
 _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
-_BATCH = 1 << 19  # masses at once
 _MAD = 1.4826
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
@@ -240,22 +238,13 @@ class _Pixels:
 
     def parabolas(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return log-likelihood (n,), score (n, 4) and Fisher's information (n, 4, 4) at theta (n, 4)."""
-        n, width = self.counts.shape
-        value, score, information = np.empty(n), np.empty((n, 4)), np.empty((n, 4, 4))
-        step = max(1, _BATCH // (5 * width))
-        for first in range(0, n, step):
-            part = slice(first, first + step)
-            own = to_parameters(theta[part])
-            columns = [np.ascontiguousarray(column) for column in own.T]
-            mass, slopes = sample_slopes(self.law.of(part), columns, self.origin[part], width)
-            # the kernel's second slope is in 1/g
-            slopes[:, 1] /= own[:, 1, None]
-            safe = np.maximum(mass, _LEAST_MASS)
-            relative = slopes / safe[:, None, :]
-            seen = self.counts[part].astype(np.float64)
-            value[part] = (seen * np.log(safe)).sum(axis=1)
-            score[part] = np.einsum("nab,nb->na", relative, seen)
-            information[part] = (slopes @ relative.transpose(0, 2, 1)) * seen.sum(axis=1)[:, None, None]
+        own = to_parameters(theta)
+        columns = [np.ascontiguousarray(column) for column in own.T]
+        value, score, information = sample_parabolas(self.law, columns, self.counts, self.origin)
+        # the second slope is in 1/g
+        score[:, 1] /= own[:, 1]
+        information[:, 1] /= own[:, 1, None]
+        information[:, :, 1] /= own[:, 1, None]
         return value, score, information
 
 

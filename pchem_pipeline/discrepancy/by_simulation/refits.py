@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, correction, log_density
-from pchem_pipeline.discrepancy.by_simulation.maps import Refit
+from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError, Refit
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 
@@ -123,6 +123,9 @@ class Refitter:
             hypotheses: effects with guessed strengths and what they do there.
             rival: score of another set: where there is no hope to come near it, this one is given up.
             replicates: at each strength.
+
+        Raises:
+            NotFittedError: hardly a pixel can be fitted with the set at its guessed strengths.
         """
         words = " + ".join(h.tag for h in hypotheses)
         self.allow(words)
@@ -139,7 +142,10 @@ class Refitter:
             if moved is None:
                 break
             self.allow(words)
-            now = self._simulated(moved, best, replicates)
+            try:
+                now = self._simulated(moved, best, replicates)
+            except NotFittedError:
+                now = best  # a step too far
             if now.score > best.score:
                 gained, best, shortened = now.score - best.score, now, 0
             elif shortened < 2:

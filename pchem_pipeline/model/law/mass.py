@@ -107,3 +107,26 @@ def sample_slopes(
     law = pack([model], n)
     mass_numba.mass_tile(start, columns, satellites_of(maps, None, n), law, NEAR, mass, slopes)
     return mass, slopes
+
+
+def sample_parabolas(
+    model: SampleLaw, maps: Parameters, counts: NDArray[np.integer], origin: NDArray[np.integer]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return log-likelihood, its slopes and Fisher's information of every pixel, NaN without parameters.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels.
+        counts: histograms, shape (n, B), any unsigned type.
+        origin: DN of bin 0, shape (n,).
+
+    Returns:
+        Nats, shape (n,), samples of less than 1e-50 as of that; slopes in log H, 1/g, mu and log sigma_R^2,
+        (n, 4); information in the same, (n, 4, 4).
+    """
+    columns, counts = columns_of(maps), kernel_counts(counts)
+    n = counts.shape[0]
+    value, score, information = np.full(n, np.nan), np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
+    first = np.ascontiguousarray(origin, np.int64)
+    mass_numba.parabola_tile(counts, first, columns, pack([model], n), value, score, information)
+    return value, score, information

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.cells_numba import (
+    CORE,
     LEAST_MASS,
+    NEAR,
     Law,
     cells_of,
     fill_far_enough,
@@ -36,6 +38,8 @@ FloatArray = NDArray[np.float64]
 
 
 _LEAST_VARIANCE = 1e-6  # DN^2
+_FAR = 1e-9  # mass of an occupied code below which the tails are looked at
+_LEAST_SEEN = 1e-60  # mass of an occupied code, at least
 
 
 @kernel
@@ -140,3 +144,62 @@ def mass_tile(
         for j in range(N_BLOCK - 1 if slopes.shape[0] > 0 else 0):
             for i in range(n_codes):
                 slopes[index, j, i] = scratch.cells[0, SLOPES + j, i]
+
+
+@kernel
+def parabola_tile(
+    counts: NDArray[np.generic],
+    first: NDArray[np.int64],
+    parameters: FloatArray,
+    law: Law,
+    value: FloatArray,
+    score: FloatArray,
+    information: FloatArray,
+) -> None:
+    """Fill the parabola about the parameters of every row of ``counts``, if they are finite.
+
+    Args:
+        counts: shape (n, B).
+        first: DN of bin 0, shape (n,).
+        parameters: (H, g, mu, sigma), shape (n, 4).
+        law: of the samples.
+        value: out, log-likelihood down to masses of 1e-50, nats, shape (n,); comes as NaN.
+        score: out, its slopes in log H, 1/g, mu and log sigma_R^2, shape (n, 4); comes as NaN.
+        information: out, Fisher's, of as many samples, in the same, shape (n, 4, 4); comes as NaN.
+    """
+    n_bins, size = counts.shape[1], N_BLOCK - 1
+    room, scratch = pixel_scratch(n_bins, law)
+    theta, weights, cell = scratch.small[OWN], room.bins[0, WEIGHT], scratch.cells[0]
+    room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_bins), 0.0
+    for index in range(parameters.shape[0]):
+        if not known_theta(parameters[index], first[index], 0.0, theta):
+            continue
+        total = 0.0
+        for i in range(n_bins):
+            weights[i] = float(counts[index, i])
+            total += weights[i]
+        pixel = _at(room, first[index])
+        resolve(law, index, 0.0, pixel)
+        cells = cells_of(pixel, np.int64(0))
+        fill_masses(theta, cells, CORE, scratch.numbers, scratch.edges, cell)
+        lowest = 1.0
+        for i in range(n_bins):
+            if weights[i] > 0.0:
+                lowest = min(lowest, cell[MASS, i])
+        if lowest < _FAR:
+            fill_masses(theta, cells, NEAR, scratch.numbers, scratch.edges, cell)
+        value[index] = 0.0
+        score[index] = 0.0
+        information[index] = 0.0
+        for i in range(n_bins):
+            mass = max(cell[MASS, i], _LEAST_SEEN)
+            if weights[i] > 0.0:
+                value[index] += weights[i] * math.log(mass)
+            for a in range(size):
+                relative = cell[SLOPES + a, i] / mass
+                score[index, a] += weights[i] * relative
+                for b in range(a + 1):
+                    information[index, a, b] += total * relative * cell[SLOPES + b, i]
+        for a in range(size):
+            for b in range(a):
+                information[index, b, a] = information[index, a, b]

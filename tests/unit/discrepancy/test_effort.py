@@ -7,8 +7,11 @@ import pytest
 from helpers.plain_camera import PlainCamera
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError, refit_maps
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.region import Region
@@ -26,7 +29,7 @@ def test_work_is_counted_and_refused_once_the_limit_is_reached():
     effort.begin()
     null = effort.spent
     effort.check("a")
-    effort.refit(10**9, 1, ["row_noise"])
+    effort.refit(10**9, 1, 8.0, ["row_noise"])
     with pytest.raises(EffortSpentError, match="b"):
         effort.check("b")
     assert effort.tried == {"row_noise"}
@@ -53,9 +56,16 @@ def test_a_fit_with_a_law_of_many_components_costs_more():
     spent = []
     for law in (plain, mixed):
         effort = Effort(1.0)
-        effort.refit(10**6, law.components, [])
+        effort.refit(10**6, law.components, 8.0, [])
         spent.append(effort.spent)
     assert spent[1] > 2.9 * spent[0]
+
+
+def test_a_fit_that_hardly_arrives_costs_more():
+    usual, lost = Effort(1.0), Effort(1.0)
+    usual.refit(10**6, 1, 8.0, [])
+    lost.refit(10**6, 1, 1000.0, [])
+    assert lost.spent > 20.0 * usual.spent
 
 
 def test_fits_of_pixels_that_are_not_identified_cost_more():
@@ -99,3 +109,14 @@ def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tri
     assert "none that was tried explains it" in found.sentence
     assert "--effort" in verdict_text(found)
     assert find_discrepancies(noisy_rows, settings=short).verdict == found
+
+
+def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some():
+    """So much coupling between neighbours would widen the peaks more than they are."""
+    frames = PlainCamera(0.3, 4.0, 12.0, (16, 16), 600).frames(1)
+    seen = observe(frames, np.arange(600), n_run=600, block_frames=50)
+    little = refit_maps(frames, seen.maps, [InterpixelCapacitance(coupling=0.01)], seen.covariance)
+    assert little.maps.usable.all()
+    assert 1.0 < little.evaluations < 15.0
+    with pytest.raises(NotFittedError):
+        refit_maps(frames, seen.maps, [InterpixelCapacitance(coupling=0.1)], seen.covariance)

@@ -13,7 +13,7 @@ from pchem_pipeline.model.law import cells_numba, pixel_numba
 from pchem_pipeline.model.law.electron_laws_numba import _one_law, electron_number
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
-from pchem_pipeline.model.law.mass import log_likelihood, sample_mass
+from pchem_pipeline.model.law.mass import log_likelihood, sample_mass, sample_parabolas, sample_slopes
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -193,3 +193,19 @@ def test_edges_of_several_effects_add_up() -> None:
     model = SampleLaw().with_edges(10, [0.1, 0.2]).with_edges(8, [0.3, 0.3, 0.3])
     assert model.edge_first == 8
     np.testing.assert_allclose(model.edge_shift, [0.3, 0.3, 0.4, 0.2])
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_parabola_is_made_of_masses_and_slopes(name: str) -> None:
+    """With a sample so far out that the first look at the masses does not reach it."""
+    model, maps = LAWS[name], list(np.transpose(PIXELS))
+    origin, n_codes = np.full(3, CODES[0]), len(CODES)
+    mass, slopes = sample_slopes(model, maps, origin, n_codes)
+    counts = np.random.default_rng(1).poisson(500.0 * mass).astype(np.uint16)
+    counts[0, -1] = 1
+    value, score, information = sample_parabolas(model, maps, counts, origin)
+    relative = slopes / np.maximum(mass, 1e-60)[:, None]
+    np.testing.assert_allclose(value, (counts * np.log(np.maximum(mass, 1e-60))).sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(score, np.einsum("nab,nb->na", relative, counts), rtol=1e-6, atol=1e-6)
+    expected = counts.sum(axis=1)[:, None, None] * (slopes @ relative.transpose(0, 2, 1))
+    np.testing.assert_allclose(information, expected, rtol=1e-6, atol=1e-6)
