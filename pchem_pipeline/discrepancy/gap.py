@@ -65,7 +65,8 @@ class Gap:
         total = distance - expected + carried
         value = total / n_samples
         ends = (total - _INTERVAL * spread) / n_samples, (total + _INTERVAL * spread) / n_samples
-        floor = float(np.quantile(chance, _FLOOR_QUANTILE) - expected) / n_samples
+        # of few replicates the quantile that one more exceeds in as many cases as it says
+        floor = float(np.quantile(chance, _FLOOR_QUANTILE, method="weibull") - expected) / n_samples
         return cls(value, floor, ends, {"shape": value} if families is None else families)
 
     @property
@@ -90,20 +91,28 @@ class StatisticsGap:
 
     null: NullModel
     n_samples: int
-    _known: dict[int, tuple[FloatArray, dict[str, FloatArray]]] = field(
+    _known: dict[tuple[int, int], tuple[FloatArray, FloatArray | None, dict[str, FloatArray]]] = field(
         default_factory=dict, repr=False, compare=False
     )
 
-    def gap(self, z: FloatArray, mean: FloatArray, replicates: FloatArray) -> Gap:
+    def gap(
+        self,
+        z: FloatArray,
+        mean: FloatArray,
+        replicates: FloatArray,
+        strengths: FloatArray | None = None,
+    ) -> Gap:
         """Return the gap of a model.
 
         Args:
             z: measured statistics, shape (m,).
             mean: what the model gives, shape (m,).
             replicates: vectors drawn from a model with that mean or another, for the floor, shape (b, m).
+            strengths: by how much a standard error of the strength of each effect moves the statistics, shape
+                (e, m); they were fitted to other samples, so that a right model, too, is off by that.
         """
         total, families = 0.0, {}
-        own = self._own_distances(replicates)
+        own = self._own_distances(replicates, strengths)
         for family, index in self._members().items():
             squared = _squared_distances((z - mean)[None, index], self.null.covariance[np.ix_(index, index)])
             distance = 0.5 * float(squared[0])
@@ -120,28 +129,32 @@ class StatisticsGap:
         found = {family: [i for i, f in enumerate(families) if f == family] for family in FAMILIES}
         return {family: index for family, index in found.items() if index}
 
-    def _own_distances(self, replicates: FloatArray) -> dict[str, FloatArray]:
-        """Return for each family half the squared distances that data of the model would have, (b,) each.
+    def _own_distances(self, replicates: FloatArray, strengths: FloatArray | None) -> dict[str, FloatArray]:
+        """Return for each family half the squared distances of data of the model, (b,) or (2 b,) each.
 
         Each replicate is measured against the others, as the data are against all: in the covariance too,
-        where that was estimated from it.
+        where that was estimated from it. Its strengths are off to one side and to the other.
         """
-        if id(replicates) in self._known:
-            return self._known[id(replicates)][1]
+        key = id(replicates), id(strengths)
+        if key in self._known:
+            return self._known[key][2]
         known = replicates is self.null.replicates
-        own: dict[str, list[float]] = {family: [] for family in self._members()}
+        own: dict[str, list[FloatArray]] = {family: [] for family in self._members()}
+        random, sides = np.random.default_rng(0), np.array([[1.0], [-1.0]])
         for i in range(replicates.shape[0]):
             others = np.delete(replicates, i, axis=0)
             mean, _, covariance = (
                 moments(others) if known else (others.mean(axis=0), None, self.null.covariance)
             )
+            apart = (replicates[i] - mean)[None]
+            if strengths is not None:
+                apart = apart + sides * (random.standard_normal(len(strengths)) @ strengths)
             for family, index in self._members().items():
-                apart = (replicates[i] - mean)[None, index]
-                squared = _squared_distances(apart, covariance[np.ix_(index, index)])
-                own[family].append(0.5 * float(squared[0]))
-        found = {family: np.array(values) for family, values in own.items()}
+                squared = _squared_distances(apart[:, index], covariance[np.ix_(index, index)])
+                own[family].append(0.5 * squared)
+        found = {family: np.concatenate(values) for family, values in own.items()}
         # the vectors are kept with it: an id is given again to what comes after them
-        self._known[id(replicates)] = replicates, found
+        self._known[key] = replicates, strengths, found
         return found
 
 

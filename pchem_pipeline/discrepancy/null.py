@@ -55,6 +55,7 @@ class NullModel:
         replicates: the vectors, shape (b, m).
         skewness: of the statistics of one split, shape (m,).
         effective_tests: number of independent statistics that the largest of them is worth.
+        strengths: by how much a standard error of the strength of each effect moves the statistics, (e, m).
     """
 
     names: tuple[str, ...]
@@ -64,6 +65,7 @@ class NullModel:
     replicates: FloatArray
     skewness: FloatArray
     effective_tests: float
+    strengths: FloatArray | None = None
 
     @classmethod
     def from_replicates(

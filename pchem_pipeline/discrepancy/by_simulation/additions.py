@@ -91,7 +91,7 @@ class AddedRounds:
             last: null of the final model.
             still: whether the data disagree with that.
         """
-        after = self.gaps.gap(self.z.final, last.mean, last.replicates)
+        after = self._gap(last)
         # what the final frames prove to be left: few of them tell the gap of a weak effect from none badly
         left = max(after.interval[0], 0.0)
         unfinished = not after.at_floor and (still or left > _REST_OF_NAMED * before.value)
@@ -106,7 +106,7 @@ class AddedRounds:
                 if place < len(order) - 1:
                     now = self.gaps.gap(self.z.final, mean, this.null.replicates)
                 elif index < len(self.rounds) - 1:
-                    now = self.gaps.gap(self.z.final, this.extended.mean, this.extended.replicates)
+                    now = self._gap(this.extended)
                 else:
                     now = after
                 effect = this.added.hypotheses[member].effect
@@ -120,6 +120,9 @@ class AddedRounds:
                 additions.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
         return Added(tuple(additions), after, unfinished)
+
+    def _gap(self, null: NullModel) -> Gap:
+        return self.gaps.gap(self.z.final, null.mean, null.replicates, null.strengths)
 
     def _against(self, this: Round, member: int, still: bool) -> str:
         """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.

@@ -215,7 +215,7 @@ class FrameExplainer:
 
     def gap(self, null: NullModel, z: Measured) -> Gap:
         """Measure the gap in the statistics of the final frames."""
-        return self.gaps.gap(z.final, null.mean, null.replicates)
+        return self.gaps.gap(z.final, null.mean, null.replicates, null.strengths)
 
     def suspects(self, null: NullModel, z: Measured) -> bool:
         """Tell whether some statistic deviates so far that a candidate may explain it with others."""
@@ -293,7 +293,7 @@ class FrameExplainer:
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
         """
-        left = self.gaps.gap(z.final, null.mean, null.replicates)
+        left = self.gap(null, z)
         if left.at_floor:
             return None
         self.effort.release()
@@ -531,6 +531,8 @@ class FrameExplainer:
         self.held = added
         extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
         extended = extended.shifted(np.sum(added.parts * change[:, None], axis=0))
+        fitted = np.array([bool(h.effect.strength) for h in added.hypotheses])
+        extended = replace(extended, strengths=added.parts * (added.stderr * fitted)[:, None])
         errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))
         now = {h.tag: h for h in corrected}
         self.rounds = [this.updated(now, errors) for this in self.rounds]

@@ -233,6 +233,26 @@ def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
     assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
 
 
+def test_a_right_model_fitted_to_other_frames_is_below_the_floor_in_19_of_20() -> None:
+    # a common mode in few frames scatters a statistic widely; few replicates know it, and the strength was
+    # fitted to as many other frames
+    rng = np.random.default_rng(24)
+    null, scale = _null(rng, b=200), np.ones(40)
+    metric, scale[0] = StatisticsGap(null, 1000), 10.0
+    counted = []
+    for _ in range(300):
+        replicates = 0.3 + scale * rng.standard_normal((24, 40))
+        error = np.zeros((1, 40))
+        error[0, 0] = 10.0
+        z = 0.3 + scale * rng.standard_normal(40) + error[0] * rng.standard_normal()
+        mean = np.full(40, 0.3)
+        gaps = [metric.gap(z, mean, replicates, s) for s in (error, None)]
+        counted.append([gap.at_floor for gap in gaps])
+    right, fixed = np.mean(counted, axis=0)
+    assert abs(right - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 300)
+    assert fixed < 0.9
+
+
 def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None:
     h, g, mu, sigma = np.array([[1.0, 2.5], [0.1, 0.08], [100.0, 104.5], [3.1, 4.2]]).reshape(4, 1, 2)
     maps = PixelMaps(h, g, mu, sigma, np.array([[True, True]]))
