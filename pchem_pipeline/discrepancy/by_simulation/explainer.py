@@ -530,9 +530,9 @@ class FrameExplainer:
         self.fit, self.sensor = self._mapped(self.model)
         self.held = added
         extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
-        extended = extended.shifted(np.sum(added.parts * change[:, None], axis=0))
+        extended = extended.shifted(np.sum(added.slopes * change[:, None], axis=0))
         fitted = np.array([bool(h.effect.strength) for h in added.hypotheses])
-        extended = replace(extended, strengths=added.parts * (added.stderr * fitted)[:, None])
+        extended = replace(extended, strengths=added.slopes * (added.stderr * fitted)[:, None])
         errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))
         now = {h.tag: h for h in corrected}
         self.rounds = [this.updated(now, errors) for this in self.rounds]

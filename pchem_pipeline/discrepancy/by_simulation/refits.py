@@ -30,6 +30,9 @@ _CLOSE = 0.05  # relative change of a factor that is not worth another simulatio
 _LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
 _SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
+_TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
+_STRONG = 10.0  # standard deviations by which an effect moves a statistic where its slope is
+_LARGEST_SHARE = 0.9  # of a factor that a correction takes away
 _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
 # nats by which a set must promise to come near the best one, beside a tenth of what that explains
 _REACH, _REACH_SHARE = 30.0, 0.1
@@ -46,6 +49,8 @@ class Refitted:
         fit: of the pixels with them.
         vectors: statistics of replicates drawn from it, shape (b, m).
         covariance: of the statistics of one split under it, shape (m, m).
+        slopes: how the statistics go with the logarithm of each factor, shape (e, m): a quantile of a sum of
+            squares goes as a root of a strong effect, which is less than the shift that it has made.
         change: logarithms of the factors by which the data ask for more of each, shape (e,).
         rest: deviations of the data from the mean, with their errors and those allowed to the effects as the
             unit, shape (m,).
@@ -58,6 +63,7 @@ class Refitted:
     fit: Refit
     vectors: FloatArray
     covariance: FloatArray
+    slopes: FloatArray
     change: FloatArray
     rest: FloatArray
     score: float
@@ -173,17 +179,57 @@ class Refitter:
         return log_density(self.target - self.null.mean, noise.covariance)
 
     def sharpened(self, one: Refitted, replicates: int) -> Refitted:
-        """Return a set with more replicates at its strengths."""
+        """Return a set with more replicates, at the strengths that its slopes ask for."""
         if one.vectors.shape[0] >= replicates:
             return one
-        return self._simulated(one.hypotheses, one, replicates)
+        slopes, hypotheses = self._slopes(one), one.hypotheses
+        if slopes is not None:
+            noise = self.noise(one.covariance, len(one.vectors))
+            kept = self._kept(hypotheses)
+            change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], noise.among(kept))
+            hypotheses = _moved(hypotheses, np.log1p(np.maximum(change, -_LARGEST_SHARE))) or hypotheses
+        return self._simulated(hypotheses, one, replicates, slopes)
+
+    def _slopes(self, one: Refitted) -> FloatArray | None:
+        """Return the slopes of an effect alone that is strong, from a step beside it; None of all others.
+
+        Replicates share their random numbers, whatever the strength: few of them show a slope.
+        """
+        strong = np.max(np.abs(one.parts) / self.null.std) > _STRONG
+        moved = _moved(one.hypotheses, np.copysign([_TRIAL], one.change)) if len(one.tags) == 1 else None
+        if moved is None or not strong or is_dear(one.effects):
+            return None
+        step = _step(one.effects, tuple(h.effect for h in moved))
+        if abs(step[0]) < _SMALLEST_SECANT:
+            return None
+        self.allow(" + ".join(sorted(one.tags)))
+        _, vectors = self.draw(tuple(h.effect for h in moved), len(one.vectors))
+        apart = (vectors - one.vectors) / step[0]
+        error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
+        # a shift in proportion to the factor has this slope between the two
+        middle = np.exp(step[0] / 2.0)
+        foreseen = middle * one.parts[0]
+        slope = foreseen + _beyond_chance(apart.mean(axis=0) - foreseen, error)
+        return np.asarray(slope[None] / middle)
+
+    def _kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
+        """Return which statistics tell strengths.
+
+        A part was chosen because it stands out: what acts everywhere would come out too strong by it.
+        """
+        placed = any(not h.effect.everywhere for h in hypotheses)
+        return np.array([placed or "@" not in name for name in self.null.names])
 
     def noise(self, covariance: FloatArray, replicates: int) -> Noise:
         """Return the noise of the data less the mean of so many replicates."""
         return Noise(covariance * (1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
 
     def _simulated(
-        self, hypotheses: tuple[Hypothesis, ...], before: Refitted | None, replicates: int
+        self,
+        hypotheses: tuple[Hypothesis, ...],
+        before: Refitted | None,
+        replicates: int,
+        slopes: FloatArray | None = None,
     ) -> Refitted:
         """Simulate effects at their strengths; ``before`` is the same set at other strengths."""
         fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
@@ -196,23 +242,21 @@ class Refitter:
         scatter = None
         if replicates >= _ENOUGH:
             scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
-        # a part was chosen because it stands out: what acts everywhere would come out too strong by it
-        kept = np.array(
-            [any(not h.effect.everywhere for h in hypotheses) or "@" not in n for n in self.null.names]
-        )
+        slopes, kept = parts if slopes is None else slopes, self._kept(hypotheses)
         change, stderr = correction(
-            parts[:, kept], residual[kept], noise.among(kept), None if scatter is None else scatter[:, kept]
+            slopes[:, kept], residual[kept], noise.among(kept), None if scatter is None else scatter[:, kept]
         )
-        change = np.where(scaling, np.log1p(np.maximum(change, -0.9)), 0.0)
+        change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
         found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
         allowed = noise.of(parts)
-        promised = residual - np.expm1(change) @ parts
+        promised = residual - np.expm1(change) @ slopes
         return Refitted(
             found,
             stderr,
             fit,
             vectors,
             covariance,
+            slopes,
             change,
             rest=residual / np.sqrt(np.diag(allowed)),
             score=log_density(residual, allowed),

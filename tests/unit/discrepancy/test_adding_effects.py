@@ -102,6 +102,25 @@ def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) 
     assert world.drawn <= 6 * 7
 
 
+@pytest.mark.parametrize("power", [1.0, 1.0 / 3.0])
+def test_the_error_of_a_strong_effect_is_that_of_its_slope(
+    monkeypatch: pytest.MonkeyPatch, power: float
+) -> None:
+    """The normal quantile of a sum of squares goes as a cubic root where one mode is nearly all of it."""
+    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0, power))
+    truth, off = effect("row_noise", 0.1), []
+    for seed in range(12):
+        world = World([truth], seed)
+        guess = Hypothesis(effect("row_noise", 0.103), statistics([effect("row_noise", 0.103)]))
+        refitter = world.refitter()
+        found = refitter.sharpened(refitter.refined([guess]), 24)
+        # chance, and 3 % that are allowed to the details of an effect
+        wanted = np.hypot(np.sqrt(1.0 / 2.0 + 1.0 / 24.0) / (power * 40.0), 0.03)
+        assert found.stderr[0] == pytest.approx(wanted, rel=0.4)  # the scatter of 24
+        off.append((factor(found.effects[0]) * np.exp(found.change[0]) - 1.0) / wanted)
+    assert np.sqrt(np.mean(np.square(off))) < 1.0 + 4.0 / np.sqrt(24.0)
+
+
 def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
