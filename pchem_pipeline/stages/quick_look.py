@@ -159,8 +159,10 @@ def _codes(store: RunStore, maps: PixelMaps) -> CodeSample | None:
         if inside.size == 0:
             continue
         inside = inside[_spread(inside.size, -(-_PIXELS // pieces.size))]
-        block = store.read("histogram/counts", (*part, slice(None)))
-        counts.append(block.reshape(-1, block.shape[2])[inside])
+        place = np.divmod(inside, maps.usable[part].shape[1])
+        (rows, row), (columns, column) = (np.unique(each, return_inverse=True) for each in place)
+        block = store.read_crossings("histogram/counts", y + rows, x + columns)
+        counts.append(block[row, column])
         origins.append(origin[part].ravel()[inside].astype(np.int64))
         values = maps.maps
         parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))

@@ -214,6 +214,24 @@ class RunStore:
         with self._translated(name, region):
             return np.asarray(array[region if region is not None else ...])
 
+    def read_crossings(self, name: str, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the elements of an array (y, x, ...) where some rows and columns cross.
+
+        Args:
+            name: of the array.
+            rows: increasing.
+            columns: increasing.
+
+        Returns:
+            Shape (rows, columns, ...).
+
+        Raises:
+            StoreError: it is missing or a chunk is corrupt.
+        """
+        array = self.array(name)
+        with self._translated(name):
+            return np.asarray(array.oindex[rows, columns])
+
     def write(self, name: str, region: _Region, data: NDArray[Any]) -> None:
         """Write ``data`` into a region made of whole chunks.
 

@@ -111,7 +111,7 @@ class StackSums:
         """The same of all blocks, within which the covariances are taken."""
         return float(self.n_frames - self.n_blocks)
 
-    @cached_property
+    @property
     def within(self) -> FloatArray:
         """Sum of squares of each pixel about its mean over the block, (b, y, x), DN^2."""
         sums = self.block_sum.astype(np.float64)
@@ -165,7 +165,9 @@ class StackSums:
 
 
 def _centred(values: FloatArray, starts: IntArray) -> FloatArray:
-    """Return values (frame, line) less their mean over each block of frames."""
+    """Take the mean over each block of frames off values (frame, line), in place, and return them."""
     lengths = np.diff(np.append(starts, values.shape[0]))
     means = np.add.reduceat(values, starts, axis=0) / lengths[:, None]
-    return np.asarray(values - np.repeat(means, lengths, axis=0))
+    for start, length, mean in zip(starts, lengths, means, strict=True):
+        values[start : start + length] -= mean
+    return values

@@ -29,6 +29,8 @@ _FEWEST = 8
 _LINES = ("row", "column")
 #: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
 _CLIP = 6.0
+#: Values whose spectra are taken at a time.
+_AT_ONCE = 1 << 21
 _WIDTH = 1.2533  # standard error of a median over that of a mean
 
 _FRAMES = (
@@ -190,7 +192,10 @@ def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
 def _line_power(lines: Lines, length: int) -> FloatArray:
     """Return the mean power of the sums of lines along the sensor, over that of independent pixels."""
     values = lines.values.reshape(-1, length)
-    power = (np.abs(np.fft.rfft(values, axis=1)) ** 2).sum(axis=0)[1:] / length
+    power, step = np.zeros(length // 2 + 1), max(1, _AT_ONCE // length)
+    for start in range(0, values.shape[0], step):
+        power += (np.abs(np.fft.rfft(values[start : start + step], axis=1)) ** 2).sum(axis=0)
+    power = power[1:] / length
     groups = lines.variance.size // length
     return np.asarray(power / max(lines.freedom * groups * float(lines.variance.mean()), 1e-300))
 

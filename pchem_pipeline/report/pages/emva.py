@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import measured, short, unit_text
@@ -89,11 +90,7 @@ def emva_rows(
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
-    maps = {name: stored[name][kept] for name in _NAMES}
-    errors = {name: stored[f"{name}_stderr"][kept] for name in _NAMES}
-    if not kept.any():
-        maps = {name: np.full(1, np.nan) for name in _NAMES}
-        errors = dict(maps)
+    maps, errors = _Kept(stored, kept), _Kept(stored, kept, "_stderr")
     gain = maps["conversion_gain"]
     rows = [
         EmvaRow(
@@ -135,6 +132,19 @@ def emva_rows(
     return rows
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """The values of some pixels in each map, NaN where there are none; a map is large, so none is kept."""
+
+    stored: Mapping[str, NDArray[Any]]
+    pixels: NDArray[np.bool_]
+    suffix: str = ""
+
+    def __getitem__(self, name: str) -> FloatArray:
+        values = self.stored[f"{name}{self.suffix}"][self.pixels]
+        return values if values.size else np.full(1, np.nan)
+
+
 def _mean(values: FloatArray) -> tuple[float, float]:
     return float(values.mean()), float(
         values.std(ddof=1) / np.sqrt(values.size)
@@ -163,7 +173,7 @@ def _relative_spread(values: FloatArray, stderr: FloatArray) -> tuple[float, flo
     return spread * scale, error * scale
 
 
-def _dsnu(maps: dict[str, FloatArray], errors: dict[str, FloatArray], kind: str) -> EmvaRow:
+def _dsnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
     gain = float(np.median(maps["conversion_gain"]))
     if kind == "dark":
         mean = maps["bias"] + maps["quanta_exposure"] / maps["conversion_gain"]
@@ -182,7 +192,7 @@ def _dsnu(maps: dict[str, FloatArray], errors: dict[str, FloatArray], kind: str)
     return EmvaRow("dark signal non-uniformity", "DSNU_1288", value, error, "e-", words, differs)
 
 
-def _prnu(maps: dict[str, FloatArray], errors: dict[str, FloatArray], kind: str) -> EmvaRow:
+def _prnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
     value, error = None, None
     if kind == "light":
         value, error = _relative_spread(maps["quanta_exposure"], errors["quanta_exposure"])
@@ -206,8 +216,8 @@ def _dark_current(found: NDArray[Any] | None, kept: NDArray[np.bool_], kind: str
     )  # fmt: skip
 
 
-def _hot_share(exposure: FloatArray, maps: dict[str, FloatArray], outlier_sigmas: float) -> float:
-    centre = float(np.median(maps["quanta_exposure"]))
-    width = 1.4826 * float(np.median(np.abs(maps["quanta_exposure"] - centre)))
+def _hot_share(exposure: FloatArray, maps: _Kept, outlier_sigmas: float) -> float:
+    kept = Ordered.of(maps["quanta_exposure"])
     known = exposure[np.isfinite(exposure)]
-    return float(100.0 * np.mean(known > centre + outlier_sigmas * width)) if known.size else np.nan
+    limit = kept.median + outlier_sigmas * kept.robust_sd
+    return float(100.0 * np.mean(known > limit)) if known.size else np.nan

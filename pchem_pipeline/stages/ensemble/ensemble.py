@@ -168,7 +168,8 @@ def run(context: StageContext) -> None:
     truth = None if frames is None else _place_in_truth(store, context.config, sensor.shape)
     everything = frames == (0, sensor.n_frames)
     source = open_source(context) if frames is not None and (truth or not everything) else None
-    fitted = _Fitted.read(store, [tile for tile in tiles if tile.key in ready])
+    fitted_tiles = [tile for tile in tiles if tile.key in ready]
+    fitted = _Fitted.read(store, fitted_tiles)
     axes = fitted.axes(settings, extended=bool(effects))
     if sensor.kind == "histograms":
         context.note(
@@ -194,9 +195,12 @@ def run(context: StageContext) -> None:
     done = context.run_units(bands, task, unit_name=unit_name, needs="fit", unit_bytes=held)
     finished = [tile for tile in tiles if tile.key in done]
     if finished:
+        if finished != fitted_tiles:
+            fitted = _Fitted.read(store, finished)
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
         totals = _totals(store, axes, [numbered[tile.key][0] for tile in finished], frames, sensor.n_frames)
-        _write_result(store, totals, finished, _Asked(context.config, frames, truth, sensor), effects, made)
+        asked = _Asked(context.config, frames, truth, sensor)
+        _write_result(store, totals, finished, fitted, asked, effects, made)
 
 
 @dataclass(frozen=True)
@@ -312,8 +316,8 @@ def _sum_tile(
             some,
             everything,
             job.axes,
-            fitted_law(store, of_pixels, place),
-            fitted_satellites(store, place),
+            fitted_law(store, of_pixels, place) if job.effects else None,
+            fitted_satellites(store, place) if job.effects else None,
             None if errors is None else errors.of(_inside(tile, part)),
         )
         rows.append(row)
@@ -412,6 +416,7 @@ def _write_result(
     store: RunStore,
     totals: EnsembleTotals,
     tiles: list[Tile],
+    fitted: _Fitted,
     asked: _Asked,
     effects: Sequence[Effect],
     facts: dict[str, Any],
@@ -426,12 +431,12 @@ def _write_result(
         store: the run.
         totals: sums over the tiles.
         tiles: the finished tiles.
+        fitted: their pixels.
         asked: what the ensemble is of.
         effects: with which the maps were fitted.
         facts: further attributes.
     """
     missing, settings, frames = _missing(asked, totals), asked.config.ensemble, asked.frames
-    fitted = _Fitted.read(store, tiles)
     pixels = fitted.pixels
     per_pixel: int | NDArray[Any] = totals.samples[0]
     if frames is None:

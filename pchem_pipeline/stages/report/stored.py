@@ -142,7 +142,8 @@ def read_run(store: RunStore) -> StoredRun:
     if "fit_status" in fit:
         # only what has a value can agree with its model or not
         failed = (fit["fit_status"] & int(FAILED)) != 0
-        fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
+        if failed.any():
+            fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
     ends = {name: interval_names(name) for name in (*INTERVALS, *CHARGE_RATES)}
     found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
     shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}
@@ -176,19 +177,18 @@ def read_histograms(
         StoreError: an array is missing or corrupt.
     """
     y, x = np.divmod(index, shape[1])
-    origin = store.read("histogram/origin").reshape(-1)[index].astype(np.int64)
     high, wide = store.array("histogram/counts").chunks[:2]
     chunk = (y // high) * (shape[1] // wide + 1) + x // wide
+    free = [(i, f"fit/{name}") for i, name in enumerate(FREE_SATELLITES) if store.has(f"fit/{name}")]
     counts: list[NDArray[np.integer[Any]]] = [np.empty(0, np.int64)] * index.size
+    origin, satellites = np.zeros(index.size, np.int64), np.zeros((2, index.size))
     for each in np.unique(chunk):
         here = np.flatnonzero(chunk == each)
-        y0, x0 = int(y[here[0]] // high * high), int(x[here[0]] // wide * wide)
-        region = (slice(y0, y0 + high), slice(x0, x0 + wide), slice(None))
-        block = store.read("histogram/counts", region)
-        for i in here:
-            counts[i] = block[y[i] - y0, x[i] - x0].copy()
-    free = [f"fit/{name}" for name in FREE_SATELLITES]
-    satellites = [
-        store.read(path).reshape(-1)[index] if store.has(path) else np.zeros(index.size) for path in free
-    ]
-    return PixelHistograms(origin, counts, np.array(satellites, np.float64).reshape(2, index.size))
+        (rows, row), (columns, column) = (np.unique(at[here], return_inverse=True) for at in (y, x))
+        block = store.read_crossings("histogram/counts", rows, columns)
+        for i, j, k in zip(here, row, column, strict=True):
+            counts[i] = block[j, k].copy()
+        origin[here] = store.read_crossings("histogram/origin", rows, columns)[row, column]
+        for i, path in free:
+            satellites[i, here] = store.read_crossings(path, rows, columns)[row, column]
+    return PixelHistograms(origin, counts, satellites)
