@@ -229,7 +229,8 @@ class RunStore:
             StoreError: it is missing or a chunk is corrupt.
         """
         array = self.array(name)
-        with self._translated(name):
+        region = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        with self._translated(name, region):
             return np.asarray(array.oindex[rows, columns])
 
     def write(self, name: str, region: _Region, data: NDArray[Any]) -> None:
