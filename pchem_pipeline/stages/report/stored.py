@@ -179,7 +179,7 @@ def read_histograms(
     y, x = np.divmod(index, shape[1])
     high, wide = store.array("histogram/counts").chunks[:2]
     chunk = (y // high) * (shape[1] // wide + 1) + x // wide
-    free = [(i, f"fit/{name}") for i, name in enumerate(FREE_SATELLITES) if store.has(f"fit/{name}")]
+    free = [(which, f"fit/{name}") for which, name in enumerate(FREE_SATELLITES) if store.has(f"fit/{name}")]
     counts: list[NDArray[np.integer[Any]]] = [np.empty(0, np.int64)] * index.size
     origin, satellites = np.zeros(index.size, np.int64), np.zeros((2, index.size))
     for each in np.unique(chunk):
@@ -189,6 +189,6 @@ def read_histograms(
         for i, j, k in zip(here, row, column, strict=True):
             counts[i] = block[j, k].copy()
         origin[here] = store.read_crossings("histogram/origin", rows, columns)[row, column]
-        for i, path in free:
-            satellites[i, here] = store.read_crossings(path, rows, columns)[row, column]
+        for which, path in free:
+            satellites[which, here] = store.read_crossings(path, rows, columns)[row, column]
     return PixelHistograms(origin, counts, satellites)
