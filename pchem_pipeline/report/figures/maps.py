@@ -261,8 +261,10 @@ def shown_pixels(look: Look, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _step(look: Look, shape: tuple[int, ...]) -> int:
+    """Return k; it is odd, so that what differs from one row or column to the next is seen."""
     dots = inches(look.width_mm) * look.dpi
-    return max(1, int(shape[1] / dots), int(shape[0] / (_TALLEST * dots)))
+    step = max(1, int(shape[1] / dots), int(shape[0] / (_TALLEST * dots)))
+    return step if step % 2 else step - 1
 
 
 def show_map(axes: Axes, colour: NDArray[Any], shape: tuple[int, ...], **options: Any) -> AxesImage:

@@ -11,6 +11,7 @@ from helpers.report_material import CASES, PARAMETERS, pixel_fit, report_data, t
 from PIL import Image
 
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
+from pchem_pipeline.model.maps.maps import display_transform
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.ensemble import (
     component_table,
@@ -26,6 +27,7 @@ from pchem_pipeline.report.figures.maps import (
     draw_status,
     histogram_table,
     map_tables,
+    shown_pixels,
     status_counts,
 )
 from pchem_pipeline.report.figures.pixels import (
@@ -180,6 +182,22 @@ def test_maps_of_all_kinds(kind: str) -> None:
         assert "(e⁻/px/s)" in texts(figure)
         drawn(figure)
     drawn(read_noise(values))
+
+
+def test_a_map_of_more_pixels_than_an_image_can_show_has_every_odd_th_of_them() -> None:
+    values = np.random.default_rng(3).normal(100.0, 4.0, (90, 1300))
+    values[7, 9] = np.nan  # is not drawn, and counted all the same
+    look = Look(dpi=100)  # 346 dots across
+    tables = map_tables(values, "bias", None, 128)
+    figure = draw_map(look, tables=tables, name="bias")
+    axes = figure.axes[1]
+    shown = axes.images[0].get_array()
+    np.testing.assert_allclose(shown, display_transform(values)[::3, ::3])
+    assert axes.get_xlim() == (-0.5, 1299.5)
+    assert axes.get_ylim() == (89.5, -0.5)
+    assert axes.images[0].get_extent() == [-0.5, 3 * 434 - 0.5, 89.5, -0.5]
+    assert "no value: 1 pixel" in texts(figure)
+    assert shown_pixels(Look(dpi=300), values).shape == values.shape
 
 
 def test_pixels_without_a_value_are_counted_in_the_map() -> None:

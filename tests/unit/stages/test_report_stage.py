@@ -210,6 +210,22 @@ def test_four_pixels_lie_in_the_corners_of_noise_and_exposure() -> None:
         assert 0.02 < abs(noise[y, x] - 0.5) < 0.48
 
 
+def test_the_pixel_nearest_to_a_corner_of_all_is_chosen() -> None:
+    rng = np.random.default_rng(2)
+    noise = rng.standard_normal((60, 70))
+    exposure = np.exp(
+        3.0 * noise + 0.1 * rng.standard_normal((60, 70))
+    )  # no pixel is near two of the corners
+    ranks = [values.ravel().argsort().argsort() / values.size for values in (noise, exposure)]
+    for (_, y, x), (low, high) in zip(
+        choose_pixels(noise, exposure, np.zeros(noise.shape, np.uint16)),
+        ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9)),
+        strict=True,
+    ):
+        distance = np.hypot(ranks[0] + 0.5 / noise.size - low, ranks[1] + 0.5 / noise.size - high)
+        assert distance[y * 70 + x] == pytest.approx(distance.min())
+
+
 def test_few_or_no_pixels_to_choose_from() -> None:
     nan, one = np.full((2, 2), np.nan), np.array([[0.3, np.nan], [0.2, np.nan]])
     words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
