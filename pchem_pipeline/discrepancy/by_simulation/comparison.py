@@ -110,7 +110,7 @@ def compare(
             return
         best = max((one.score for one in tried), default=-np.inf)
         try:
-            tried.append(refitter.refined((*held, *members), best))
+            tried.append(refitter.refined((*held, *members), best, whole=len(members) == 1))
         except EffortSpentError:
             raise
         except NotFittedError:
@@ -128,10 +128,8 @@ def compare(
     best = max(tried, key=_worth)
     if not leaves_nothing(refitter, best):
         for members in _sets(choice, tried):
-            refit(members)
-    tried.sort(key=_worth, reverse=True)
-    known_sets = {one.tags: one for one in ([] if before is None else [before]) + tried[::-1]}
-    chosen = next((one for one in tried if _all_seen(refitter, one, known_sets)), None)
+            refit(_begun(members, tried))
+    chosen = _chosen(refitter, tried, [] if before is None else [before])
     if chosen is None:
         return None
     known = {h.tag for h in held}
@@ -139,6 +137,32 @@ def compare(
         if member.tag not in known:
             tried += _placebo(refitter, hypotheses, chosen, member, tried)
     return Comparison(chosen, tuple(tried), failed)
+
+
+def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted]) -> Refitted | None:
+    """Return the best set of which each effect is seen; sort all, and fit those that may be it to the end.
+
+    Args:
+        refitter: fits sets.
+        tried: sets; out: the best first, at their best fit where that may be the best of all.
+        before: sets that are known besides.
+    """
+    while True:
+        tried.sort(key=_worth, reverse=True)
+        known = {one.tags: one for one in [*before, *tried[::-1]]}
+        chosen = next((one for one in tried if _all_seen(refitter, one, known)), None)
+        if chosen is None:
+            return None
+        reach = chosen.promise - PRICE_OF_MORE * (len(chosen.hypotheses) - 1)
+        short = [
+            i
+            for i, one in enumerate(tried)
+            if one.short and one.promise - PRICE_OF_MORE * (len(one.hypotheses) - 1) >= reach
+        ]
+        if not short:
+            return chosen
+        for i in short:
+            tried[i] = refitter.refined(tried[i].hypotheses, chosen.score)
 
 
 def unrelated(one: Effect, other: Effect) -> bool:
@@ -248,10 +272,22 @@ def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis,
 
 def _kind(member: Hypothesis, best: Hypothesis) -> Hypothesis:
     """Return a member of a set, of the kind of another hypothesis where they are of different kinds."""
-    strength = member.effect.strength
-    without = {strength}
-    same = member.effect.model_dump(exclude=without) == best.effect.model_dump(exclude=without)
-    return member if same else best
+    return member if _alike(member, best) else best
+
+
+def _alike(one: Hypothesis, other: Hypothesis) -> bool:
+    """Tell whether two hypotheses differ in nothing but the strength of their effect."""
+    without = {one.effect.strength}
+    return one.effect.model_dump(exclude=without) == other.effect.model_dump(exclude=without)
+
+
+def _begun(members: Sequence[Hypothesis], tried: Sequence[Refitted]) -> tuple[Hypothesis, ...]:
+    """Return a set at the strengths of the best refitted one of several that differs in one effect."""
+    near = [one for one in tried if sum(h.tag in one.tags for h in members) >= max(2, len(members) - 1)]
+    if not near:
+        return tuple(members)
+    own = {h.tag: h for h in max(near, key=_worth).hypotheses}
+    return tuple(own[h.tag] if h.tag in own and _alike(h, own[h.tag]) else h for h in members)
 
 
 def _all_seen(refitter: Refitter, one: Refitted, known: dict[frozenset[str], Refitted]) -> bool:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.discrepancy.by_simulation.population_numba import solve_parabolas
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -33,6 +34,7 @@ _MOST_LEARNT_FROM = 1000  # pixels that the population is learnt from
 _TAILS = 8.0  # degrees of freedom of Student's t: pixels far from the others are no reason to widen T
 _ROUNDS = 8  # of parabolas, each followed by EM
 _EM_STEPS = 60
+_STILL = 1e-4  # standard deviations, and relative variances: a smaller change ends the steps of EM
 _NEWTON_STEPS = 3  # of each pixel between two rounds of EM, and in the end
 _LAST_STEPS = 8
 _SETTLED = 0.02  # nats: a smaller rise of the marginal likelihood per pixel ends the rounds
@@ -46,8 +48,6 @@ _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _MAD = 1.4826
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
-_ARRIVED = 0.2  # nats, twice the rise that a further step promises: more, and a point is no maximum
-_APART = 4.0  # squared standard deviations between two maxima
 _RARE = 0.003
 _AGAIN = 100  # resamplings of the pixels behind the error of the centre
 _LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
@@ -266,23 +266,21 @@ class _Maxima:
 
     def solve(self, population: Population) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return posterior mean (j, n, 4), covariance (j, n, 4, 4) and weight (j, n) under a population."""
-        prior = np.linalg.inv(population.scatter) / self.widening[:, None, None]
-        off = self.theta - population.centre
-        precision = self.information + prior
-        covariance = np.asarray(np.linalg.inv(precision), np.float64)
-        slope = self.score - np.einsum("nab,jnb->jna", prior, off)
-        step = np.einsum("jnab,jnb->jna", covariance, slope)
-        evidence = self.value - 0.5 * np.einsum("jna,nab,jnb->jn", off, prior, off)
-        evidence += 0.5 * (slope * step).sum(axis=2) + 0.5 * np.linalg.slogdet(covariance)[1]
-        self.evidence = np.logaddexp.reduce(evidence, axis=0) + 0.5 * np.linalg.slogdet(prior)[1]
-        arrived = ((slope * step).sum(axis=2) < _ARRIVED) | self.parabolic
-        counts = _distinct(self.theta + step, covariance, arrived) > 0.0
+        prior = np.linalg.inv(population.scatter)
+        shape = self.value.shape
+        mean, covariance = np.empty((*shape, 4)), np.empty((*shape, 4, 4))
+        evidence, counts = np.empty(shape), np.empty(shape, np.bool_)
+        solve_parabolas(
+            *(self.theta, self.value, self.score, self.information, population.centre, prior, self.widening),
+            *(self.parabolic, mean, covariance, evidence, counts),
+        )
+        # the prior's factor, its scatter widened in each pixel
+        factor = 0.5 * np.linalg.slogdet(prior)[1] - 2.0 * np.log(self.widening)
+        self.evidence = np.logaddexp.reduce(evidence, axis=0) + factor
         # the first maximum always counts, however unlikely the others make it
         evidence = np.where(counts & np.isfinite(evidence), evidence, -1e300)
         weight = np.exp(evidence - evidence.max(axis=0))
-        # a step from where the climb has not arrived leads anywhere
-        theta = self.theta + np.where(arrived[:, :, None], step, 0.0)
-        return theta, covariance, weight / weight.sum(axis=0)
+        return mean, covariance, weight / weight.sum(axis=0)
 
     def likely(self, population: Population) -> FloatArray:
         """Return the maxima without those kinds that hardly a pixel has, shape (i, n, 4)."""
@@ -293,18 +291,6 @@ class _Maxima:
         """Return the posterior under a population."""
         theta, covariance, weight = self.solve(population)
         return Posterior(population, _inside(theta), covariance, weight)
-
-
-def _distinct(theta: FloatArray, covariance: FloatArray, arrived: NDArray[np.bool_]) -> FloatArray:
-    """Return 1 for each maximum that is one, and not one of the earlier ones, else 0, shape (j, n)."""
-    found = np.where(arrived, 1.0, 0.0)
-    found[0] = 1.0
-    for j in range(1, theta.shape[0]):
-        for i in range(j):
-            off = theta[j] - theta[i]
-            apart = np.einsum("na,nab,nb->n", off, np.linalg.inv(covariance[i]), off)
-            found[j] *= (apart > _APART) | (found[i] == 0.0)
-    return found
 
 
 def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: int) -> _Maxima:
@@ -384,7 +370,13 @@ def _expectation_maximisation(maxima: _Maxima, population: Population) -> Popula
         centre = population.centre if hold else np.einsum("jn,jna->a", share, mean) / share.sum()
         off = mean - centre
         scatter = np.einsum("jn,jna,jnb->ab", share, off, off) + np.einsum("jn,jnab->ab", share, covariance)
-        population = replace(population, centre=centre, scatter=_at_least(scatter / weight.sum()))
+        new = replace(population, centre=centre, scatter=_at_least(scatter / weight.sum()))
+        variance = np.diag(population.scatter)
+        moved = np.abs(new.centre - population.centre) / np.sqrt(variance)
+        widened = np.abs(np.diag(new.scatter) / variance - 1.0)
+        population = new
+        if max(moved.max(), widened.max()) < _STILL:
+            break
     return population
 
 

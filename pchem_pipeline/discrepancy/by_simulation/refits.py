@@ -10,7 +10,7 @@ by secants): an effect is judged by what is left after its best fit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,9 @@ _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its
 # nats by which a set must promise to come near the best one, beside a tenth of what that explains
 _REACH, _REACH_SHARE = 30.0, 0.1
 _LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the next ones bring less
+# nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
+# the logarithm of a factor up to which its promise is believed
+_SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class Refitted:
             unit, shape (m,).
         score: log density of the rest, nats.
         promise: the same where the strengths are changed as the data ask for, if all goes in proportion.
+        chance: the same of a rest that chance leaves.
+        short: the strengths were not brought to their best, at which much would be left, too.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -68,6 +73,8 @@ class Refitted:
     rest: FloatArray
     score: float
     promise: float
+    chance: float
+    short: bool = False
 
     @property
     def tags(self) -> frozenset[str]:
@@ -121,7 +128,12 @@ class Refitter:
     allow: Callable[[str], None] = lambda _: None
 
     def refined(
-        self, hypotheses: Sequence[Hypothesis], rival: float = -np.inf, replicates: int = _FEW
+        self,
+        hypotheses: Sequence[Hypothesis],
+        rival: float = -np.inf,
+        replicates: int = _FEW,
+        *,
+        whole: bool = False,
     ) -> Refitted:
         """Return a set at the strengths that explain the data best, or the best that was simulated.
 
@@ -129,6 +141,7 @@ class Refitter:
             hypotheses: effects with guessed strengths and what they do there.
             rival: score of another set: where there is no hope to come near it, this one is given up.
             replicates: at each strength.
+            whole: only a set that explains the data is of interest, see ``short`` of :class:`Refitted`.
 
         Raises:
             NotFittedError: hardly a pixel can be fitted with the set at its guessed strengths.
@@ -141,6 +154,8 @@ class Refitter:
         for step_number in range(self.steps):
             if best.settled or gained < _LEAST_GAIN or self._hopeless(best, gained, rival):
                 break
+            if whole and self._explains_a_part(best):
+                return replace(best, short=True)
             if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
                 break
             step = np.clip(best.change, -_LARGEST_STEP, _LARGEST_STEP) * 0.5**shortened
@@ -167,6 +182,12 @@ class Refitter:
         """
         near = rival - _REACH
         return one.promise < near - _REACH_SHARE * (rival - self.nothing) or one.score + gained < near
+
+    def _explains_a_part(self, one: Refitted) -> bool:
+        """Tell whether a set not at its best strengths will leave far more than chance at these, too."""
+        known = bool(np.all(np.abs(one.change) < _BELIEVED))
+        left = _SHORT + _SHORT_SHARE * (one.chance - self.nothing)
+        return known and not one.settled and one.promise < one.chance - left
 
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
         """Return the model with effects."""
@@ -261,6 +282,7 @@ class Refitter:
             rest=residual / np.sqrt(np.diag(allowed)),
             score=log_density(residual, allowed),
             promise=log_density(promised, allowed),
+            chance=log_density(np.zeros_like(residual), allowed) - residual.size / 2.0,
         )
 
     def _parts(
