@@ -257,8 +257,8 @@ class FrameExplainer:
     def add(self, explanation: _Explanation, null: NullModel, z: Measured) -> NullModel | None:
         """Put the effects of the best refitted set into the model; None where none is established.
 
-        Asked twice: of the strengths as the data give them, and of the final frames. Effects of earlier
-        rounds are fitted anew with the new ones.
+        Asked thrice: of the strengths as the data give them, of the final frames, and whether the gap there
+        does not widen. Effects of earlier rounds are fitted anew with the new ones.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -275,11 +275,19 @@ class FrameExplainer:
         while found is not None and added is not None:
             kept = self._established(added, z)
             if len(kept) == len(added.hypotheses):
+                if self._widens(added, null, z):
+                    return None
                 return self._put(found, added, explanation.hypotheses, null)
             if not kept or {h.tag for h in kept} <= {h.tag for h in held}:
                 break
             added = refitter.sharpened(refitter.refined(kept), self.settings.extended_replicates)
         return None
+
+    def _widens(self, added: Refitted, null: NullModel, z: Measured) -> bool:
+        """Tell whether a set, its strengths as the data ask for, leaves a wider gap than without it."""
+        mean = added.mean + np.expm1(added.change) @ added.parts
+        before = self.gaps.gap(z.final, null.mean, null.replicates)
+        return self.gaps.gap(z.final, mean, added.vectors).interval[0] > before.value
 
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
         """Measure what no effect explains as shifts or as noise of the samples, and put it into the model.

@@ -34,8 +34,9 @@ _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
 _STRONG = 10.0  # standard deviations by which an effect moves a statistic where its slope is
 _LARGEST_SHARE = 0.9  # of a factor that a correction takes away
 _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
-# nats by which a set must promise to come near the best one, beside a tenth of what that explains
-_REACH, _REACH_SHARE = 30.0, 0.1
+# nats by which a set must promise to come near the best one, beside a tenth of what that explains or several
+# times what its next step promises to gain
+_REACH, _REACH_SHARE, _MISJUDGED = 30.0, 0.1, 5.0
 _LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the next ones bring less
 # nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
 # the logarithm of a factor up to which its promise is believed
@@ -181,7 +182,8 @@ class Refitter:
         Steps towards a maximum gain less and less.
         """
         near = rival - _REACH
-        return one.promise < near - _REACH_SHARE * (rival - self.nothing) or one.score + gained < near
+        more = min(_REACH_SHARE * (rival - self.nothing), _MISJUDGED * (one.promise - one.score))
+        return one.promise + more < near or one.score + gained < near
 
     def _explains_a_part(self, one: Refitted) -> bool:
         """Tell whether a set not at its best strengths will leave far more than chance at these, too."""

@@ -15,7 +15,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
     unexplained_of_its_own,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulator
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare, own_signature
+from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, _begun, compare, own_signature
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
@@ -149,6 +149,37 @@ def test_a_dear_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> 
     assert not found.settled
 
 
+def test_an_effect_that_explains_a_part_only_is_not_tuned_to_the_end_unless_it_is_the_best() -> None:
+    """Row noise beside frame noise: whatever its strength, much is left."""
+    world = World([effect("row_noise", 0.2), effect("frame_noise", 0.12)])
+    guess = hypothesis("row_noise", 0.18)
+    refitter = world.refitter()
+    short = refitter.refined([guess], whole=True)
+    assert short.short
+    assert world.drawn == 6
+    full = refitter.refined([guess])
+    assert not full.short
+    assert world.drawn > 12
+    assert full.score > short.score
+    # where there is no other, it is
+    found = world.compare(guess)
+    assert found is not None
+    assert not found.chosen.short
+    assert found.chosen.score >= full.score - 0.5
+
+
+def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
+    world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
+    known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
+    drift = hypothesis("exposure_drift")
+    first, second = _begun([hypothesis("row_noise"), drift], [known])
+    assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
+    members = [hypothesis("row_noise"), drift, hypothesis("frame_noise")]
+    begun = _begun(members, [known])
+    assert {begun[0].effect, begun[2].effect} == set(known.effects)
+    assert begun[1] is drift
+
+
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     world = World([effect("row_noise", 0.5)])
     # frame noise helps the fingerprint of row noise out where that is extrapolated
@@ -253,7 +284,7 @@ def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() 
 def add(world: World, monkeypatch: pytest.MonkeyPatch, *hypotheses: Hypothesis, final: Any = None) -> Any:
     """Return a search to which a round was added, and the null that it came to."""
     search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
-    search.first = world.null
+    search.first, search.gaps = world.null, StatisticsGap(world.null, 100_000)
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
     monkeypatch.setattr(search, "_refitter", lambda *_: world.refitter())
     monkeypatch.setattr(search, "_mapped", lambda *_: (SimpleNamespace(moved={}), "maps"))
@@ -288,6 +319,17 @@ def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.Mon
     assert search.model == ()
 
 
+def test_what_widens_the_gap_of_the_final_frames_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have some of it, by what it does to one statistic, and the opposite of what it does to another."""
+    monkeypatch.setitem(TRUTH, "row_noise", ((np.eye(M)[0] + np.eye(M)[5]) * 40.0, 1.0))
+    world = World([effect("row_noise", 0.1)])
+    for of_other, outside in ((-0.5, True), (0.3, False)):
+        final = 40.0 * (np.eye(M)[0] + of_other * np.eye(M)[5])
+        search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=final)
+        assert (extended is None) == outside
+        assert (search.model == ()) == outside
+
+
 @pytest.mark.parametrize(
     ("anisotropy", "against"), [(-1.0, "its anisotropy stands at its limit, -1"), (-0.9, "")]
 )
@@ -297,7 +339,6 @@ def test_an_effect_that_can_go_no_further_gets_no_name(
     world = World([effect("interpixel_capacitance", 0.1)])
     guess = hypothesis("interpixel_capacitance", anisotropy=anisotropy)
     search, extended = add(world, monkeypatch, guess)
-    search.gaps = StatisticsGap(world.null, 100_000)
     before = search.gap(world.null, world.z)
     [added] = search.close(before, extended, world.z, False).additions
     assert added.against == against
@@ -310,7 +351,6 @@ def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands
     world = World([effect("interpixel_capacitance", 0.2), effect("frame_noise", 0.1)])
     tags = ("interpixel_capacitance", "frame_noise", "exposure_drift")
     search, extended = add(world, monkeypatch, *(hypothesis(tag) for tag in tags))
-    search.gaps = StatisticsGap(world.null, 100_000)
     before = search.gap(world.null, world.z)
     additions = search.close(before, extended, world.z, False).additions
     assert {each.effect.tag for each in additions} == {"interpixel_capacitance", "frame_noise"}
@@ -327,7 +367,6 @@ def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_th
 ) -> None:
     world = World([effect("interpixel_capacitance", 0.2)])
     search, extended = add(world, monkeypatch, hypothesis("interpixel_capacitance"))
-    search.gaps = StatisticsGap(world.null, 100_000)
     before = search.gap(world.null, world.z)
     search.rounds = [replace(search.rounds[0], extended=extended.shifted(np.eye(M)[3] * 20.0))]
     for still in (False, True):
