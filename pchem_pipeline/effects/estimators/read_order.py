@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import optimize
 
 from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
 
@@ -16,6 +17,7 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 _TAPS = (1, 2, 4, 8)
 _LAGS = 8  # rows
 _LEAST = 3.0  # standard errors
+_LEAST_BESIDE = 0.005  # of what such rows show, that it must show beside them
 _LEAST_SHAPE = 6.0  # chi2 by which it must beat rows whose pixels move together, each row by itself
 
 
@@ -41,26 +43,40 @@ def pink_noise_of(evidence: Evidence) -> list[tuple[float, int]]:
     """Return standard deviation, DN, and number of taps of 1/f noise; empty if rows do not show it.
 
     Least squares of its variance to the covariances of row means, and to the correlations of neighbours along
-    both axes, for each number of taps.
+    both axes, for each number of taps: in place of rows that move each by itself, or beside them.
     """
     time, rows, columns = evidence.time, *evidence.maps.usable.shape
     if time is None or rows < 8 or columns < 8:
         return []
     seen, error = _seen(evidence, time)
-    fits = []
+    fits, shapes = [], []
     for taps in (taps for taps in _TAPS if columns % taps == 0 and columns // taps > 1):
         shape = _shown(evidence, rows, columns, taps)
         gain, variance = _fitted(seen, shape, error)
         # coupled neighbours are alike, too, but not whole rows
         rows_too = _fitted(seen[: _LAGS + 1], shape[: _LAGS + 1], error[: _LAGS + 1])[0]
+        shapes.append(shape)
         fits.append((gain if rows_too > _LEAST**2 else 0.0, variance, taps))
     gain, variance, taps = max(fits)
     # rows that move each by itself: their variance, and that of neighbours within them
     alone = np.where(np.isin(np.arange(seen.size), (0, _LAGS + 1)), 1.0, 0.0)
     alone[_LAGS + 1] = float(np.nanmean(evidence.readout_std**-2.0))
-    if gain < max(_LEAST**2, _fitted(seen, alone, error)[0] + _LEAST_SHAPE):
-        return []
-    return [(float(np.sqrt(variance)), taps)]
+    alone[: _LAGS + 1] -= 1.0 / rows  # the frame's mean is taken from each
+    by_rows = _fitted(seen, alone, error)[0]
+    if gain >= max(_LEAST**2, by_rows + _LEAST_SHAPE):
+        return [(float(np.sqrt(variance)), taps)]
+    # both at once, by whole rows: coupled neighbours are alike, too
+    in_rows = slice(0, _LAGS + 1)
+    wanted, by_rows = (seen / error)[in_rows], _fitted(seen[in_rows], alone[in_rows], error[in_rows])[0]
+    pairs = [
+        optimize.nnls((np.stack([alone, shape], axis=1) / error[:, None])[in_rows], wanted)
+        for shape in shapes
+    ]
+    left, variance, taps = min(
+        (float(rest), float(pair[1]), fit[2]) for (pair, rest), fit in zip(pairs, fits, strict=True)
+    )
+    more = float((wanted**2).sum()) - left**2 - by_rows
+    return [(float(np.sqrt(variance)), taps)] if more > _LEAST**2 + _LEAST_BESIDE * by_rows else []
 
 
 def _fitted(seen: FloatArray, shape: FloatArray, error: FloatArray) -> tuple[float, float]:

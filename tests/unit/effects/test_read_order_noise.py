@@ -51,6 +51,16 @@ def test_an_independent_camera_s_noise_is_found(seed):
     assert found.noise_dn == pytest.approx(hidden.strength, rel=0.25)
 
 
+def test_it_is_seen_beside_rows_that_move_each_by_itself():
+    hidden = RowNoise(row_noise_dn=1.5), ReadOrderNoise(noise_dn=2.0)
+    [found] = ReadOrderNoise.estimate(seen(taken(drawn_truth((24, 24)), *hidden, n_frames=1200, seed=51)))
+    assert found.taps == 1
+    assert found.noise_dn == pytest.approx(2.0, rel=0.6)  # a start of the search
+    [_] = ReadOrderNoise.estimate(
+        seen(hide(("read_order_noise", "row_noise"), 8.0, 180000, (32, 32), 1200).frames)
+    )
+
+
 def test_relatives_have_another_order():
     truth = drawn_truth((24, 24))
     effects = ((), (RowNoise(row_noise_dn=0.8),), (InterpixelCapacitance(coupling=0.01),))
