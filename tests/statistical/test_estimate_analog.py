@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.sensor_of_modes import drawn_truth, seen, taken
 
+from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
 from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
 from pchem_pipeline.effects.analog.gain_drift import GainDrift
@@ -133,9 +134,30 @@ def test_slow_telegraph_noise_is_found():
         fraction=0.03, amplitude_e=0.5, probability=0.5, sampling="single", correlation_frames=15.0
     )
     slow = [g for g in RtsNoise.estimate(evidence_of(effect)) if g.sampling == "single"]
-    assert len(slow) == 1
+    assert [g.times_spread > 0 for g in slow] == [False, True, True]
     assert slow[0].amplitude_e == pytest.approx(0.5, rel=0.4)
     assert 0.3 < slow[0].correlation_frames / 15.0 < 3.5
+
+
+def test_slow_traps_that_differ_have_smaller_steps_than_those_that_stand_out():
+    """Drawn by numpy alone: traps of their own steps and times; the weak ones are lost in the light."""
+    rng = np.random.default_rng(8)
+    n_frames, shape, share, step = 1500, (24, 24), 0.15, 1.0
+    n = int(share * 576)
+    leave = 1.0 / rng.uniform(3.0, 80.0, (2, n))  # of the empty and of the full state, per frame
+    state = rng.random(n) < leave[0] / leave.sum(axis=0)
+    traps = np.zeros((n_frames, n))
+    for t in range(n_frames):
+        traps[t] = state
+        state = np.where(rng.random(n) < np.where(state, leave[1], leave[0]), ~state, state)
+    signal = rng.poisson(1.5, (n_frames, 576)) + 0.25 * rng.standard_normal((n_frames, 576))
+    steps = np.maximum(rng.normal(step, 0.2, n), 0.4)
+    signal[:, rng.choice(576, n, replace=False)] += steps * (traps - traps.mean(axis=0))
+    frames = np.rint(100.0 + 10.0 * signal).reshape(n_frames, *shape).astype(np.uint16)
+    evidence = observe(frames, np.arange(n_frames), n_run=n_frames, block_frames=50)
+    alike, *differing = [g for g in RtsNoise.estimate(evidence) if g.sampling == "single"]
+    assert alike.amplitude_e / step > 1.15
+    assert any(abs(g.amplitude_e / step - 1.0) < 0.15 and g.times_spread > 0 for g in differing)
 
 
 @pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)

@@ -190,8 +190,9 @@ def _ornstein_uhlenbeck(
         return random.normal(("y", "x"), frame_key(frame, process))
 
     def midpoint(
-        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], rho: float
+        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], half: int
     ) -> NDArray[np.float64]:
+        rho = float(np.exp(-half / correlation_frames))
         state = normal(frame)
         state *= np.sqrt((1.0 - rho**2) / (1.0 + rho**2))
         state += rho / (1.0 + rho**2) * (before + after)

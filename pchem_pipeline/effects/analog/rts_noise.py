@@ -10,11 +10,12 @@ seen.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
+from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import frame_key, two_states
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
@@ -24,11 +25,13 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.framework.context import EffectContext, RandomSource
+    from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 # draws that are no frame's
-_WHERE, _SIZE = 0xFFFFFFFE, 0xFFFFFFFF
+_WHERE, _SIZE, _FULL, _EMPTY = 0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC
+# standard deviation of the logarithms of lognormal steps
+_LOGNORMAL = 0.4
 # steps, e-, and samples averaged that the estimator looks for, with probabilities
 _STEPS = (
     (0.5, 1), (0.7, 1), (1.0, 1), (1.5, 1), (2.5, 1), (4.0, 1), (1.3, 2), (2.0, 2), (1.5, 4), (3.0, 4),
@@ -43,6 +46,12 @@ _PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
 _LIMITS = np.array([4.2, 6.0, 4.2, 4.5, 4.5, 5.0])
 # standard deviations of a correlation in time beyond which a pixel has a slow trap
 _SLOW = 5.0
+# median step of slow traps that differ, over that of those which stand out
+_OF_THE_LARGEST = (0.8, 0.55)
+# standard deviations of the logarithms of its times by which hardly a trap is slower
+_FARTHEST = 4.0
+# spread of the times of real traps: those of one oxide differ by more than the frames of a run show
+_USUAL_TIMES_SPREAD = 0.8
 # amplitudes tried in every pixel, in units of that of the effect
 _EQUAL, _EXPONENTIAL = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0), (0.35, 0.5, 0.7, 1.0, 1.35, 1.8, 2.5, 3.4)
 _ALARM = 0.1  # pixels wrongly given levels, of those that have some
@@ -83,8 +92,10 @@ class RtsNoise(Effect):
     amplitude_e: float = Field(
         ge=0, le=1e4, description="step of the trap, e-; exponential: its mean over these pixels"
     )
-    spread: Literal["equal", "exponential"] = Field(
-        default="equal", description="equal: the same step in all these pixels; exponential: distributed so"
+    spread: Literal["equal", "lognormal", "exponential"] = Field(
+        default="equal",
+        description="equal: the same step in all these pixels; lognormal: the stated one is the median, with "
+        "a standard deviation of 0.4 of the logarithm; exponential: distributed so",
     )
     probability: float = Field(
         default=0.2,
@@ -105,6 +116,13 @@ class RtsNoise(Effect):
     correlation_frames: float = Field(
         default=30.0, gt=0, le=1e6, description="single: correlation time of the trap's state, frames"
     )
+    times_spread: float = Field(
+        default=0.0,
+        ge=0,
+        le=3,
+        description="single: standard deviation of the logarithms of the mean times full and empty, which "
+        "differ from trap to trap; 0: alike in all",
+    )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with the steps of the pixels that have a trap."""
@@ -112,14 +130,40 @@ class RtsNoise(Effect):
         _, y, x = np.nonzero(context.random.uniform(("y", "x"), _WHERE) < self.fraction)
         if not y.size:
             return result
-        step = np.full(y.size, self.amplitude_e)
-        if self.spread == "exponential":
-            step *= -np.log(context.random.uniform(("y", "x"), _SIZE)[0, y, x])
+
+        def uniform(draw: int) -> NDArray[np.float64]:
+            found: NDArray[np.float64] = context.random.uniform(("y", "x"), draw)[0, y, x]
+            return found
+
+        step = self._steps(uniform)
         if self.sampling == "single":
-            result[:, y, x] += step * (self._states(context.random, context.frames, y, x) - self.probability)
+            full, times = self._traps(uniform)
+            longest = self.correlation_frames * float(np.exp(_FARTHEST * self.times_spread))
+            states = two_states(context.frames, times, full, lambda t: uniform(frame_key(t)), longest)
+            result[:, y, x] += step * (states - full)
         else:
             result[:, y, x] += step * self._differences(context.random.uniform(("frame", "y", "x"))[:, y, x])
         return result
+
+    def _steps(self, uniform: Callable[[int], NDArray[np.float64]]) -> NDArray[np.float64] | float:
+        """Return the steps of traps, e-, given the uniform numbers of each for a draw."""
+        if self.spread == "exponential":
+            return np.asarray(self.amplitude_e * -np.log(uniform(_SIZE)))
+        if self.spread == "lognormal":
+            return np.asarray(self.amplitude_e * np.exp(_LOGNORMAL * special.ndtri(uniform(_SIZE))))
+        return self.amplitude_e
+
+    def _traps(
+        self, uniform: Callable[[int], NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
+        """Return the probabilities of slow traps to be full, and their correlation times, frames."""
+        if self.times_spread == 0 or not 0 < self.probability < 1:
+            return self.probability, self.correlation_frames
+        full, empty = (
+            self.correlation_frames / of_the_other * np.exp(self.times_spread * special.ndtri(uniform(draw)))
+            for of_the_other, draw in ((1.0 - self.probability, _FULL), (self.probability, _EMPTY))
+        )
+        return full / (full + empty), full * empty / (full + empty)
 
     def _differences(self, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return signal less reset, in steps of the trap, from uniform numbers of any shape."""
@@ -134,17 +178,6 @@ class RtsNoise(Effect):
     def _places(self) -> int:
         """Return between how many successive samples a jump can fall."""
         return 2 * self.samples - 1
-
-    def _states(
-        self, random: RandomSource, frames: NDArray[np.int64], y: NDArray[np.intp], x: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
-        """Return 1 where the trap is full and 0 where it is empty, (frame, pixel)."""
-
-        def uniform(frame: int) -> NDArray[np.float64]:
-            found: NDArray[np.float64] = random.uniform(("y", "x"), frame_key(frame))[0, y, x]
-            return found
-
-        return two_states(frames, self.correlation_frames, self.probability, uniform)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
@@ -221,15 +254,25 @@ class RtsNoise(Effect):
         near, _, far = (charge[:, outlying] * sd_k**2 + readout[:, outlying] * sd_r**2).mean(axis=1)
         rho = float(np.clip(max(far / near, 0.0) ** 0.5, 0.05, 0.995))
         amplitude = 2.0 * float(np.sqrt(max(near + float((both * sd_k * sd_r).mean()), 1e-6) / rho))
-        return [
-            cls(
-                fraction=float(outlying.mean()),
-                amplitude_e=min(amplitude, 1e4),
-                probability=0.5,
-                sampling="single",
-                correlation_frames=-1.0 / float(np.log(rho)),
+        alike = cls(
+            fraction=float(outlying.mean()),
+            amplitude_e=min(amplitude, 1e4),
+            probability=0.5,
+            sampling="single",
+            correlation_frames=-1.0 / float(np.log(rho)),
+        )
+        # where traps differ, those that stand out have larger steps than most
+        differing = [
+            alike.model_copy(
+                update={
+                    "spread": "lognormal",
+                    "times_spread": _USUAL_TIMES_SPREAD,
+                    "amplitude_e": alike.amplitude_e * share,
+                }
             )
+            for share in _OF_THE_LARGEST
         ]
+        return [alike, *differing]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that looks for such levels in every pixel, with a weight of its own.

@@ -35,30 +35,29 @@ def frame_key(frame: int, process: int = 0) -> int:
 
 def between_grid_points(
     frames: NDArray[np.int64],
-    correlation_frames: float,
+    longest: float,
     independent: Callable[[int], NDArray[Any]],
-    midpoint: Callable[[int, NDArray[Any], NDArray[Any], float], NDArray[Any]],
+    midpoint: Callable[[int, NDArray[Any], NDArray[Any], int], NDArray[Any]],
 ) -> list[NDArray[Any]]:
     """Return the states of a stationary Markov process at frames.
 
     Args:
         frames: frame numbers, shape (n,), at least one.
-        correlation_frames: tau > 0: the correlation of states h frames apart is exp(-h / tau).
+        longest: correlation time, frames, > 0: states much farther apart are independent.
         independent: gives the state at a frame from its stationary law.
         midpoint: gives the state at a frame from (its number, the state h frames before, the state h frames
-            after, exp(-h / tau)).
+            after, h).
 
     Returns:
         The state at each frame, in order.
     """
-    step = 1 << int(np.ceil(np.log2(max(_FAR * correlation_frames, 1.0))))
+    step = 1 << int(np.ceil(np.log2(max(_FAR * longest, 1.0))))
     first, last = int(frames.min()), int(frames.max())
     known = {at: independent(at) for at in range(first // step * step, last + step + 1, step)}
     while step > 1:
         half = step // 2
-        rho = float(np.exp(-half / correlation_frames))
         for left in [at for at in known if at + step in known]:
-            known[left + half] = midpoint(left + half, known[left], known[left + step], rho)
+            known[left + half] = midpoint(left + half, known[left], known[left + step], half)
         # the next level needs the points around the block only
         known = {at: state for at, state in known.items() if first - half < at < last + half}
         step = half
@@ -67,35 +66,39 @@ def between_grid_points(
 
 def two_states(
     frames: NDArray[np.int64],
-    correlation_frames: float,
-    occupied: float,
+    correlation_frames: NDArray[np.float64] | float,
+    occupied: NDArray[np.float64] | float,
     uniform: Callable[[int], NDArray[np.float64]],
+    longest: float,
 ) -> NDArray[np.float64]:
     """Return a Markov chain of two states for each of n traps: 1 where it is full and 0 where it is empty.
 
     Args:
         frames: frame numbers, shape (m,), at least one.
-        correlation_frames: tau > 0: the correlation of states h frames apart is exp(-h / tau).
-        occupied: probability that a trap is full.
+        correlation_frames: tau > 0, of all or of each, (n,): the correlation of states h frames apart is
+            exp(-h / tau).
+        occupied: probability that a trap is full, of all or of each, (n,).
         uniform: gives the uniform numbers of a frame, shape (n,).
+        longest: about the largest correlation time of any trap, whichever are asked for here.
 
     Returns:
         Shape (m, n).
     """
 
-    def full_after(state: NDArray[np.float64] | float, rho: float) -> NDArray[np.float64]:
+    def full_after(state: NDArray[np.float64] | float, rho: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(occupied + (state - occupied) * rho, np.float64)
 
     def independent(frame: int) -> NDArray[np.float64]:
         return (uniform(frame) < occupied).astype(np.float64)
 
     def midpoint(
-        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], rho: float
+        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], half: int
     ) -> NDArray[np.float64]:
+        rho = np.exp(-half / np.asarray(correlation_frames))
         # Bayes: the way there by way of "full" and by way of "empty"
         up, from_full, from_empty = full_after(before, rho), full_after(1.0, rho), full_after(0.0, rho)
         by_full = up * np.where(after > 0, from_full, 1.0 - from_full)
         by_empty = (1.0 - up) * np.where(after > 0, from_empty, 1.0 - from_empty)
         return (uniform(frame) * (by_full + by_empty) < by_full).astype(np.float64)
 
-    return np.stack(between_grid_points(frames, correlation_frames, independent, midpoint))
+    return np.stack(between_grid_points(frames, longest, independent, midpoint))

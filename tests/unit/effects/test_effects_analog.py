@@ -53,6 +53,7 @@ STRONG: list[Effect] = [
     RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7),
     RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7, samples=4, spread="exponential"),
     RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.6, sampling="single", correlation_frames=11.0),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, sampling="single", spread="lognormal", times_spread=0.9),
     SignalDependentNoise(noise_e=0.5),
     SignalDependentNoise(noise_e=0.5, growth="linear"),
 ]
@@ -364,6 +365,29 @@ def test_a_slow_trap_is_a_markov_chain_of_two_levels(tau):
     for before_now in (0, 1):
         of = full[2:][now & (full[:-2] == before_now)]
         within(of.mean(), stay, np.sqrt(stay * (1 - stay) / of.size))
+
+
+def test_slow_traps_differ_in_their_times():
+    effect = RtsNoise(
+        fraction=1.0,
+        amplitude_e=2.0,
+        probability=0.5,
+        sampling="single",
+        correlation_frames=2.0,
+        times_spread=0.7,
+    )
+    after, before, _, _ = analog(effect, (4000, 12, 12))
+    up = (after - before).reshape(4000, -1) > 0
+    full = up.mean(axis=0)
+    # the logarithms of the mean times full and empty, 4 frames in the middle, are of standard deviation 0.7
+    odds = np.log(full / (1.0 - full))
+    n = odds.size
+    within(odds.mean(), 0.0, 0.7 * np.sqrt(2.0 / n))
+    within(odds.std(), 0.7 * np.sqrt(2.0), 0.7 * np.sqrt(1.0 / n) + 0.02)
+    leaves = (up[:-1] & ~up[1:]).sum(axis=0) / up[:-1].sum(axis=0)
+    rate = -np.log1p(-leaves / (1.0 - full)) * (1.0 - full)  # of a chain that is looked at in every frame
+    within(np.median(np.log(1.0 / rate)), np.log(4.0), 1.25 * 0.7 / np.sqrt(n) + 0.03)
+    assert odds.std() > 20 * 0.02
 
 
 def test_exponential_steps_have_the_mean_that_is_stated():
