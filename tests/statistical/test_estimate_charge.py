@@ -219,6 +219,24 @@ def test_tracks():
     assert abs(found.electrons_per_um / 80.0 - 1) < 5 * 0.5 / np.sqrt(n) + 0.2
 
 
+def test_a_strong_afterglow_has_the_image_that_it_has_however_wrong_the_fits_are():
+    """Drawn by numpy alone: a disc that is brighter than the steady light, and one level all over."""
+    rng, n_frames, shape, peak = np.random.default_rng(12), 1500, (24, 24), 8.0
+    y, x = np.indices(shape)
+    disc = np.hypot(y - 11.5, x - 11.5) < 6
+    left = np.exp(-np.arange(n_frames) / 500.0)[:, None, None]
+    steady = rng.uniform(2.0, 4.0, shape)
+    signal = rng.poisson(steady + peak * left * disc) + 0.33 * rng.standard_normal((n_frames, *shape))
+    frames = np.rint(100.0 + 10.0 * signal).astype(np.uint16)
+    evidence = observe(frames, np.arange(n_frames), n_run=n_frames, block_frames=50)
+    image, _ = Persistence.estimate(evidence)
+    # a pixel's amplitude is known to 0.2 e-; by two time constants in steps of 27 % the first frame to less
+    pattern = image.pattern(np.arange(24), shape)[np.hypot(y - 11.5, x - 11.5) < 4]
+    assert pattern.std() < 0.05 * pattern.mean()
+    assert abs(image.peak_e * pattern.mean() / peak - 1) < 0.25
+    assert image.pattern(np.arange(24), shape)[np.hypot(y - 11.5, x - 11.5) > 9].max() < 0.05
+
+
 def frames_with(events, n_frames, shape=(24, 24), seed=3):
     """Return frames in which tracks, and clouds of 12,000 e- and 0.9 pixels, were drawn by numpy alone."""
     rng = np.random.default_rng(seed)

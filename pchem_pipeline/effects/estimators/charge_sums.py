@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence
+    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
 FloatArray = NDArray[np.float64]
 
@@ -77,8 +77,7 @@ def block_charge(evidence: Evidence) -> BlockCharge | None:
     good = evidence.maps.usable & (evidence.charge_std > 0) & (evidence.maps.quanta_exposure > 0)
     if not good.any():
         return None
-    last = np.append(np.searchsorted(time.frames, time.block_start[1:]), time.frames.size)
-    length = np.diff(np.append(np.searchsorted(time.frames, time.block_start[0]), last)).astype(np.float64)
+    length = _lengths(time)
     exposure, variance = evidence.maps.quanta_exposure[good], evidence.charge_std[good] ** 2
     charge = np.asarray(time.block_charge, np.float64)[:, good]
     charge -= np.average(charge, axis=0, weights=length)
@@ -87,6 +86,30 @@ def block_charge(evidence: Evidence) -> BlockCharge | None:
     deviation = (charge - common[:, None] * variance) / slope
     y, x = np.nonzero(good)
     return BlockCharge(time.block_start.astype(np.float64), length, deviation, exposure**2 / variance, y, x)
+
+
+def block_signal(evidence: Evidence) -> BlockCharge | None:
+    """Return the same of the samples themselves, at the sensor's usual gain; None as there.
+
+    Where the light of a pixel changes much its fit is led astray, and with it what is taken for charge.
+    """
+    charge, time = block_charge(evidence), evidence.time
+    if charge is None or time is None:
+        return None
+    at = charge.y, charge.x
+    gain, exposure = evidence.maps.conversion_gain[at], evidence.maps.quanta_exposure[at]
+    usual = float(np.median(gain)) / gain
+    signal = (time.block_charge[:, *at] + gain * time.block_readout[:, *at]).astype(np.float64) * usual
+    signal -= np.average(signal, axis=0, weights=charge.length)
+    signal -= np.median(signal / exposure, axis=1)[:, None] * exposure
+    variance = (evidence.charge_std[at] ** 2 + (gain * evidence.readout_std[at]) ** 2) * usual**2
+    return charge._replace(deviation=signal, variance=variance)
+
+
+def _lengths(time: TimeSeries) -> FloatArray:
+    """Return the number of frames of each block, (b,)."""
+    last = np.append(np.searchsorted(time.frames, time.block_start[1:]), time.frames.size)
+    return np.diff(np.append(np.searchsorted(time.frames, time.block_start[0]), last)).astype(np.float64)
 
 
 def exposure_nodes(factors: ArrayLike, n: int = 3) -> tuple[FloatArray, FloatArray]:

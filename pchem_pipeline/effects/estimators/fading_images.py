@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge
 
@@ -57,7 +58,8 @@ class FadingCells:
             return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
 
         inverse = stderr**-2
-        amplitude = np.zeros(n)
+        # from the middle of each cell: from 0 on a bright image would be cut at so many steps
+        amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
         for _ in range(_CUTS):
             # single pixels that jump are another effect
             middle = amplitude[cell]

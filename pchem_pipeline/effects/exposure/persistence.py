@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_nodes
+from pchem_pipeline.effects.estimators.charge_sums import block_charge, block_signal, exposure_nodes
 from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_of
 from pchem_pipeline.effects.estimators.spots import best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _GRIDS = (8, 16)
 #: cells along a side of an image that was found in a part of the sensor: it stands in the YAML
 _MOST_CELLS = 48
+# by how many times as clearly the samples must show it as the charge
+_MORE = 1.25
 # time constants tried, in lengths of the run
 _DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
 
@@ -197,7 +199,8 @@ class Persistence(Effect):
         """Return a spot and an image from the pixels' block means, fitted with a falling exponential each.
 
         What all pixels do in proportion to H is taken out first. The amplitudes are averaged over the cells
-        of a coarse grid; the time constant is the one that explains most.
+        of a coarse grid; the time constant is the one that explains most. It is found in the charge; the
+        samples themselves hold all of it, however strong it is.
         """
         blocks = block_charge(evidence)
         if blocks is None or evidence.time is None:
@@ -209,6 +212,11 @@ class Persistence(Effect):
         best = max(tried, key=lambda cells: cells.score)
         if best.score < 4.0:
             return ()
+        # the charge is less noisy, unless the fits that tell it are wrong
+        signal = block_signal(evidence) or blocks
+        whole = FadingCells.of(signal, exposure, best.decay, _GRIDS[0])
+        if whole.score > _MORE * best.score:
+            blocks, best = signal, whole
         finer = FadingCells.of(blocks, exposure, best.decay, _GRIDS[1])
         fading = fading_of(blocks, best, evidence.time.n_run)
         fields: dict[str, Any] = {
