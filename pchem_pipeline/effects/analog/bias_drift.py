@@ -171,8 +171,10 @@ def _wander(time: TimeSeries) -> float:
     lengths = np.diff([*edges, time.frames.size])
     whole = lengths == lengths.max()
     blocks = (np.add.reduceat(time.frame_readout, edges) / lengths)[whole]
-    inside = np.diff(time.frame_readout)[np.diff(time.frames) == 1].var() / 2.0
-    excess = float(blocks.var() - inside / lengths.max()) if blocks.size > 1 else 0.0
+    steps = np.diff(time.frame_readout)[np.diff(time.frames) == 1]
+    if blocks.size < 2 or steps.size == 0:  # frames of a period have no next one
+        return 0.0
+    excess = float(blocks.var() - steps.var() / 2.0 / lengths.max())
     return float(np.sqrt(6.0 * max(excess, 0.0)))
 
 

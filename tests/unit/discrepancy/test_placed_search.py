@@ -12,12 +12,13 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, simu
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_statistics
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.effects.framework.registry import effect_classes
 
 SHAPE, FRAMES = (32, 32), 1500
 
@@ -191,3 +192,20 @@ def test_a_range_of_few_frames_of_poor_pixels_has_statistics():
     quiet = Part(when=When(range=((900, 1060),)))
     found = part_statistics(frames[some], numbers[some], maps, [quiet], n_run=FRAMES, block_frames=20)
     assert abs(found["space.row.readout.variance@frames=900:1060"]) < 4.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_estimators_look_at_frames_of_a_period_that_have_no_next_one():
+    def every_tenth(rng, shape):
+        moved = rng.normal(0.0, 1.5, (shape[0], shape[1], 1))
+        moved[np.arange(shape[0]) % 10 != 7] = 0.0
+        return moved
+
+    frames, numbers = camera(14, every_tenth, (16, 24)), np.arange(FRAMES)
+    evidence = observe(frames, numbers, n_run=FRAMES, block_frames=50)
+    [part] = suspected_parts(evidence, frames)
+    assert part == Part(when=When(every=10, phase=7))
+    own = part_evidence(frames, numbers, evidence.maps, part, n_run=FRAMES, block_frames=50)
+    guesses = {tag: cls.estimate(own) for tag, cls in effect_classes().items()}
+    [found] = guesses["row_noise"]
+    assert 0.75 < found.row_noise_dn / 1.5 < 1.1  # a guess: the fit of 150 frames takes a part of it
