@@ -100,8 +100,11 @@ def with_model(text: str, model: ModelSettings, name: str, folder: Path | None =
                 return changed
         except (YAMLError, yaml.YAMLError, ConfigError, ValueError, KeyError, TypeError, AttributeError):
             continue
-    line = {_SECTION: model.model_dump(mode="json", exclude_defaults=True)}
-    words = yaml.safe_dump(line, sort_keys=False, default_flow_style=True, width=10**6).strip()
+    line = model.model_dump(mode="json", exclude_defaults=True)
+    if model.effects:  # the tag is what each has by default
+        given = (effect.model_dump(mode="json", exclude_defaults=True) for effect in model.effects)
+        line["effects"] = [{"tag": e.tag, **own} for e, own in zip(model.effects, given, strict=True)]
+    words = yaml.safe_dump({_SECTION: line}, sort_keys=False, default_flow_style=True, width=10**6).strip()
     raise ConfigError(f"{name}: its section model cannot be edited; write it by hand: {words}")
 
 

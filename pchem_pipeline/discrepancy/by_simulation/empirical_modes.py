@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, shares_of
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, On, Shared
+from pchem_pipeline.effects.analog.empirical_noise import Changed, EmpiricalNoise, Lag, NoiseMode, Shared
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_ON: tuple[On, ...] = ("offset", "gain", "light")
+_CHANGED: tuple[Changed, ...] = ("offset", "gain", "light")
 _OF: tuple[Shared, ...] = ("frame", "row", "column")
 _CLEAR = 15.0  # nats
 # times what a Gaussian explains that bursts must, and nats: the scores are skewed themselves
@@ -63,7 +63,7 @@ class Sums(NamedTuple):
 
 def common_scores(
     frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolArray
-) -> dict[tuple[Shared, On], Sums]:
+) -> dict[tuple[Shared, Changed], Sums]:
     """Sum the scores of the samples over frames, rows and columns, for each kind of change.
 
     Args:
@@ -72,14 +72,14 @@ def common_scores(
         inside: pixels that are looked at, shape (y, x).
     """
     inside = inside & maps.usable
-    found: dict[tuple[Shared, On], Sums] = {}
+    found: dict[tuple[Shared, Changed], Sums] = {}
     pixels = np.flatnonzero(inside.ravel())
     if not pixels.size:
         return found
     flat = frames.reshape(len(frames), -1)
     first = flat.min(axis=0)[pixels].astype(np.int64)
     length = int((flat.max(axis=0)[pixels] - first).max()) + 1
-    for on, table in zip(_ON, _score_tables(maps, pixels, first, length), strict=True):
+    for changed, table in zip(_CHANGED, _score_tables(maps, pixels, first, length), strict=True):
         gathered: list[tuple[FloatArray, ...]] = []
         mean, square = np.zeros(inside.shape), np.zeros(inside.shape)
         for begin in range(0, len(flat), _CHUNK):
@@ -91,9 +91,9 @@ def common_scores(
         power = np.maximum(square - mean**2, 0.0)
         frame, row, column, block = (np.concatenate(parts) for parts in zip(*gathered, strict=True))
         blocks = block - _in_blocks(mean[None]), _in_blocks(power[None])[0]
-        found["frame", on] = Sums(frame - mean.sum(), power.sum(keepdims=True)[0], blocks)
-        found["row", on] = Sums(row - mean.sum(axis=1), power.sum(axis=1))
-        found["column", on] = Sums(column - mean.sum(axis=0), power.sum(axis=0))
+        found["frame", changed] = Sums(frame - mean.sum(), power.sum(keepdims=True)[0], blocks)
+        found["row", changed] = Sums(row - mean.sum(axis=1), power.sum(axis=1))
+        found["column", changed] = Sums(column - mean.sum(axis=0), power.sum(axis=0))
     return found
 
 
@@ -126,8 +126,8 @@ def _score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: in
 
 
 def measured_mode(
-    data: dict[tuple[Shared, On], Sums],
-    model: dict[tuple[Shared, On], Sums],
+    data: dict[tuple[Shared, Changed], Sums],
+    model: dict[tuple[Shared, Changed], Sums],
     maps: PixelMaps,
     inside: BoolArray,
 ) -> Measurement | None:
@@ -139,25 +139,25 @@ def measured_mode(
         maps: parameters of the pixels.
         inside: pixels that were looked at, shape (y, x).
     """
-    best: tuple[Shared, On, Sums, tuple[tuple[float, ...], ...], float] | None = None
+    best: tuple[Shared, Changed, Sums, tuple[tuple[float, ...], ...], float] | None = None
     gain = _CLEAR
-    for (of, on), sums in data.items():
+    for (of, changed), sums in data.items():
         one, blocks = _shaped(sums)
-        expected = max(model[of, on].ratio, 1.0)
+        expected = max(model[of, changed].ratio, 1.0)
         ratio = max(one.ratio / expected, 1.0)
         here = 0.5 * one.number * (ratio - 1.0 - np.log(ratio))
         if here > gain:
-            best, gain = (of, on, one, blocks, one.ratio - expected), here
+            best, gain = (of, changed, one, blocks, one.ratio - expected), here
     if best is None or best[1] == "offset":
         return None
-    of, on, one, blocks, excess = best
+    of, changed, one, blocks, excess = best
     power = excess / float(np.mean(one.information[one.information > 0.0]))
     inside = inside & maps.usable
     signal = float(np.median((maps.quanta_exposure / maps.conversion_gain)[inside]))
     burst, size = _bursts(one, gain)
     lags, correlation = ((), ()) if burst else _correlation(one, power)
     mode = NoiseMode(
-        of=of, share=1.0, on=on, signal_dn=round(signal, 3), lags=lags, correlation=correlation,
+        of=of, share=1.0, changes=changed, signal_dn=round(signal, 3), lags=lags, correlation=correlation,
         burst=burst, negative=size < 0.0, shape=blocks,
     )  # fmt: skip
     rms = abs(size) * np.sqrt(burst) if burst else np.sqrt(power)

@@ -28,7 +28,7 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.effects.analog.empirical_noise import On, Shared
+from pchem_pipeline.effects.analog.empirical_noise import Changed, Shared
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
@@ -44,7 +44,7 @@ class _Shared(NamedTuple):
     """How samples vary together: products of their residuals, and sums of their scores."""
 
     covariances: Covariances
-    scores: dict[tuple[Shared, On], Sums]
+    scores: dict[tuple[Shared, Changed], Sums]
 
 
 @dataclass

@@ -33,7 +33,7 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
 Shared = Literal["sample", "row", "column", "frame"]
-On = Literal["offset", "gain", "light"]
+Changed = Literal["offset", "gain", "light"]
 _DIMS: dict[Shared, tuple[Dim, ...]] = {
     "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
 }  # fmt: skip
@@ -55,7 +55,7 @@ class NoiseMode(Section):
     correlation: tuple[float, ...] = Field(
         default=(), max_length=64, description="correlation of the values at each of them, no unit"
     )
-    on: On = Field(default="offset", description="what it moves: the offset, the gain or the light")
+    changes: Changed = Field(default="offset", description="what it moves: the offset, the gain or the light")
     signal_dn: float = Field(
         default=1.0, gt=0, description="gain, light: mean signal over the bias at which it has its size, DN"
     )
@@ -106,9 +106,9 @@ class NoiseMode(Section):
             whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
         if self.shape:
             whole += f", strongest in {self.strongest()}"
-        on = "" if self.on == "offset" else f"of the {self.on} at {self.signal_dn:.3g} DN"
+        what = "" if self.changes == "offset" else f"of the {self.changes} at {self.signal_dn:.3g} DN"
         burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
-        return ", ".join(part for part in (on, whole, burst, shared) if part)
+        return ", ".join(part for part in (what, whole, burst, shared) if part)
 
     def values(self, number: int, context: EffectContext) -> FloatArray:
         """Return its values, of mean square 1, in a shape that fits (frame, y, x)."""
@@ -190,9 +190,9 @@ class EmpiricalNoise(Effect):
             if mode.shape:
                 places = context.rows / context.shape[0], np.arange(values.shape[2]) / context.shape[1]
                 field = field * mode.across(*places)
-            if mode.on == "offset":
+            if mode.changes == "offset":
                 total = total + field
-            elif mode.on == "gain":
+            elif mode.changes == "gain":
                 electrons = electrons + field / mode.signal_dn * np.asarray(context.charge)
             else:
                 electrons = electrons + _of_light(field / mode.signal_dn, number, context)
@@ -229,9 +229,9 @@ class EmpiricalNoise(Effect):
         """
         for mode in self.modes:
             power = self.share_of(mode) ** 2
-            if mode.on == "offset":
+            if mode.changes == "offset":
                 model = model.with_variance(dn2=power)
-            elif mode.on == "gain":
+            elif mode.changes == "gain":
                 model = model.with_variance(per_electron2=power / mode.signal_dn**2)
         return model
 

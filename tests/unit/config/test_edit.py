@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import stat
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.config.edit import check_writable, with_model, write_model
 from pchem_pipeline.config.load import parse_config
 from pchem_pipeline.config.template import commented_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.effects.framework.settings import ModelSettings
 
 ROW: dict[str, Any] = {"tag": "row_noise", "row_noise_dn": 1.2}
@@ -144,6 +147,48 @@ def test_comments_and_other_lines_stay_whatever_the_text(text: str, strength: fl
     assert comments(changed) == comments(text)
     # and back, to the byte
     assert with_model(changed, old, "a.yaml").split() == text.split()
+
+
+def test_every_effect_can_be_written() -> None:
+    shared = {"of": "row", "share": 1.0, "changes": "gain", "signal_dn": 7.5, "burst": 0.1}
+    measured = {"tag": "empirical_noise", "noise_dn": 1.5, "modes": [shared], "region": {"columns": [[3, 9]]}}
+    for tag, kind in effect_classes().items():
+        for effect in (*kind.typical(), *(model(measured).effects if tag == "empirical_noise" else ())):
+            for text in (TEXT, "input: {files: [a]}\n"):
+                wanted = ModelSettings(effects=(effect,))
+                assert parse_config(with_model(text, wanted, "a.yaml")).model == wanted, tag
+
+
+def test_no_setting_is_called_what_yaml_takes_for_true_or_false() -> None:
+    def names(kind: type[BaseModel], seen: set[type]) -> set[str]:
+        seen.add(kind)
+        found = set(kind.model_fields)
+        for field in kind.model_fields.values():
+            for part in parts(field.annotation):
+                if part not in seen:
+                    found |= names(part, seen)
+        return found
+
+    def parts(annotation: Any) -> list[type[BaseModel]]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            return [annotation]
+        return [part for inner in get_args(annotation) for part in parts(inner)]
+
+    for kind in (RunConfig, *effect_classes().values()):
+        for name in names(kind, set()):
+            assert yaml.safe_load(name) == name, (kind, name)
+
+
+def test_a_model_that_cannot_be_put_in_is_told_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> str:
+        raise ValueError
+
+    for name in ("_with_lines", "_with_document"):
+        monkeypatch.setattr(f"pchem_pipeline.config.edit.{name}", refuse)
+    with pytest.raises(ConfigError, match="write it by hand") as error:
+        with_model(TEXT, model(CLIP, ROW), "a.yaml")
+    words = str(error.value).partition("by hand: ")[2]
+    assert ModelSettings.model_validate(yaml.safe_load(words)["model"]) == model(CLIP, ROW)
 
 
 def test_a_text_that_is_no_configuration_is_refused() -> None:

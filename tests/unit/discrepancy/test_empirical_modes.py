@@ -51,7 +51,7 @@ def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, 
     found = measured(frames(1, gain=1.0 + 0.02 * drawn(*shape)))
     assert found is not None
     (mode,) = found.modes
-    assert (mode.of, mode.on, mode.burst, mode.shape) == (of, "gain", None, ())
+    assert (mode.of, mode.changes, mode.burst, mode.shape) == (of, "gain", None, ())
     # its own variance is known to sqrt(2 / n); the scores see a little less where the peaks overlap
     error = 0.02 * SIGNAL * np.sqrt(0.5 / np.prod(shape))
     assert abs(found.noise_dn - 0.02 * SIGNAL) < 5 * error + 0.15 * 0.02 * SIGNAL
@@ -65,7 +65,7 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
     found = measured(frames(2, light=1.0 + 1.5 * burst * corner))
     assert found is not None
     (mode,) = found.modes
-    assert (mode.of, mode.on) == ("frame", "light")
+    assert (mode.of, mode.changes) == ("frame", "light")
     assert mode.burst == pytest.approx(burst.mean(), rel=0.3)
     assert not mode.negative
     blocks = np.array(mode.shape)
@@ -105,7 +105,7 @@ def simulated(mode: NoiseMode, noise_dn: float) -> np.ndarray:
 
 @pytest.mark.parametrize("on", ["gain", "light"])
 def test_the_simulated_change_has_its_size(on: Any) -> None:
-    mode = NoiseMode(of="frame", share=1.0, on=on, signal_dn=4 * STEP)
+    mode = NoiseMode(of="frame", share=1.0, changes=on, signal_dn=4 * STEP)
     means = simulated(mode, 0.1 * 4 * STEP).mean(axis=(1, 2)) / (4 * STEP)
     own = 1 / (4 * means.size * EVERYWHERE.size)
     chance = np.var(simulated(mode, 0.0).mean(axis=(1, 2)) / (4 * STEP))
@@ -115,7 +115,7 @@ def test_the_simulated_change_has_its_size(on: Any) -> None:
 
 def test_simulated_bursts_are_as_rare_and_where_they_are_told() -> None:
     mode = NoiseMode(
-        of="frame", share=1.0, on="light", signal_dn=4 * STEP, burst=0.04, shape=((1.0, 0.0), (0.0, 0.0))
+        of="frame", share=1.0, changes="light", signal_dn=4 * STEP, burst=0.04, shape=((1.0, 0.0), (0.0, 0.0))
     )
     found = simulated(mode, 2.0 * np.sqrt(0.04) / 2.0 * 4 * STEP)
     corner, rest = found[:, :8, :10].mean(axis=(1, 2)), found[:, 8:, 10:].mean(axis=(1, 2))
