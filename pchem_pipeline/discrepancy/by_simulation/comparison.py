@@ -44,6 +44,7 @@ _LEFT = 0.02  # chance of what a complete set may leave, anywhere among the stat
 _SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
 _MOVED = 3.0  # by which that effect must move it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
+_NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
 _PLACEBO_STEPS = 2  # corrections of its strength
 
 
@@ -126,6 +127,8 @@ def compare(
     if not tried:
         return None
     best = max(tried, key=_worth)
+    if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
+        return None  # nothing beside the effects held explains more than they do by themselves
     if not leaves_nothing(refitter, best):
         for members in _sets(choice, tried):
             refit(_begun(members, tried))

@@ -83,12 +83,14 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
 
-    def compare(self, *hypotheses: Hypothesis, held: Sequence[Hypothesis] = ()) -> Comparison | None:
+    def compare(
+        self, *hypotheses: Hypothesis, held: Sequence[Hypothesis] = (), before: Any = None
+    ) -> Comparison | None:
         refitter = self.refitter()
         shifts = (self.z.train - self.null.mean, self.z.test - self.null.mean)
         choice = choose(hypotheses, shifts, refitter.noise(self.null.covariance, 40))
         assert choice is not None
-        return compare(refitter, held, hypotheses, choice)
+        return compare(refitter, held, hypotheses, choice, before)
 
 
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
@@ -166,6 +168,17 @@ def test_an_effect_that_explains_a_part_only_is_not_tuned_to_the_end_unless_it_i
     assert found is not None
     assert not found.chosen.short
     assert found.chosen.score >= full.score - 0.5
+
+
+def test_the_search_ends_where_no_effect_explains_more_beside_those_held() -> None:
+    world = World([effect("row_noise", 0.5), effect("frame_noise", 0.1)])
+    [held] = world.refitter().refined([hypothesis("row_noise")]).hypotheses
+    before = world.refitter().refined([held], replicates=16)
+    more = world.compare(hypothesis("frame_noise"), held=[held], before=before)
+    assert more is not None
+    assert more.chosen.tags == {"row_noise", "frame_noise"}
+    better = replace(before, score=more.chosen.score + 20.0)
+    assert world.compare(hypothesis("frame_noise"), held=[held], before=better) is None
 
 
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
