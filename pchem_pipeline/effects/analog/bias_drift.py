@@ -20,6 +20,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     quantile_means,
     responsivity,
     run_position,
+    successive,
     with_offsets,
 )
 from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
@@ -171,10 +172,8 @@ def _wander(time: TimeSeries) -> float:
     lengths = np.diff([*edges, time.frames.size])
     whole = lengths == lengths.max()
     blocks = (np.add.reduceat(time.frame_readout, edges) / lengths)[whole]
-    steps = np.diff(time.frame_readout)[np.diff(time.frames) == 1]
-    if blocks.size < 2 or steps.size == 0:  # frames of a period have no next one
-        return 0.0
-    excess = float(blocks.var() - steps.var() / 2.0 / lengths.max())
+    inside = np.diff(time.frame_readout)[successive(time.frames)].var() / 2.0
+    excess = float(blocks.var() - inside / lengths.max()) if blocks.size > 1 else 0.0
     return float(np.sqrt(6.0 * max(excess, 0.0)))
 
 

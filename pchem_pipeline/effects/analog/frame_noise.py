@@ -20,6 +20,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     line_excess,
     mean_variance,
     responsivity,
+    successive,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
@@ -111,5 +112,4 @@ def _steps(time: TimeSeries) -> NDArray[np.float64]:
         chosen = time.frames % 2 == parity
         if chosen.any():
             means[chosen] -= means[chosen].mean()
-    successive = np.diff(time.frames) == 1
-    return np.asarray(np.diff(means)[successive], np.float64)
+    return np.asarray(np.diff(means)[successive(time.frames)], np.float64)

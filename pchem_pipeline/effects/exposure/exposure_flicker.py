@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
+from pchem_pipeline.effects.estimators.common_modes import successive
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ class ExposureFlicker(Effect):
 def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
     """Return a flicker anew in every frame, and one with a memory, where there is more than shot noise."""
     n = profile.deviation.size
-    step = np.diff(profile.deviation)[np.diff(profile.frames) == 1]
+    step = np.diff(profile.deviation)[successive(profile.frames)]
     if step.size < 8:
         return []
     # differences do not see a drift; their variance has the kurtosis of a moving average
