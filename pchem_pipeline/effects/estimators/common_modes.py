@@ -61,10 +61,10 @@ def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> N
     return np.asarray(np.where(n > 0, total / np.maximum(n, 1) ** 2, np.nan), np.float64)
 
 
-def successive(frames: NDArray[np.int64]) -> NDArray[np.bool_]:
+def successive(frames: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which frames follow the one before as closely as any here do, (n - 1,); of a period, all."""
     apart = np.diff(frames)
-    return np.asarray(apart == apart.min(initial=np.iinfo(np.int64).max))
+    return np.asarray(apart == apart.min(initial=apart.max(initial=1)))
 
 
 def line_excess(means: NDArray[Any], variance: NDArray[np.float64]) -> tuple[float, float]:
