@@ -132,7 +132,9 @@ def compare(
     if not leaves_nothing(refitter, best):
         for members in _sets(choice, tried):
             refit(_begun(members, tried))
-    chosen = _chosen(refitter, tried, [] if before is None else [before])
+    # the work that led here must not be lost for the little that is left: no limit
+    to_choose = replace(refitter, allow=lambda _: None)
+    chosen = _chosen(to_choose, tried, [] if before is None else [before])
     if chosen is None:
         return None
     known = {h.tag for h in held}

@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, _beg
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
+from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -179,6 +180,25 @@ def test_the_search_ends_where_no_effect_explains_more_beside_those_held() -> No
     assert more.chosen.tags == {"row_noise", "frame_noise"}
     better = replace(before, score=more.chosen.score + 20.0)
     assert world.compare(hypothesis("frame_noise"), held=[held], before=better) is None
+
+
+def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of three effects all pairs are asked for, to see that each has a signature of its own."""
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.comparison._MOST_SETS", 1)
+    tags = ("row_noise", "frame_noise", "exposure_drift")
+    world = World([effect(tag, 0.3) for tag in tags])
+
+    def allow(words: str) -> None:
+        if words.count("+") == 1:
+            raise EffortSpentError(words)
+
+    plain = world.refitter()
+    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
+    found = world.compare(*(hypothesis(tag, 0.3) for tag in tags))
+    assert found is not None
+    assert found.chosen.tags == set(tags)
 
 
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
