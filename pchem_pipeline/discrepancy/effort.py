@@ -19,7 +19,7 @@ _USUAL_EVALUATIONS = 15.0  # of the likelihood, in that fit with effects; more o
 #: starts, flat maxima and more electron numbers.
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
-_LEAST, _OF_NULL = 100.0, 3.0
+_LEAST, _OF_NULL = 100.0, 6.0
 #: Share of that which is kept for measuring what no effect explains.
 _KEPT = 0.25
 

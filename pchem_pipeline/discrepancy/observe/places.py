@@ -19,11 +19,12 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import MINIMUM_BLOCKS, observe
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.effects.framework.region import Region, Span, When
 from pchem_pipeline.effects.framework.registry import effect_classes
 
 #: Of a part that is looked at by itself.
 FEWEST_PIXELS, FEWEST_FRAMES = 16, 64
+_SAME = 0.8  # of two regions together, that one and the same has in common as two looks tell it
 _LEADING = 2  # statistics of a signature that are looked at
 
 
@@ -34,11 +35,13 @@ class SensorWindow:
     Attributes:
         rows, columns: first, and end.
         shape: rows and columns of the sensor.
+        known: regions of the sensor that a look at all of it found.
     """
 
     rows: tuple[int, int]
     columns: tuple[int, int]
     shape: tuple[int, int]
+    known: tuple[Region, ...] = ()
 
     @classmethod
     def whole(cls, shape: tuple[int, ...]) -> SensorWindow:
@@ -72,8 +75,21 @@ class SensorWindow:
         effect = effect.found_in(rows, columns, self.shape)
         return effect if part is None else effect.at_place(part.region, part.when)
 
+    def _known_as(self, region: Region) -> Region | None:
+        """Return the known region of the sensor of which the window shows nearly the same, if any."""
+        height, width = self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+        found = region.mask((height, width))
+        for place in self.known:
+            seen = self.mask(place)
+            if (found & seen).sum() >= _SAME * (found | seen).sum():
+                return place
+        return None
+
     def on_sensor(self, region: Region | None) -> Region | None:
-        """Return a region of the window as one of the sensor; without ends here it has none there."""
+        """Return a region of the window as one of the sensor.
+
+        Without ends here it has none there, and where it ends with the window as a known one shows it does.
+        """
         if region is None:
             return None
         y, x = self.rows[0], self.columns[0]
@@ -83,14 +99,30 @@ class SensorWindow:
             if taps.every is not None and taps.width == 1:
                 which = tuple(sorted((w + taps.first) % taps.every for w in taps.which))
                 taps = taps.model_copy(update={"first": 0, "which": which})
+        rows = tuple((a + y, b + y) for a, b in region.rows)
+        columns = tuple((a + x, b + x) for a, b in region.columns)
+        same = self._known_as(region)
         return region.model_copy(
             update={
-                "rows": tuple((a + y, b + y) for a, b in region.rows),
-                "columns": tuple((a + x, b + x) for a, b in region.columns),
+                "rows": rows if same is None else _beyond(rows, self.rows, same.rows),
+                "columns": columns if same is None else _beyond(columns, self.columns, same.columns),
                 "pixels": tuple((row + y, a + x, b + x) for row, a, b in region.pixels),
                 "taps": taps,
             }
         )
+
+
+def _beyond(found: tuple[Span, ...], window: Span, known: tuple[Span, ...]) -> tuple[Span, ...]:
+    """Return ranges of a window with the ends that they are known to have beyond it, on the sensor."""
+    if not found:  # all of the window
+        return known
+    spans = []
+    for first, last in found:
+        same = [(begin, end) for begin, end in known if begin < last and first < end]
+        low = min((begin for begin, _ in same), default=first) if first == window[0] else first
+        high = max((end for _, end in same), default=last) if last == window[1] else last
+        spans.append((min(first, low), max(last, high)))
+    return tuple(spans)
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,12 @@ def _run_frames(
         integration_time=context.integration_time or 1.0,
         model=before,
         mapper=_Mapper(context),
-        window=SensorWindow(window.rows, window.columns, (source.shape[1], source.shape[2])),
+        window=SensorWindow(
+            window.rows,
+            window.columns,
+            (source.shape[1], source.shape[2]),
+            tuple(place.region for place in seen.places.values()),
+        ),
         tell=tell,
     )
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)

@@ -34,7 +34,7 @@ def test_work_is_counted_and_refused_once_the_limit_is_reached():
         effort.check("b")
     assert effort.tried == {"row_noise"}
     # a quarter is kept for the end
-    effort.spent = null + 0.8 * 3.0 * null
+    effort.spent = null + 0.8 * 6.0 * null
     with pytest.raises(EffortSpentError):
         effort.check("c")
     effort.release()

@@ -134,6 +134,19 @@ def test_effects_are_told_on_the_sensor_and_act_in_the_window():
     np.testing.assert_array_equal(np.flatnonzero(moved.any(axis=(0, 1))), [6, 7, 8, 9])
 
 
+def test_a_region_that_ends_with_the_window_ends_where_the_whole_sensor_shows_it():
+    tap, block = Region(columns=((12, 30),)), Region(rows=((4, 30),), columns=((6, 12),))
+    window = SensorWindow((8, 24), (4, 20), (40, 32), (block, tap))
+    # the window shows columns 8 to 15 of the tap; its own end is told by the window, the other by the sensor
+    assert window.on_sensor(Region(columns=((8, 16),))) == tap
+    assert window.on_sensor(Region(columns=((9, 16),))) == Region(columns=((13, 30),))
+    assert window.on_sensor(Region(columns=((2, 8),))) == block
+    # what is elsewhere, or smaller, is not that
+    assert window.on_sensor(Region(columns=((12, 16),))) == Region(columns=((16, 20),))
+    assert window.on_sensor(Region(rows=((0, 4),))) == Region(rows=((8, 12),))
+    assert window.effects([RowNoise(row_noise_dn=1.0, region=tap)])[0].region == Region(columns=((8, 16),))
+
+
 def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     window = SensorWindow((100, 124), (40, 72), (512, 512))
     frames = camera(8, rows_of_columns, (24, 32), 1000)
