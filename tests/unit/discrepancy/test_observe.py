@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.observe.observe import (
 )
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence
+from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.pcd import pcd_mass
 
@@ -371,3 +372,20 @@ def test_pixels_that_jump_show_in_the_form_of_their_peaks(noise: float, step: fl
     assert found.z["shape.peaks.cnt"] > max(4.0, 1.4 * found.z["shape.goodness.cnt"])
     outlying = found.peaks > 3.5
     assert (jumping[outlying]).mean() > 0.8
+
+
+def test_a_coarse_step_is_not_taken_for_a_comb_of_electrons_that_are_not_there():
+    camera = PlainCamera(0.25, 0.11, 3.45, (12, 12), 6000, (0.06, 0.015, 0.045, 1.5))
+    frames = camera.frames(300)
+    evidence = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=100)
+    maps = evidence.maps
+    assert maps.usable.all()
+    assert np.abs(1 / maps.conversion_gain / 3.45 - 1).max() < 0.2
+    density = observe(
+        frames,
+        np.arange(len(frames)),
+        n_run=len(frames),
+        block_frames=100,
+        fit=FitSettings(likelihood="density"),
+    )
+    assert np.abs(1 / density.maps.conversion_gain / 3.45 - 1).max() > 0.5  # as it would be
