@@ -65,6 +65,15 @@ class Round:
         return replace(self, added=replace(self.added, hypotheses=new, stderr=stderr))
 
 
+def leaves_too_much(after: Gap, closed: float) -> bool:
+    """Tell whether so much of the gap is left that an effect which closed some of it gets no name.
+
+    What counts is what the final frames prove to be left: few of them tell the gap of a weak effect from none
+    badly.
+    """
+    return max(after.interval[0], 0.0) >= _REST_OF_NAMED * closed
+
+
 @dataclass(frozen=True)
 class AddedRounds:
     """Measures what each effect of the rounds closed of the gap.
@@ -92,9 +101,7 @@ class AddedRounds:
             still: whether the data disagree with that.
         """
         after = self._gap(last)
-        # what the final frames prove to be left: few of them tell the gap of a weak effect from none badly
-        left = max(after.interval[0], 0.0)
-        unfinished = not after.at_floor and (still or left > _REST_OF_NAMED * before.value)
+        unfinished = not after.at_floor and (still or leaves_too_much(after, before.value))
         rest = left_of(self.rounds, last, self.z, self.allowed) if unfinished and self.rounds else None
         additions: list[Addition] = []
         gap = before
@@ -113,7 +120,7 @@ class AddedRounds:
                 against = (
                     "" if rest is None else unexplained_of_its_kind(effect, parts[member], rest, this.null)
                 )
-                if rest is not None and left >= _REST_OF_NAMED * (gap.value - now.value):
+                if rest is not None and leaves_too_much(after, gap.value - now.value):
                     against = "too much of the gap is left beside it"
                 against = against or self._against(this, int(member), still)
                 later = parts[order[place + 1 :]].sum(axis=0)

@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.additions import (
     AddedRounds,
     Round,
+    leaves_too_much,
     left_of,
     unexplained_of_its_own,
 )
@@ -295,8 +296,8 @@ class FrameExplainer:
         Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
         First without the effects that were added, since one that merely mimics has no place beside it; where
         that does not close the gap, with those of them that account for what they move themselves. Noise only
-        with these: it could be any common mode that has a name. None where it closes less than half of what
-        is left.
+        with these: it could be any common mode that has a name; and without them in the end, where they leave
+        so much that none gets its name. None where it closes less than half of what is left.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -320,8 +321,13 @@ class FrameExplainer:
             self.defects,
         )
         sure = self._sure(null, z)
-        for kept in [(), sure] if sure else [()]:
-            found = unexplained.measured(kept, with_noise=kept == sure)
+        tried: list[tuple[tuple[Hypothesis, ...], bool]] = [((), not sure)]
+        if sure:
+            tried.append((sure, True))
+            if leaves_too_much(left, before.value - left.value):
+                tried.append(((), True))
+        for kept, with_noise in tried:
+            found = unexplained.measured(kept, with_noise)
             if found is None:
                 continue
             gap = self.gaps.gap(z.final, found.mean, found.vectors)
