@@ -332,11 +332,17 @@ def _draw_map(
 
 
 def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return the pixels of a map that its region holds, (y, x); None without a region."""
-    if each.region is None:
+    """Return the pixels of a map that its region holds, (y, x); None without a region.
+
+    The region may go on beyond the map.
+    """
+    region = each.region
+    if region is None:
         return None
-    ny, nx = each.z.shape
-    return each.region.mask((origin[0] + ny, origin[1] + nx))[origin[0] :, origin[1] :]
+    y, x = (slice(first, first + n) for first, n in zip(origin, each.z.shape, strict=True))
+    rows = max((y.stop, *(last for _, last in region.rows), *(row + 1 for row, _, _ in region.pixels)))
+    columns = max((x.stop, *(last for _, last in region.columns), *(last for _, _, last in region.pixels)))
+    return region.mask((rows, columns))[y, x]
 
 
 def _outline(axes: Axes, inside: NDArray[np.bool_], origin: tuple[int, int]) -> None:

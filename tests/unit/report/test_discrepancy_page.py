@@ -313,6 +313,19 @@ def test_a_map_with_a_place_comes_first_with_its_outline() -> None:
     assert place_text(moved) == f"columns {origin[1] + 3} to {origin[1] + 6}"
 
 
+def test_a_place_that_goes_on_beyond_the_part_examined_is_drawn_as_far_as_that_goes() -> None:
+    data = discrepancy_data("named")
+    _, x = data.found.examined.origin
+    # from column 3 of the part to far beyond it: an edge on the left, and above and below each column
+    place = Place.of("space.x.rr", 20.0, region={"columns": [[x + 3, x + 500]]}, region_p=1e-30)
+    placed = replace(data, found=data.found.model_copy(update={"where": (place,)}))
+    rows, columns = largest_maps(placed.arrays, regions_of(placed))[0].z.shape
+    figure = next(each for each in discrepancy_figures(placed) if each.name == "discrepancy_maps")
+    outlines = [a for axes in figure.draw(Look(180.0)).axes for a in axes.collections]
+    edges = [len(lines.get_segments()) for lines in outlines if isinstance(lines, LineCollection)]
+    assert 2 * rows + 2 * (columns - 3) in edges
+
+
 def test_the_largest_maps_are_those_with_structure() -> None:
     words = [each.title for each in largest_maps(discrepancy_data().arrays)]
     assert words[0].startswith("goodness of fit")
