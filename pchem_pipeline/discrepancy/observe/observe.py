@@ -47,6 +47,7 @@ MINIMUM_BLOCKS = 4
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
 #: with an unambiguous sample would bias the statistics of the rest.
 UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
+_OTHER_COMB = 0.2  # difference of the logarithms of two conversion gains
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 
 
@@ -246,7 +247,7 @@ def _fitted(
     """Return the fit, its parameters (n, 4), and which pixels can be used.
 
     Where a DN is coarse the density at whole DN may be largest at a comb of electrons that are not there:
-    such pixels are fitted again with rounding counted.
+    such pixels are fitted again with rounding counted, and take that fit where its gain is another one.
     """
     start = None if near is None else near.columns
     under, over = outside.T.astype(np.int64)
@@ -264,8 +265,9 @@ def _fitted(
             settings=settings.model_copy(update={"likelihood": "exact"}),
             start=None if start is None else start[some],
         )
-        result = result.with_pixels(some, again)
-        found &= (result.fit_status & UNTRUSTWORTHY) == 0
+        other = np.abs(np.log(again.conversion_gain / result.conversion_gain[some])) > _OTHER_COMB
+        better = other & ((again.fit_status & UNTRUSTWORTHY) == 0)
+        result = result.with_pixels(some[better], again.of(better))
     parameters = result.columns
     usable = found & np.isfinite(parameters).all(axis=1)
     return result, parameters, usable & _inside(counts, outside)
