@@ -315,7 +315,10 @@ def _all_seen(refitter: Refitter, one: Refitted, known: dict[frozenset[str], Ref
         if others is None and is_dear(h.effect for h in one.hypotheses):
             return False
         if others is None:
-            others = refitter.refined([h for h in one.hypotheses if h.tag != hypothesis.tag], one.score)
+            try:
+                others = refitter.refined([h for h in one.hypotheses if h.tag != hypothesis.tag], one.score)
+            except NotFittedError:
+                return False
             known[tags] = others
         part = one.hypotheses[place].fingerprint
         if not own_signature(part, others.parts, others.rest, noise):

@@ -44,6 +44,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.maps import (
     MANY_MISTAKEN,
+    NotFittedError,
     Refit,
     Sensor,
     expected_codes,
@@ -281,7 +282,10 @@ class FrameExplainer:
                 return self._put(found, added, explanation.hypotheses, null)
             if not kept or {h.tag for h in kept} <= {h.tag for h in held}:
                 break
-            added = refitter.sharpened(refitter.refined(kept), self.settings.extended_replicates)
+            try:
+                added = refitter.sharpened(refitter.refined(kept), self.settings.extended_replicates)
+            except NotFittedError:
+                break
         return None
 
     def _widens(self, added: Refitted, null: NullModel, z: Measured) -> bool:
@@ -534,14 +538,11 @@ class FrameExplainer:
         # within a standard error the steps end, too
         near = np.abs(added.change) < np.maximum(_NEAR, added.stderr)
         change = np.where(near, np.expm1(added.change), 0.0)
-        corrected = tuple(
-            Hypothesis(h.rescaled(1.0 + float(c)), h.fingerprint * (1.0 + c))
-            for h, c in zip(added.hypotheses, change, strict=True)
-        )
-        tags = {h.tag for h in corrected}
-        present = tuple(e for e in self.model if e.tag not in tags)
-        self.model = (*present, *(h.effect for h in corrected))
-        self.fit, self.sensor = self._mapped(self.model)
+        try:
+            corrected = self._take(added, change)
+        except NotFittedError:  # a step too far
+            change = np.zeros_like(change)
+            corrected = self._take(added, change)
         self.held = added
         extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
         extended = extended.shifted(np.sum(added.slopes * change[:, None], axis=0))
@@ -557,6 +558,18 @@ class FrameExplainer:
         )
         self.rounds.append(Round(found, fit, hypotheses, null, extended, self.fit.moved))
         return extended
+
+    def _take(self, added: Refitted, change: FloatArray) -> tuple[Hypothesis, ...]:
+        """Take a set into the model, its factors changed by shares; fit the pixels with it, and return it."""
+        taken = tuple(
+            Hypothesis(h.rescaled(1.0 + float(c)), h.fingerprint * (1.0 + c))
+            for h, c in zip(added.hypotheses, change, strict=True)
+        )
+        tags = {h.tag for h in taken}
+        model = (*(e for e in self.model if e.tag not in tags), *(h.effect for h in taken))
+        self.fit, self.sensor = self._mapped(model)
+        self.model = model
+        return taken
 
 
 def _certain(added: Refitted, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:

@@ -211,7 +211,10 @@ class Refitter:
             kept = self._kept(hypotheses)
             change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], noise.among(kept))
             hypotheses = _moved(hypotheses, np.log1p(np.maximum(change, -_LARGEST_SHARE))) or hypotheses
-        return self._simulated(hypotheses, one, replicates, slopes)
+        try:
+            return self._simulated(hypotheses, one, replicates, slopes)
+        except NotFittedError:  # a step too far
+            return self._simulated(one.hypotheses, one, replicates)
 
     def _slopes(self, one: Refitted) -> FloatArray | None:
         """Return the slopes of an effect alone that is strong, from a step beside it; None of all others.
@@ -226,7 +229,10 @@ class Refitter:
         if abs(step[0]) < _SMALLEST_SECANT:
             return None
         self.allow(" + ".join(sorted(one.tags)))
-        _, vectors = self.draw(tuple(h.effect for h in moved), len(one.vectors))
+        try:
+            _, vectors = self.draw(tuple(h.effect for h in moved), len(one.vectors))
+        except NotFittedError:
+            return None
         apart = (vectors - one.vectors) / step[0]
         error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
         # a shift in proportion to the factor has this slope between the two

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulat
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, _begun, compare, own_signature
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
+from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
@@ -72,11 +73,14 @@ class World:
     def __init__(self, truth: Sequence[Effect], seed: int = 1) -> None:
         self.rng = np.random.default_rng(seed)
         self.drawn = 0
+        self.unfit: Callable[[Sequence[Effect]], bool] = lambda _: False
         self.null = NullModel.from_replicates(NAMES, self.rng.standard_normal((40, M)))
         mean = statistics(truth)
         self.z = Measured(*(mean + self.rng.standard_normal(M) for _ in range(3)))
 
     def draw(self, effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+        if self.unfit(effects):
+            raise NotFittedError("hardly a pixel can be fitted with it")
         self.drawn += count
         vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
         return SimpleNamespace(moved={}), vectors
@@ -314,13 +318,19 @@ def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() 
     assert not own_signature(own, np.eye(M)[1:2] * 40.0, left, noise)
 
 
-def add(world: World, monkeypatch: pytest.MonkeyPatch, *hypotheses: Hypothesis, final: Any = None) -> Any:
+def add(
+    world: World,
+    monkeypatch: pytest.MonkeyPatch,
+    *hypotheses: Hypothesis,
+    final: Any = None,
+    mapped: Callable[[tuple[Effect, ...]], Any] = lambda _: (SimpleNamespace(moved={}), "maps"),
+) -> Any:
     """Return a search to which a round was added, and the null that it came to."""
     search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
     search.first, search.gaps = world.null, StatisticsGap(world.null, 100_000)
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
     monkeypatch.setattr(search, "_refitter", lambda *_: world.refitter())
-    monkeypatch.setattr(search, "_mapped", lambda *_: (SimpleNamespace(moved={}), "maps"))
+    monkeypatch.setattr(search, "_mapped", mapped)
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
@@ -393,6 +403,47 @@ def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands
         [rival] = [rival for rival in each.rivals if rival.effect == "exposure_drift"]
         # nothing of it is in the data: in either place it closes nothing
         assert abs(each.before.value - rival.gap_after) < 0.1 * closed
+
+
+def test_strengths_that_no_pixel_can_be_fitted_with_end_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial step, the best correction and a part of a set may all be such."""
+    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0, 1.0))
+    world = World([effect("row_noise", 0.1)])
+    guess = Hypothesis(effect("row_noise", 0.098), statistics([effect("row_noise", 0.098)]))
+    refitter = world.refitter()
+    near = refitter.refined([guess])
+    world.unfit = lambda effects: effects != near.effects
+    assert refitter._slopes(near) is None
+    assert refitter.sharpened(near, 24).effects == near.effects
+    world.unfit = lambda effects: False
+    assert refitter.sharpened(near, 24).effects != near.effects
+
+
+def test_a_set_of_which_a_part_cannot_be_fitted_is_not_chosen_and_the_others_are() -> None:
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
+    pair = hypothesis("row_noise"), hypothesis("frame_noise")
+    world.unfit = lambda effects: [e.tag for e in effects] == ["frame_noise"]
+    found = world.compare(*pair)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise"}
+
+
+def test_a_correction_that_no_pixel_can_be_fitted_with_is_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World([effect("row_noise", 0.5)])
+    search, _ = add(world, monkeypatch, hypothesis("row_noise"))
+    [corrected] = search.model
+    added = search.held
+
+    def mapped(model: tuple[Effect, ...]) -> Any:
+        if model == (corrected,):
+            raise NotFittedError("hardly a pixel can be fitted with it")
+        return SimpleNamespace(moved={}), "maps"
+
+    search, extended = add(
+        World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"), mapped=mapped
+    )
+    assert search.model == added.effects != (corrected,)
+    assert np.allclose(extended.mean, added.mean)
 
 
 def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_the_model(
