@@ -290,6 +290,8 @@ def _pixel_map(name: str, evidence: Evidence) -> NDArray[np.floating] | None:
         if parts[1] == "lag1":
             lag = time.lag_charge if parts[2] == "charge" else time.lag_readout
             return np.asarray(lag[0] * np.sqrt(time.n_pairs))
+        if parts[1] == "cross":
+            return np.asarray(time.lag_readout_charge * np.sqrt(time.n_pairs))
         blocks, std = (
             (time.block_charge, evidence.charge_std)
             if parts[2] == "charge"

@@ -181,7 +181,7 @@ class InterpixelCapacitance(Hidden):
 
 
 class AnalogMemory(Hidden):
-    """A part of the signal of the frame before remains; strength: that part."""
+    """A part of the signal of the frame before remains; strength: that part, the mean over the pixels."""
 
     tag: ClassVar[str] = "analog_memory"
     s95: ClassVar[float] = 0.0006
@@ -190,10 +190,14 @@ class AnalogMemory(Hidden):
 
     def draw(self):
         self.before = np.zeros(self.sensor.shape)
+        self.memory = np.full(self.sensor.shape, self.strength)
+        if self.pick("pixels", "alike", "different", p=(0.7, 0.3)) == "different":
+            s = self.between("spread", 0.3, 1.0)
+            self.memory *= self.rng.lognormal(-(s**2) / 2, s, self.sensor.shape)
 
     def signal(self, t, v):
         before, self.before = self.before, v
-        return v + self.strength * before
+        return v + self.memory * before
 
 
 class GainDrift(Hidden):

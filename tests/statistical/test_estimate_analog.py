@@ -67,6 +67,16 @@ def test_the_strength_is_found(effect, relative):
     assert getattr(first, effect.strength) == pytest.approx(truth, rel=relative)
 
 
+@pytest.mark.parametrize("memory", [0.006, 0.05])
+def test_a_memory_that_differs_is_told_from_one_alike(memory):
+    alike, differs = AnalogMemory.estimate(evidence_of(AnalogMemory(memory=memory, spread=0.8)))
+    assert alike.spread == 0.0
+    # of 784 lognormal numbers, with what chance adds to each
+    assert differs.spread == pytest.approx(0.8, abs=0.12)
+    assert differs.memory == pytest.approx(memory, rel=0.15)
+    assert len(AnalogMemory.estimate(evidence_of(AnalogMemory(memory=memory)))) == 1
+
+
 def test_a_linear_growth_is_among_the_guesses():
     effect = SignalDependentNoise(noise_e=0.05, growth="linear")
     found = {guess.growth: guess for guess in SignalDependentNoise.estimate(evidence_of(effect))}

@@ -83,6 +83,11 @@ def _time() -> list[Statistic]:
     )
     found += [
         Statistic("time.cross.readout_charge", "cross", "residuals follow the charge of the frame before"),
+        Statistic(
+            "time.cross.readout_charge.chi",
+            "cross",
+            "residuals follow the charge of the frame before, differently by pixel",
+        ),
         Statistic("time.cross.charge_readout", "cross", "charge follows the residual of the frame before"),
     ]
     found += _of_channels("time.block.{}.chi", "block means of the {} wander, each pixel by itself")

@@ -223,14 +223,20 @@ def time_statistics(view: FrameView, lags: FloatArray) -> dict[str, float]:
             z = lags[3 * channel + lag - 1][usable] * np.sqrt(view.sums.n_pairs[lag - 1])
             found[f"time.lag{lag}.{name}.mean"] = float(z.sum() / np.sqrt(n_pixels))
             if lag == 1:
-                found[f"time.lag1.{name}.chi"] = float((z @ z - n_pixels) / np.sqrt(2.0 * n_pixels))
+                found[f"time.lag1.{name}.chi"] = _unlike(z)
                 found[f"time.lag1.{name}.cnt"] = outliers(z, two_sided=True)
         found |= _block_statistics(view, channel, name)
     if view.sums.n_pairs[0]:
         root = np.sqrt(view.sums.n_pairs[0] / n_pixels)
         found["time.cross.readout_charge"] = float(lags[6].sum() * root)
+        found["time.cross.readout_charge.chi"] = _unlike(lags[6][usable] * root * np.sqrt(n_pixels))
         found["time.cross.charge_readout"] = float(lags[7].sum() * root)
     return found
+
+
+def _unlike(z: FloatArray) -> float:
+    """Return by how many standard deviations the squares of standard normal deviates exceed their number."""
+    return float((z @ z - z.size) / np.sqrt(2.0 * z.size))
 
 
 def _block_statistics(view: FrameView, channel: int, name: str) -> dict[str, float]:

@@ -267,6 +267,26 @@ def test_memory_is_of_the_frame_before():
     assert effect.history() == 1
 
 
+def test_memory_may_differ_from_pixel_to_pixel():
+    effect = AnalogMemory(memory=0.1, spread=0.5)
+    after, before, _, _ = analog(effect, (8, 60, 60), charge=np.full((8, 60, 60), 3))
+    memory = (after[1:] - before[1:]) / 3
+    np.testing.assert_allclose(
+        memory, np.broadcast_to(memory[0], memory.shape), atol=1e-12
+    )  # always the same
+    logs = np.log(memory[0] / 0.1)
+    within(logs.mean(), -(0.5**2) / 2, 0.5 / 60)
+    within(logs.std(), 0.5, 0.5 / 60 / np.sqrt(2))
+
+
+def test_memory_levels_off():
+    after, before, _, _ = analog(
+        AnalogMemory(memory=0.1, saturation_e=5.0), (6, 1, 1), charge=np.arange(6)[:, None, None] ** 3
+    )
+    left = (after - before)[1:, 0, 0]
+    np.testing.assert_allclose(left, 0.5 * (1 - np.exp(-(np.arange(5) ** 3) / 5)), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("effect", "profile"),
     [
@@ -412,6 +432,7 @@ CODES = np.arange(60, 240)
     "effect",
     [
         AnalogMemory(memory=0.05),
+        AnalogMemory(memory=0.2, saturation_e=1.5),
         FlickerNoise(share=0.5, correlation_frames=1.0),
         HeavyTailedNoise(share=0.05, factor=3.0),
         NoiseSkew(share=0.5),
