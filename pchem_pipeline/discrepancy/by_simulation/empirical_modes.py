@@ -79,7 +79,7 @@ def common_scores(
     flat = frames.reshape(len(frames), -1)
     first = flat.min(axis=0)[pixels].astype(np.int64)
     length = int((flat.max(axis=0)[pixels] - first).max()) + 1
-    for changed, table in zip(_CHANGED, _score_tables(maps, pixels, first, length), strict=True):
+    for changed, table in zip(_CHANGED, score_tables(maps, pixels, first, length), strict=False):
         gathered: list[tuple[FloatArray, ...]] = []
         mean, square = np.zeros(inside.shape), np.zeros(inside.shape)
         for begin in range(0, len(flat), _CHUNK):
@@ -108,19 +108,23 @@ def _in_blocks(values: FloatArray) -> FloatArray:
     return values
 
 
-def _score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
-    """Return the scores of codes for an offset (1/DN), a relative gain and a relative light, (3, n, c)."""
+def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
+    """Return the scores of codes for changes of their law, shape (4, n, c).
+
+    Of an offset (1/DN), a relative gain, a relative light, and a in the variance ``H + a H^2`` of electrons.
+    """
     exposure, gain, bias, sigma = (values.ravel()[pixels][:, None] for values in maps.maps)
     most = int(np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0))
     signal = first[:, None] + np.arange(length) - bias
-    total, sums = np.zeros(signal.shape), np.zeros((3, *signal.shape))
+    total, sums = np.zeros(signal.shape), np.zeros((4, *signal.shape))
     chance = np.exp(-exposure)
     for k in range(most + 1):
         chance = chance * exposure / k if k else chance
         rest = (signal - k / gain) / sigma**2
         weight = chance * np.exp(-0.5 * np.minimum((signal - k / gain) ** 2 / sigma**2, 200.0))
         total += weight
-        for one, score in zip(sums, (rest, rest * k / gain, k - exposure), strict=True):
+        scores = rest, rest * k / gain, k - exposure, 0.5 * ((k - exposure) ** 2 - k)
+        for one, score in zip(sums, scores, strict=True):
             one += weight * score
     return np.asarray(sums / np.maximum(total, np.finfo(np.float64).tiny))
 

@@ -14,6 +14,11 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.comparison import leaves_nothing
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, measured_moves
+from pchem_pipeline.discrepancy.by_simulation.empirical_electrons import (
+    Electrons,
+    electron_chances,
+    measured_electrons,
+)
 from pchem_pipeline.discrepancy.by_simulation.empirical_modes import Sums, common_scores, measured_mode
 from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
     Covariances,
@@ -33,7 +38,8 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 #: Measures a part of the frames, the pixels fitted with some effects, beside some of these.
-Measure = Callable[[Part, tuple[Effect, ...], tuple[Effect, ...]], Measurement | None]
+Model = tuple[Effect, ...]
+Measure = Callable[[Part, Model, Model], Measurement | None]
 
 _CONVINCING = 6.0  # nats that a form must add
 _MOST_TRIED = 3  # of all forms and parts
@@ -41,10 +47,14 @@ _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
 
 class _Shared(NamedTuple):
-    """How samples vary together: products of their residuals, and sums of their scores."""
+    """How samples vary together: products of their residuals, sums of their scores, chances of electrons."""
 
     covariances: Covariances
     scores: dict[tuple[Shared, Changed], Sums]
+    electrons: Electrons
+
+
+SharedBy = Callable[[Part], _Shared]
 
 
 @dataclass
@@ -81,7 +91,9 @@ class Unexplained:
         forms: dict[str, Measure] = {"empirical": self._moves}
         if with_noise:
             data = self._shared(self.frames.stack[self.frames.seen], self.plain.maps)
-            forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, {})
+            known: dict[str, Callable[[Part], _Shared]] = {}
+            forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, known)
+            forms["empirical_electrons"] = functools.partial(self._electrons, data, known)
         # one that the model has already is not replaced
         forms = {tag: form for tag, form in forms.items() if tag not in {e.tag for e in refitter.present}}
         found: Refitted | None = None
@@ -162,22 +174,27 @@ class Unexplained:
         return measured_moves(self.frames.stack[self.frames.seen[some]], numbers[some], own, beside)
 
     def _noise_of_samples(
-        self,
-        data: Callable[[Part], _Shared],
-        known: dict[str, Callable[[Part], _Shared]],
-        part: Part,
-        _: tuple[Effect, ...],
-        beside: tuple[Effect, ...],
+        self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
     ) -> Measurement | None:
         """Measure what samples of a part share beyond what effects make of them: gain or light, or noise."""
-        key = "|".join(e.model_dump_json() for e in beside)
-        if key not in known:
-            known[key] = self._shared(*self._simulated(beside))
-        (covariances, scores), model = data(part), known[key](part)
+        own, model = data(part), self._made(known, beside)(part)
         inside = self.frames.inside(part)
-        return measured_mode(scores, model.scores, self.plain.maps, inside) or measured_noise(
-            covariances, model.covariances, self.plain, inside
+        return measured_mode(own.scores, model.scores, self.plain.maps, inside) or measured_noise(
+            own.covariances, model.covariances, self.plain, inside
         )
+
+    def _electrons(
+        self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
+    ) -> Measurement | None:
+        """Measure what electrons of a part do to each other beyond what effects make of them."""
+        return measured_electrons(data(part).electrons, self._made(known, beside)(part).electrons)
+
+    def _made(self, known: dict[str, SharedBy], model: Model) -> SharedBy:
+        """Return the same of frames simulated with a model; ``known`` are those of other models."""
+        key = "|".join(e.model_dump_json() for e in model)
+        if key not in known:
+            known[key] = self._shared(*self._simulated(model))
+        return known[key]
 
     def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
         """Simulate the frames that are seen under a model, and fit their pixels."""
@@ -198,6 +215,7 @@ class Unexplained:
             if self.frames.window is not None:
                 # the shape of a line beyond the window is not known
                 found = found._replace(lines={})
-            return _Shared(found, common_scores(frames[some], maps, inside))
+            electrons = electron_chances(frames[some], numbers[some], maps, self.plain, inside)
+            return _Shared(found, common_scores(frames[some], maps, inside), electrons)
 
         return of

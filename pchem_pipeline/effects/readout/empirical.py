@@ -169,7 +169,7 @@ class Empirical(Effect):
                     continue
                 other = None
                 if move.towards is not None:
-                    other, known = _neighbours(before if move.towards[0] else own, move.towards)
+                    other, known = neighbours(before if move.towards[0] else own, move.towards)
                     here = here & known
                 found = np.where(here, move.of(own, other), found)
         return found.clip(0, 2**context.bit_depth - 1).astype(values.dtype)
@@ -213,7 +213,7 @@ class Empirical(Effect):
         return f"a share of {self.share:.2g} of the {what}{place} {how}"
 
 
-def _neighbours(
+def neighbours(
     values: NDArray[np.int64], place: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the samples at a place beside those of frames (frame, y, x), and where there are any."""

@@ -1,0 +1,186 @@
+"""The empirical component: what electrons do to each other, by how their numbers vary, alone and together.
+
+The excess of the variance over Poisson is measured by the score of the second Charlier polynomial (Rao 1948),
+and how numbers go together by the products of the expected electrons of samples beside each other and of
+successive frames. Both are divided by what one event for each electron, or for each of its pairs, would make.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
+from pchem_pipeline.discrepancy.by_simulation.empirical_modes import score_tables
+from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
+from pchem_pipeline.effects.estimators.count_scores import charlier_information
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Place = tuple[int, int, int]
+
+_PLACES: tuple[Place, ...] = ((1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1), (0, 1, 0))
+_OWN: Place = (0, 0, 0)
+_NEXT: Place = (1, 0, 0)
+_CLEAR = 5.0  # standard errors of a chance
+_FEWEST = 1000  # products
+_ALIKE = 2.0  # factor within which the chances are that electrons go, and that they come elsewhere
+_MOST = 0.5  # of a chance
+
+
+class Chance(NamedTuple):
+    """Events for each electron, or for each of its pairs, and the standard error."""
+
+    value: float
+    error: float
+
+    def less(self, other: Chance) -> Chance:
+        """Return what is left beyond another one."""
+        return Chance(self.value - other.value, float(np.hypot(self.error, other.error)))
+
+    @property
+    def clear(self) -> float:
+        """The value in standard errors."""
+        return self.value / self.error if np.isfinite(self.error) else 0.0
+
+
+#: By what chances are measured: for each electron, and for each of its pairs.
+Chances = tuple[Chance, Chance]
+_NOTHING: Chances = (Chance(0.0, np.inf), Chance(0.0, np.inf))
+
+
+class Electrons(NamedTuple):
+    """How electron numbers vary and go together.
+
+    Attributes:
+        excess: of the variance over Poisson, as further electrons of the same sample.
+        together: how numbers at a place go with those of the sample, as further electrons there.
+    """
+
+    excess: Chances
+    together: dict[Place, Chances]
+
+
+def electron_chances(
+    frames: NDArray[np.unsignedinteger],
+    numbers: IntArray,
+    maps: PixelMaps,
+    evidence: Evidence,
+    inside: BoolArray,
+) -> Electrons:
+    """Measure how electron numbers vary and go together.
+
+    Args:
+        frames: (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, shape (frame,).
+        maps: plain fit of these frames.
+        evidence: of the frames of the data, which says how well their electrons are told.
+        inside: pixels that are looked at, shape (y, x).
+    """
+    inside = inside & maps.usable & evidence.maps.usable & (maps.quanta_exposure > 0)
+    if not inside.any():
+        return Electrons(_NOTHING, {})
+    u = np.concatenate([chunk for (chunk,) in Samples.of(frames, maps).without(~inside).chunks((0,))])
+    # what a whole frame shares is another thing
+    u -= np.where(inside, u.sum(axis=(1, 2), keepdims=True) / inside.sum(), 0.0)
+    exposure = np.where(inside, maps.quanta_exposure, 1.0)
+    spread = np.where(inside, evidence.charge_std, 0.0)
+    together = {place: _together(u, numbers, exposure, spread, place) for place in _PLACES}
+    return Electrons(_excess(frames, maps, inside), together)
+
+
+def _together(
+    u: NDArray[np.float32], numbers: IntArray, exposure: FloatArray, spread: FloatArray, place: Place
+) -> Chances:
+    """Return how electrons go with those at a place, per electron and per pair of them.
+
+    Args:
+        u: expected electrons beyond the mean, in their standard deviation, (frame, y, x), 0 where not known.
+        numbers: of the frames in the run, shape (frame,).
+        exposure: H, e-, shape (y, x).
+        spread: standard deviation of the expected electrons, 0 where not known, e-, shape (y, x).
+        place: frames later, rows and columns.
+    """
+    later = np.searchsorted(numbers, numbers + place[0]).clip(max=numbers.size - 1)
+    first = np.flatnonzero(numbers[later] == numbers + place[0])
+    ny, nx = exposure.shape
+    here = slice(0, ny - place[1]), slice(0, nx - place[2])
+    there = slice(place[1], ny), slice(place[2], nx)
+    one, two = u[(slice(None), *here)], u[(slice(None), *there)]
+    products = sum(np.einsum("yx,yx->yx", one[a], two[b]) for a, b in zip(first, later[first], strict=True))
+    # what one further electron there, for each that is here, does to that product
+    for_each = spread[here] * spread[there] / exposure[there]
+    known = for_each > 0.0
+    if first.size * np.count_nonzero(known) < _FEWEST:
+        return _NOTHING
+    sums, for_each = np.asarray(products)[known], for_each[known]
+    return _chance(sums, first.size, for_each), _chance(sums, first.size, for_each * exposure[here][known])
+
+
+def _excess(frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolArray) -> Chances:
+    """Return the excess of the variance over Poisson, per electron and per pair of them."""
+    pixels = np.flatnonzero(inside.ravel())
+    own = frames.reshape(len(frames), -1)[:, pixels]
+    first = own.min(axis=0).astype(np.int64)
+    length = int((own.max(axis=0) - first).max()) + 1
+    table = score_tables(maps, pixels, first, length)[3]
+    score = table[np.arange(pixels.size), own - first].sum(axis=0)
+    exposure, gain, _, sigma = (values.ravel()[pixels] for values in maps.maps)
+    number = len(frames) * charlier_information(exposure, gain * sigma)
+    # of further electrons Var K = H + 2 c H, of pairs H + 2 c H^2
+    return _chance(score, number, 2.0 / exposure), _chance(score, number, np.full(exposure.size, 2.0))
+
+
+def _chance(sums: FloatArray, variance: FloatArray | float, response: FloatArray) -> Chance:
+    """Return the chance c of sums of mean ``c response variance`` by least squares."""
+    weight = float(np.sum(variance * response**2))
+    if weight <= 0.0:
+        return Chance(0.0, np.inf)
+    return Chance(float(response @ sums) / weight, weight**-0.5)
+
+
+def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
+    """Return what electrons do beyond what a model makes; None where nothing is clear.
+
+    Args:
+        data: chances of the frames.
+        model: of frames simulated with it.
+    """
+    more, of_pairs = _beyond(data.excess, model.excess)
+    found: list[tuple[Fate, Place, float]] = []
+    if more.clear > _CLEAR:
+        found.append(("followed", _OWN, more.value))
+    fate: Fate = "lost"
+    where, lost = _OWN, -of_pairs.value if of_pairs.clear < -_CLEAR else 0.0
+    gain, chain = (0.5 * max(abs(more.clear), abs(of_pairs.clear)) ** 2 if found or lost else 0.0), 0.0
+    for place, chances in data.together.items():
+        each, arriving = _beyond(chances, model.together.get(place, _NOTHING))
+        # those that came to the next frame have brought others themselves
+        each = each._replace(value=each.value - (chain ** place[0] if place[0] > 1 else 0.0))
+        if each.clear < _CLEAR:
+            continue
+        gain += 0.5 * each.clear**2
+        if fate == "lost" and lost < _ALIKE * arriving.value < _ALIKE**2 * lost:
+            fate, where = "moved", place
+        else:
+            found.append(("followed", place, each.value))
+            chain = each.value if place == _NEXT else chain
+    if lost:
+        found.append((fate, where, lost))
+    if not found:
+        return None
+    chance = max(value for _, _, value in found)
+    modes = tuple(
+        ElectronMode(fate=fate, place=place, weight=round(value / chance, 4)) for fate, place, value in found
+    )
+    return Measurement(EmpiricalElectrons(chance=min(chance, _MOST), modes=modes), gain)
+
+
+def _beyond(data: Chances, model: Chances) -> Chances:
+    """Return what is left of chances beyond those that a model makes."""
+    return data[0].less(model[0]), data[1].less(model[1])

@@ -1,0 +1,146 @@
+"""What is measured and not understood of electrons: lost, moved or followed by others, as many as are there.
+
+To first order in its strength, whatever electrons do to each other shows in two things only: how far their
+number varies more or less than Poisson, and how numbers of neighbours and of successive frames go together
+(Cox and Isham 1980, Point processes, on factorial cumulants). The simplest events that make both describe the
+samples; nothing is said about why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.estimators.electrons import binomial_upper
+from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.readout.empirical import neighbour_words, neighbours
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence
+
+#: What happens to electrons: some that have others in their sample are lost or moved, or each brings others.
+Fate = Literal["lost", "moved", "followed"]
+_DEPTH = 4  # frames through which electrons that follow others are followed themselves
+
+
+class ElectronMode(Section):
+    """Something that happens to electrons, in proportion to their number or to that of their pairs.
+
+    Lost, moved: each electron with a chance for every other one in its sample. Followed: each brings a
+    Poisson number of others, and those that come to a later frame bring others themselves.
+    """
+
+    fate: Fate = Field(description="lost, moved (to the place), or followed (by others, at the place)")
+    weight: float = Field(default=1.0, gt=0, description="relative frequency, no unit")
+    place: tuple[int, int, int] = Field(
+        default=(0, 0, 0), description="where: frames later, rows and columns from the electron's pixel"
+    )
+
+    @model_validator(mode="after")
+    def _of_the_future(self) -> Self:
+        if self.place[0] < 0 or (self.fate == "moved") > any(self.place):
+            raise ValueError("place: of this frame or a later one; electrons are moved to another sample")
+        return self
+
+    def words(self, chance: float) -> str:
+        """Return in words what happens with a chance (or a mean number)."""
+        where = f"to {neighbour_words(self.place)}" if any(self.place) else "to its own sample"
+        if self.fate == "followed":
+            return f"each brings {chance:.2g} others on average {where}"
+        end = "is lost" if self.fate == "lost" else f"goes {where}"
+        return f"each {end} with a chance of {chance:.2g} for every other one in its sample"
+
+
+@register_effect
+class EmpiricalElectrons(Effect):
+    """Electrons that are lost, moved or followed by others, with chances that are measured.
+
+    Signature: none of its own; it is measured where the data disagree with all that is known, and describes
+    the law of the electron numbers without a name for what makes it so.
+    """
+
+    tag: Literal["empirical_electrons"] = Field(
+        default="empirical_electrons", description="name of the effect"
+    )
+    plane: ClassVar[Plane] = Plane.CHARGE
+    title: ClassVar[str] = "Measured law of electron numbers, without an explanation"
+    source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
+    strength: ClassVar[str] = "chance"
+    measured_only: ClassVar[bool] = True
+    chance: float = Field(
+        ge=0, le=0.5, description="largest chance or mean number, that of weight 1, no unit"
+    )
+    modes: tuple[ElectronMode, ...] = Field(
+        min_length=1, max_length=8, description="what happens: its `fate`, `place` and relative `weight`"
+    )
+
+    def halo(self) -> int:
+        """Return how far electrons come across rows, px."""
+        return max(abs(mode.place[1]) for mode in self.modes) * (_DEPTH if self.history() else 1)
+
+    def history(self) -> int:
+        """Return how many frames before it matter."""
+        return _DEPTH * max(mode.place[0] for mode in self.modes)
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return electron numbers (frame, y, x), e-, without those that go and with those that come."""
+        own = values.astype(np.int64)
+        largest = max(mode.weight for mode in self.modes)
+        chance = {number: self.chance * mode.weight / largest for number, mode in enumerate(self.modes)}
+        for number, mode in enumerate(self.modes):
+            if mode.fate != "followed":
+                u = context.random.uniform(("frame", "y", "x"), number)
+                gone = _gone(own, u, chance[number])
+                own = own - gone + (_arrived(gone, mode.place) if mode.fate == "moved" else 0)
+        followed = [n for n, mode in enumerate(self.modes) if mode.fate == "followed"]
+        found = own
+        for _ in range(_DEPTH if self.history() else 1):
+            before, found = found, own
+            for number in followed:
+                place = self.modes[number].place
+                source = _arrived(before if place[0] else own, place)
+                mean = np.asarray(chance[number] * source, np.float64)
+                found = np.asarray(found + context.random.poisson(mean, number))
+        return found.astype(values.dtype)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return electrons of which each hundredth brings another one to the next frame."""
+        return (cls(chance=0.01, modes=(ElectronMode(fate="followed", place=(1, 0, 0)),)),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return none: it is measured where all else has failed, and competes with nothing."""
+        return ()
+
+    def words(self) -> str:
+        """Return what is known of it."""
+        place = f" in {place_words(self)}" if place_words(self) else ""
+        largest = max(mode.weight for mode in self.modes)
+        told = [mode.words(self.chance * mode.weight / largest) for mode in self.modes]
+        return f"electrons{place} that do not come by themselves ({'; '.join(told)})"
+
+
+def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -> NDArray[np.int64]:
+    """Return how many electrons of each sample go, each with a chance for every other one."""
+    gone = np.zeros(electrons.shape, np.int64)
+    here = np.nonzero(electrons > 1)
+    k = electrons[here]
+    gone[here] = binomial_upper(u[here], k, np.minimum(chance * (k - 1), 0.99))
+    return gone
+
+
+def _arrived(electrons: NDArray[np.int64], place: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Return how many electrons come from the samples of which each is at a place, 0 from beyond the edge."""
+    if not any(place):
+        return electrons
+    source, known = neighbours(electrons, (-place[0], -place[1], -place[2]))
+    return np.where(known, source, 0)

@@ -1,0 +1,161 @@
+"""What electrons do to each other is measured in frames made by plain numpy, and simulated as it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.empirical_electrons import electron_chances, measured_electrons
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+
+SHAPE, FRAMES, STEP, NOISE = (16, 16), 2000, 14.0, 0.25
+EVERYWHERE = np.ones(SHAPE, bool)
+RNG = np.random.default_rng(20)
+EXPOSURE = np.exp(RNG.normal(0.6, 0.25, SHAPE))
+Fate = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def nothing(k: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return electrons as they come."""
+    return k
+
+
+def followed(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return electrons each of which brings 0.05 others to the next frame."""
+    for t in range(1, len(k)):
+        k[t] += rng.poisson(0.05 * k[t - 1])
+    return k
+
+
+def lost(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return electrons each of which is lost with a chance of 0.03 for every other one."""
+    return k - rng.binomial(k, 0.03 * np.maximum(k - 1, 0))
+
+
+def moved(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return electrons each of which goes one column to the right with a chance of 0.04 for every other."""
+    gone = rng.binomial(k, 0.04 * np.maximum(k - 1, 0))
+    found = k - gone
+    found[:, :, 1:] += gone[:, :, :-1]
+    return found
+
+
+def codes(electrons: np.ndarray, seed: int) -> np.ndarray:
+    """Return the digital numbers of electrons."""
+    noise = NOISE * np.random.default_rng(seed).standard_normal(electrons.shape)
+    return np.floor(100.0 + STEP * (electrons + noise) + 0.5).astype(np.uint16)
+
+
+def chances(frames: np.ndarray, inside: np.ndarray = EVERYWHERE) -> Any:
+    """Return what is measured of frames."""
+    evidence = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=100)
+    return electron_chances(frames, np.arange(len(frames)), evidence.maps, evidence, inside)
+
+
+def drawn(fate: Fate, seed: int) -> np.ndarray:
+    """Return frames in which something happens to electrons."""
+    rng = np.random.default_rng(seed)
+    return codes(fate(rng.poisson(EXPOSURE, (FRAMES, *SHAPE)), rng), seed + 1000)
+
+
+@pytest.fixture(scope="module")
+def plain() -> Any:
+    """What is measured where electrons come by themselves."""
+    return chances(drawn(nothing, 1))
+
+
+@pytest.mark.parametrize(
+    ("fate", "told", "place", "chance"),
+    [
+        (followed, "followed", (1, 0, 0), 0.05),
+        (lost, "lost", (0, 0, 0), 0.03),
+        (moved, "moved", (0, 0, 1), 0.04),
+    ],
+)
+def test_what_happens_to_electrons_is_told_with_its_chance(
+    plain: Any, fate: Fate, told: str, place: tuple[int, int, int], chance: float
+) -> None:
+    found = measured_electrons(chances(drawn(fate, 2)), plain)
+    assert found is not None
+    assert isinstance(found.effect, EmpiricalElectrons)
+    (mode,) = found.effect.modes
+    assert (mode.fate, mode.place) == (told, place)
+    # to first order in the chance; refits make it exact
+    assert found.effect.chance == pytest.approx(chance, rel=0.35)
+
+
+def test_electrons_that_come_by_themselves_need_nothing(plain: Any) -> None:
+    for seed in (3, 4):
+        assert measured_electrons(chances(drawn(nothing, seed)), plain) is None
+
+
+def simulated(*modes: ElectronMode, chance: float) -> np.ndarray:
+    """Return electron numbers of a sensor of next to no read noise under the effect."""
+    values = (2.0, 1 / STEP, 100.0, 1e-6)
+    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    effect = EmpiricalElectrons(chance=chance, modes=modes)
+    how = SimulateSettings(shape=SHAPE, n_frames=FRAMES, seed=5, bit_depth=14, effects=(effect,))
+    return (simulate_block(truth, how, (0, FRAMES))[0] - 100.0) / STEP
+
+
+def test_simulated_electrons_are_followed_by_as_many_as_told() -> None:
+    k = simulated(ElectronMode(fate="followed", place=(1, 0, 0)), chance=0.1)
+    error = np.sqrt(2.0 / k.size)
+    # each brings 0.1 others, and these again
+    assert abs(k.mean() - 2.0 / 0.9) < 5 * error
+    together = np.mean((k[1:] - k.mean()) * (k[:-1] - k.mean()))
+    # of a mean of 2.22, a tenth of the variance
+    assert together == pytest.approx(0.1 * k.var(), abs=5 * 2.3 / np.sqrt(k.size))
+
+
+def test_simulated_electrons_that_go_are_as_many_as_told_and_come_where_it_is_told() -> None:
+    lost = simulated(ElectronMode(fate="lost"), chance=0.05)
+    moved = simulated(ElectronMode(fate="moved", place=(0, 0, 1)), chance=0.05)
+    error = np.sqrt(2.0 / lost.size)
+    # pairs are H^2 many
+    assert abs(lost.mean() - (2.0 - 0.05 * 4.0)) < 5 * error
+    assert abs(moved[:, :, 1:].mean() - 2.0) < 5 * error
+    assert abs(moved[:, :, 0].mean() - 1.8) < 5 * error * np.sqrt(SHAPE[1])
+
+
+def test_simulated_frames_do_not_depend_on_how_they_are_cut() -> None:
+    values = (2.0, 1 / STEP, 100.0, 1e-6)
+    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    modes = (
+        ElectronMode(fate="followed", place=(1, 0, 0)),
+        ElectronMode(fate="followed", place=(0, 1, 0)),
+        ElectronMode(fate="moved", place=(0, 1, 0)),
+    )
+    effect = EmpiricalElectrons(chance=0.1, modes=modes)
+    how = SimulateSettings(shape=SHAPE, n_frames=40, seed=5, bit_depth=14, effects=(effect,))
+    whole = simulate_block(truth, how, (0, 40))[0]
+    np.testing.assert_array_equal(whole[10:20], simulate_block(truth, how, (10, 20))[0])
+
+
+def test_it_competes_with_nothing_and_refuses_what_cannot_be() -> None:
+    assert "empirical_electrons" not in candidate_classes(DiscrepancySettings())
+    with pytest.raises(ValidationError, match="this frame or a later one"):
+        ElectronMode(fate="followed", place=(-1, 0, 0))
+    with pytest.raises(ValidationError, match="another sample"):
+        ElectronMode(fate="moved")
+
+
+def test_its_words_say_what_happens_to_electrons() -> None:
+    modes = (
+        ElectronMode(fate="followed", place=(1, 0, 0)),
+        ElectronMode(fate="lost", weight=0.5),
+    )
+    assert EmpiricalElectrons(chance=0.04, modes=modes).words() == (
+        "electrons that do not come by themselves (each brings 0.04 others on average to the sample one "
+        "frame later; each is lost with a chance of 0.02 for every other one in its sample)"
+    )
