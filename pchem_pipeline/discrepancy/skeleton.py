@@ -77,6 +77,10 @@ class Explainer(Protocol[Explanation]):
         """Put effects into the model and draw replicates of it; None where no effect is established."""
         ...
 
+    def replaced(self, null: NullModel, z: Measured) -> NullModel | None:
+        """Put what no effect with a name makes in the place of all that were added, if it leaves nothing."""
+        ...
+
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
         """Put what no effect explains into the model as it is measured; None where that does not help."""
         ...
@@ -122,13 +126,17 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     while wanted and rounds < by.most_rounds:
         try:
             extended = _round(by, null, z, still, tell)
+            if extended is None:
+                break
+            null, rounds = extended, rounds + 1
+            wanted = still = disagrees(null, z, significance, by.tolerance())
+            instead = by.replaced(null, z) if still else None
         except EffortSpentError as spent:
             limit = spent.words()
             break
-        if extended is None:
+        if instead is not None:
+            null, still = instead, disagrees(instead, z, significance, by.tolerance())
             break
-        null, rounds = extended, rounds + 1
-        wanted = still = disagrees(null, z, significance, by.tolerance())
     if still:
         tell("measuring what no effect explains")
         try:

@@ -233,6 +233,10 @@ class HistogramExplainer:
         vectors = self._drawn(self._with_effects(explanation))
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors))
 
+    def replaced(self, null: NullModel, z: Measured) -> NullModel | None:
+        """Leave what was added: nothing is measured of anything else here."""
+        return None
+
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
         """Leave what no effect explains to the codes that are told: nothing is measured of it here."""
         return None

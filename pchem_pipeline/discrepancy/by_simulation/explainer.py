@@ -19,7 +19,6 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.additions import (
     AddedRounds,
     Round,
-    leaves_too_much,
     left_of,
     unexplained_of_its_own,
 )
@@ -161,6 +160,7 @@ class FrameExplainer:
         self.effort = Effort(self.settings.effort)
         self.lost: float | None = None
         self.held: Refitted | None = None
+        self.unexplained: Unexplained | None = None
 
     def split(self) -> tuple[Evidence, Examined]:
         """Observe train and test frames together, then each part near their fit."""
@@ -294,14 +294,27 @@ class FrameExplainer:
         before = self.gaps.gap(z.final, null.mean, null.replicates)
         return self.gaps.gap(z.final, mean, added.vectors).interval[0] > before.value
 
+    def replaced(self, null: NullModel, z: Measured) -> NullModel | None:
+        """Put what no effect with a name makes in the place of all that were added, if it leaves nothing.
+
+        Effects that leave something merely mimic it. None where it leaves more than chance.
+
+        Raises:
+            EffortSpentError: the work is at its limit; nothing was added.
+        """
+        found = None if self.gap(null, z).at_floor else self._unexplained(z).by_itself()
+        if found is None or not self._gap_of(found, z).at_floor:
+            return None
+        return self._put_measured(found)
+
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
-        """Measure what no effect explains as shifts or as noise of the samples, and put it into the model.
+        """Measure what no effect explains in the samples, and put it into the model.
 
         Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
-        First without the effects that were added, since one that merely mimics has no place beside it; where
-        that does not close the gap, with those of them that account for what they move themselves. Noise only
-        with these: it could be any common mode that has a name; and without them in the end, where they leave
-        so much that none gets its name. None where it closes less than half of what is left.
+        Without the effects that were added, since one that merely mimics has no place beside it, and with
+        those of them that account for what they move themselves: what closes the gap, then in the fewest
+        forms, and where both do as well with the effects, which have a name. None where it closes less than
+        half of what is left.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -310,43 +323,56 @@ class FrameExplainer:
         if left.at_floor:
             return None
         self.effort.release()
-        rounds = self.rounds
-        held = tuple(h for this in rounds for h in this.added.hypotheses)
-        unexplained = Unexplained(
-            self.frames,
-            self.plain,
-            self._refitter(z, held),
-            self._refit,
-            lambda model: self._mapped(model)[1],
-            lambda found: self._established(found, z),
-            self._seed("covariances"),
-            self.settings.extended_replicates,
-            self.effort,
-            self.defects,
-        )
-        sure = self._sure(null, z)
-        tried: list[tuple[tuple[Hypothesis, ...], bool]] = [((), not sure)]
-        if sure:
-            tried.append((sure, True))
-            if leaves_too_much(left, before.value - left.value):
-                tried.append(((), True))
-        for kept, with_noise in tried:
-            found = unexplained.measured(kept, with_noise)
+        unexplained, sure = self._unexplained(z), self._sure(null, z)
+        best: tuple[tuple[bool, float], Refitted] | None = None
+        for kept in ((), sure) if sure else ((),):
+            try:
+                found = unexplained.measured(kept)
+            except EffortSpentError:
+                if best is None:
+                    raise
+                break
             if found is None:
                 continue
-            gap = self.gaps.gap(z.final, found.mean, found.vectors)
-            if gap.at_floor or gap.value < _DESCRIBED * (
-                left.value if kept else min(left.value, before.value)
-            ):
-                gone = {h.tag for h in held} - found.tags
-                self.model = tuple(e for e in self.model if e.tag not in gone)
-                changed = [
-                    i for i, this in enumerate(rounds) if gone & {h.tag for h in this.added.hypotheses}
-                ]
-                self.rounds = rounds[: min(changed, default=len(rounds))] if kept else []
-                last = self.rounds[-1].extended if self.rounds else self.first
-                return self._put(Comparison(found, (found,)), found, (), last)
-        return None
+            gap = self._gap_of(found, z)
+            most = _DESCRIBED * (left.value if kept else min(left.value, before.value))
+            forms = sum(type(e).measured_only for e in found.effects)
+            rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
+            if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):
+                best = rank, found
+            if best is not None and best[0] == (False, 1.0):
+                break
+        return None if best is None else self._put_measured(best[1])
+
+    def _gap_of(self, found: Refitted, z: Measured) -> Gap:
+        return self.gaps.gap(z.final, found.mean, found.vectors)
+
+    def _put_measured(self, found: Refitted) -> NullModel:
+        """Put what was measured into the model, without effects that are not beside it, and their rounds."""
+        held = {h.tag for this in self.rounds for h in this.added.hypotheses}
+        gone = held - found.tags
+        self.model = tuple(e for e in self.model if e.tag not in gone)
+        changed = [i for i, this in enumerate(self.rounds) if gone & {h.tag for h in this.added.hypotheses}]
+        self.rounds = self.rounds[: min(changed, default=len(self.rounds))]
+        last = self.rounds[-1].extended if self.rounds else self.first
+        return self._put(Comparison(found, (found,)), found, (), last)
+
+    def _unexplained(self, z: Measured) -> Unexplained:
+        """Return what measures beside effects that the model had before the search; always the same."""
+        if self.unexplained is None:
+            self.unexplained = Unexplained(
+                self.frames,
+                self.plain,
+                self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses)),
+                self._refit,
+                lambda model: self._mapped(model)[1],
+                lambda found: self._established(found, z),
+                self._seed("covariances"),
+                self.settings.extended_replicates,
+                self.effort,
+                self.defects,
+            )
+        return self.unexplained
 
     def _sure(self, null: NullModel, z: Measured) -> tuple[Hypothesis, ...]:
         """Return the effects that were added of which the model accounts for what they move."""

@@ -57,6 +57,14 @@ class _Shared(NamedTuple):
 SharedBy = Callable[[Part], _Shared]
 
 
+class _Likely(NamedTuple):
+    """A form that was measured in a part."""
+
+    part: Part
+    form: str
+    measured: Measurement
+
+
 @dataclass
 class Unexplained:
     """Measures frames beside effects.
@@ -85,46 +93,74 @@ class Unexplained:
     effort: Effort
     defects: dict[str, str] = field(default_factory=dict)
 
-    def measured(self, kept: tuple[Hypothesis, ...], with_noise: bool) -> Refitted | None:
-        """Return effects with what is best measured beside them, and with the other form beside both."""
-        refitter = self.refitter
-        forms: dict[str, Measure] = {"empirical": self._moves}
-        if with_noise:
-            data = self._shared(self.frames.stack[self.frames.seen], self.plain.maps)
-            known: dict[str, Callable[[Part], _Shared]] = {}
-            forms["empirical_noise"] = functools.partial(self._noise_of_samples, data, known)
-            forms["empirical_electrons"] = functools.partial(self._electrons, data, known)
-        # one that the model has already is not replaced
-        forms = {tag: form for tag, form in forms.items() if tag not in {e.tag for e in refitter.present}}
+    @functools.cached_property
+    def _forms(self) -> dict[str, Measure]:
+        """The forms that the model does not have already."""
+        known: dict[str, SharedBy] = {}
+        data = self._shared(self.frames.stack[self.frames.seen], self.plain.maps)
+        forms: dict[str, Measure] = {
+            "empirical": self._moves,
+            "empirical_noise": functools.partial(self._noise_of_samples, data, known),
+            "empirical_electrons": functools.partial(self._electrons, data, known),
+        }
+        return {tag: form for tag, form in forms.items() if tag not in {e.tag for e in self.refitter.present}}
+
+    @functools.cached_property
+    def _of_all(self) -> list[_Likely]:
+        """What explains most without any effect."""
+        return self._likeliest((), self._forms)
+
+    def by_itself(self) -> Refitted | None:
+        """Return what no known effect makes, where it leaves nothing by itself; None where it does not."""
+        for likely in self._of_all:
+            if likely.measured.effect.unlisted:
+                found = self._tried((), likely, whole=True)
+                if found is not None and leaves_nothing(self.refitter, found):
+                    return found
+        return None
+
+    def measured(self, kept: tuple[Hypothesis, ...]) -> Refitted | None:
+        """Return effects with what is best measured beside them, and with other forms beside all of these."""
+        forms = dict(self._forms)
         found: Refitted | None = None
-        while forms and not (found is not None and leaves_nothing(refitter, found)):
+        while forms and not (found is not None and leaves_nothing(self.refitter, found)):
             beside, better, score = kept, "", -np.inf
             if found is not None:
                 beside, score = found.hypotheses, found.score + _CONVINCING
-            for part, form in self._likeliest(tuple(h.effect for h in beside), forms):
+            effects = tuple(h.effect for h in beside)
+            for likely in self._likeliest(effects, forms) if effects else self._of_all:
+                if likely.form not in forms:
+                    continue
                 try:
-                    one = self._described(beside, part, forms[form])
+                    one = self._tried(beside, likely)
                 except EffortSpentError:
                     if found is None:
                         raise
                     return found
-                # a defect of what is measured must not cost the verdict
-                except Exception as error:
-                    self.defects[form] = error_words(error)
-                    continue
                 if one is not None and one.score > score:
-                    found, better, score = one, form, one.score
-                    if leaves_nothing(refitter, one):
+                    found, better, score = one, likely.form, one.score
+                    if leaves_nothing(self.refitter, one):
                         break
             if not better:
                 break
             del forms[better]
         return found
 
-    def _likeliest(self, effects: tuple[Effect, ...], forms: Mapping[str, Measure]) -> list[tuple[Part, str]]:
+    def _tried(self, kept: tuple[Hypothesis, ...], likely: _Likely, whole: bool = False) -> Refitted | None:
+        """Return effects with a form beside them; None where it fails or is not certain."""
+        try:
+            return self._described(kept, likely.part, self._forms[likely.form], whole)
+        except EffortSpentError:
+            raise
+        # a defect of what is measured must not cost the verdict
+        except Exception as error:
+            self.defects[likely.form] = error_words(error)
+            return None
+
+    def _likeliest(self, effects: Model, forms: Mapping[str, Measure]) -> list[_Likely]:
         """Return the parts and forms that explain most beside effects, what is everywhere included."""
         model = self.refitter.model(effects)
-        found: list[tuple[float, Part, str]] = []
+        found: list[_Likely] = []
         for part, form in itertools.product((Part(), *self.frames.parts), forms):
             try:
                 one = forms[form](part, model, model)
@@ -133,13 +169,15 @@ class Unexplained:
                 self.defects[form] = error_words(error)
                 continue
             if one is not None:
-                found.append((one.gain, part, form))
-        return [(part, form) for _, part, form in sorted(found, key=lambda one: -one[0])[:_MOST_TRIED]]
+                found.append(_Likely(part, form, one))
+        return sorted(found, key=lambda one: -one.measured.gain)[:_MOST_TRIED]
 
-    def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Refitted | None:
+    def _described(
+        self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure, whole: bool
+    ) -> Refitted | None:
         """Return effects with what is measured in a part beside them at their best fit, or None.
 
-        Effects of which nothing is certain beside it are left out.
+        Effects of which nothing is certain beside it are left out; ``whole``: see `Refitter.refined`.
         """
         refitter, effects, measured = self.refitter, tuple(h.effect for h in kept), None
         for _ in range(_MEASUREMENTS):
@@ -152,14 +190,16 @@ class Unexplained:
         refitter.allow(measured.tag)
         _, vectors = refitter.draw((*effects, measured), self.replicates)
         shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
-        found = refitter.refined((*kept, Hypothesis(measured, shift)))
+        found = refitter.refined((*kept, Hypothesis(measured, shift)), whole=whole)
+        if found.short:
+            return None
         found = refitter.sharpened(found, self.replicates)
         proven = {h.tag for h in self.proven(found)}
         if proven == found.tags:
             return found
         if measured.tag not in proven:
             return None
-        return self._described(tuple(h for h in kept if h.tag in proven), part, measure)
+        return self._described(tuple(h for h in kept if h.tag in proven), part, measure, whole)
 
     def _moves(
         self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]

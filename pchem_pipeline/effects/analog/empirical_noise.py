@@ -214,6 +214,14 @@ class EmpiricalNoise(Effect):
         """Return none: it is measured where all else has failed, and competes with nothing."""
         return ()
 
+    @property
+    def unlisted(self) -> bool:
+        """Whether it is a gain without a memory, or light that a row or column shares."""
+        return any(
+            not mode.lags and (mode.changes == "gain" or (mode.changes == "light" and mode.of != "frame"))
+            for mode in self.modes
+        )
+
     def halo(self) -> int:
         """Return how far the moving averages reach across rows, px."""
         return max(_average(mode).reach[1] for mode in self.modes)

@@ -82,6 +82,11 @@ class EmpiricalElectrons(Effect):
         min_length=1, max_length=8, description="what happens: its `fate`, `place` and relative `weight`"
     )
 
+    @property
+    def unlisted(self) -> bool:
+        """Whether electrons go, or bring others to later frames."""
+        return any(mode.fate != "followed" or mode.place[0] for mode in self.modes)
+
     def halo(self) -> int:
         """Return how far electrons come across rows, px."""
         return max(abs(mode.place[1]) for mode in self.modes) * (_DEPTH if self.history() else 1)

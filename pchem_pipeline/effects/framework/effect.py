@@ -108,6 +108,11 @@ class Effect(Section):
         """Whether it acts on all pixels, in all frames."""
         return self.region is None and self.when is None
 
+    @property
+    def unlisted(self) -> bool:
+        """Whether it is measured, and of a kind that no effect with a name makes."""
+        return False
+
     def at_place(self, region: Region | None, when: When | None = None) -> Self:
         """Return a copy with another place and time."""
         return self.model_copy(update={"region": region, "when": when})

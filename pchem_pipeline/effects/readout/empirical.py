@@ -139,6 +139,15 @@ class Empirical(Effect):
         weight = np.array([move.weight for move in self.moves])
         return np.asarray(self.share * weight / weight.sum())
 
+    @property
+    def unlisted(self) -> bool:
+        """Whether rows are exchanged or slip, or samples come nearer to those of an earlier frame."""
+        if self.exchange or self.together == "rest_of_row":
+            return True
+        ways = [move.towards for move in self.moves if move.towards]
+        along = self.together == "row" and any(way[2] for way in ways)
+        return along or (self.together == "sample" and any(way[0] for way in ways))
+
     def halo(self) -> int:
         """Return how far the neighbours lie across rows, px."""
         reach = max(abs(move.towards[1]) if move.towards else 0 for move in self.moves)

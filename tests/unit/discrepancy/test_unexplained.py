@@ -5,13 +5,20 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+import pchem_pipeline.discrepancy.by_simulation.unexplained as module
 from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
-from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
+from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
+from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained, _Likely
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
+from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.effects.readout.empirical import Empirical
+from pchem_pipeline.effects.readout.empirical import Empirical, Move
 
 TAP = Part(Region(columns=((8, 16),)))
 
@@ -35,7 +42,8 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
         frames, nothing, refitter, nothing, nothing, nothing, 0, 0, nothing  # type: ignore[arg-type]
     )  # fmt: skip
     forms = {"moves": moves, "noise": noise, "broken": broken}
-    assert unexplained._likeliest((), forms) == [(TAP, "noise"), (Part(), "moves"), (Part(), "noise")]
+    found = [(one.part, one.form) for one in unexplained._likeliest((), forms)]
+    assert found == [(TAP, "noise"), (Part(), "moves"), (Part(), "noise")]
     assert "no such line" in unexplained.defects["broken"]
 
 
@@ -44,3 +52,96 @@ def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_fi
     assert leaves_too_much(left, 1.0)
     assert not leaves_too_much(left, 1.2)
     assert not leaves_too_much(Gap(0.3, 0.01, (-0.1, 0.7), {}), 1.0)
+
+
+def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bias = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
+    gain = EmpiricalNoise(
+        noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0, changes="gain", signal_dn=9.0),)
+    )
+    nothing: Any = None
+    unexplained = Unexplained(*[nothing] * 9)
+    likely = [_Likely(Part(), name, Measurement(e, 9.0)) for name, e in (("bias", bias), ("gain", gain))]
+    unexplained.__dict__["_of_all"] = likely
+    tried = []
+
+    def described(_: Any, one: _Likely, **__: Any) -> str:
+        tried.append(one.form)
+        return one.form
+
+    monkeypatch.setattr(unexplained, "_tried", described)
+    for leaves_nothing in (False, True):
+        monkeypatch.setattr(module, "leaves_nothing", lambda *_, answer=leaves_nothing: answer)
+        assert unexplained.by_itself() == ("gain" if leaves_nothing else None)
+    assert tried == ["gain", "gain"]
+
+
+@pytest.mark.parametrize(
+    ("effect", "unlisted"),
+    [
+        (NoiseMode(of="frame", share=1.0, changes="gain"), True),
+        (NoiseMode(of="frame", share=1.0, changes="gain", lags=((1, 0, 0),), correlation=(0.5,)), False),
+        (NoiseMode(of="frame", share=1.0, changes="light"), False),
+        (NoiseMode(of="column", share=1.0, changes="light"), True),
+        (ElectronMode(fate="followed"), False),
+        (ElectronMode(fate="followed", place=(0, 1, 0)), False),
+        (ElectronMode(fate="followed", place=(1, 0, 0)), True),
+        (ElectronMode(fate="lost"), True),
+        (Move(shift_dn=4), False),
+        (Move(towards=(0, 0, 1)), False),
+        (Move(towards=(-1, 0, 0), part=0.5), True),
+    ],
+)
+def test_what_an_effect_with_a_name_makes_is_told_from_what_none_does(effect: Any, unlisted: bool) -> None:
+    made = {
+        NoiseMode: lambda: EmpiricalNoise(noise_dn=1.0, modes=(effect,)),
+        ElectronMode: lambda: EmpiricalElectrons(chance=0.01, modes=(effect,)),
+        Move: lambda: Empirical(share=0.1, moves=(effect,)),
+    }
+    assert made[type(effect)]().unlisted is unlisted
+
+
+def test_rows_that_slip_or_are_exchanged_have_no_name() -> None:
+    right, below = (Move(towards=(0, 0, 1)),), (Move(towards=(0, 1, 0)),)
+    assert Empirical(share=0.1, moves=right, together="rest_of_row").unlisted
+    assert Empirical(share=0.1, moves=right, together="row").unlisted
+    assert Empirical(share=0.1, moves=below, together="row", exchange="even").unlisted
+    # a row that repeats another one has
+    assert not Empirical(share=0.1, moves=below, together="row").unlisted
+
+
+@pytest.mark.parametrize(
+    ("alone", "beside", "chosen"),
+    [
+        ((True, 1), (True, 1), "alone"),  # one form by itself closes all: nothing else is asked
+        ((True, 2), (True, 1), "beside"),
+        ((True, 2), (True, 2), "beside"),  # what has a name is kept where it does as well
+        ((False, 1), (True, 2), "beside"),
+        ((True, 2), (False, 1), "alone"),
+        (None, (True, 1), "beside"),
+        (None, None, None),
+    ],
+)
+def test_what_closes_the_gap_in_fewest_forms_describes(
+    monkeypatch: pytest.MonkeyPatch, alone: Any, beside: Any, chosen: str | None
+) -> None:
+    search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
+    held = (SimpleNamespace(tag="row_noise"),)
+
+    def found(name: str, how: Any) -> Any:
+        effects = [] if how is None else [Empirical.typical()[0]] * how[1]
+        return None if how is None else SimpleNamespace(name=name, effects=effects, closes=how[0])
+
+    known = {0: found("alone", alone), 1: found("beside", beside)}
+    measures = SimpleNamespace(measured=lambda kept: known[len(kept)])
+    wide, closed = Gap(1.0, 0.01, (0.9, 1.1), {}), Gap(0.0, 0.01, (-0.01, 0.01), {})
+    part = Gap(0.2, 0.01, (0.1, 0.3), {})
+    monkeypatch.setattr(search, "_unexplained", lambda _: measures)
+    monkeypatch.setattr(search, "_sure", lambda *_: held)
+    monkeypatch.setattr(search, "gap", lambda *_: wide)
+    monkeypatch.setattr(search, "_gap_of", lambda one, _: closed if one.closes else part)
+    monkeypatch.setattr(search, "_put_measured", lambda one: one.name)
+    nothing: Any = None
+    assert search.describe(wide, nothing, nothing) == chosen
