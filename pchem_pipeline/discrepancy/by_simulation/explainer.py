@@ -336,7 +336,7 @@ class FrameExplainer:
                 continue
             gap = self._gap_of(found, z)
             most = _DESCRIBED * (left.value if kept else min(left.value, before.value))
-            forms = sum(type(e).measured_only for e in found.effects)
+            forms = sum(e.measured_parts for e in found.effects)
             rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
             if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):
                 best = rank, found

@@ -217,10 +217,15 @@ class EmpiricalNoise(Effect):
     @property
     def unlisted(self) -> bool:
         """Whether it is a gain without a memory, or light that a row or column shares."""
-        return any(
+        return all(
             not mode.lags and (mode.changes == "gain" or (mode.changes == "light" and mode.of != "frame"))
             for mode in self.modes
         )
+
+    @property
+    def measured_parts(self) -> int:
+        """How many modes there are."""
+        return len(self.modes)
 
     def halo(self) -> int:
         """Return how far the moving averages reach across rows, px."""

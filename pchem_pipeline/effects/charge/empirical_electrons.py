@@ -85,7 +85,12 @@ class EmpiricalElectrons(Effect):
     @property
     def unlisted(self) -> bool:
         """Whether electrons go, or bring others to later frames."""
-        return any(mode.fate != "followed" or mode.place[0] for mode in self.modes)
+        return all(mode.fate != "followed" or mode.place[0] for mode in self.modes)
+
+    @property
+    def measured_parts(self) -> int:
+        """How many modes there are."""
+        return len(self.modes)
 
     def halo(self) -> int:
         """Return how far electrons come across rows, px."""

@@ -113,6 +113,11 @@ class Effect(Section):
         """Whether it is measured, and of a kind that no effect with a name makes."""
         return False
 
+    @property
+    def measured_parts(self) -> int:
+        """How many things are told that were measured and have no explanation."""
+        return int(type(self).measured_only)
+
     def at_place(self, region: Region | None, when: When | None = None) -> Self:
         """Return a copy with another place and time."""
         return self.model_copy(update={"region": region, "when": when})

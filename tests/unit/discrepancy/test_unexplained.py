@@ -131,7 +131,8 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
     held = (SimpleNamespace(tag="row_noise"),)
 
     def found(name: str, how: Any) -> Any:
-        effects = [] if how is None else [Empirical.typical()[0]] * how[1]
+        modes = (NoiseMode(of="row", share=1.0), NoiseMode(of="frame", share=1.0))
+        effects = [] if how is None else [EmpiricalNoise(noise_dn=1.0, modes=modes[: how[1]])]
         return None if how is None else SimpleNamespace(name=name, effects=effects, closes=how[0])
 
     known = {0: found("alone", alone), 1: found("beside", beside)}
