@@ -18,7 +18,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.readout.empirical import neighbour_words, neighbours
+from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -85,21 +86,6 @@ class Move(Section):
         if self.part == 1.0:
             return f"to the value of {neighbour_words(self.towards)}{near}"
         return f"by {self.part:.2g} of the difference towards {neighbour_words(self.towards)}{near}"
-
-
-def neighbour_words(place: tuple[int, int, int]) -> str:
-    """Return the place of a neighbour in words, for example ``the sample one column to the left``."""
-    frames, rows, columns = place
-    parts = []
-    for number, noun, (before, after) in (
-        (frames, "frame", ("earlier", "later")),
-        (rows, "row", ("above", "below")),
-        (columns, "column", ("to the left", "to the right")),
-    ):
-        if number:
-            count = "one" if abs(number) == 1 else str(abs(number))
-            parts.append(f"{count} {noun}{'s' if abs(number) > 1 else ''} {before if number < 0 else after}")
-    return f"the sample {' and '.join(parts)}"
 
 
 @register_effect
@@ -220,19 +206,6 @@ class Empirical(Effect):
         free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside it"
         how = f"comes out moved after the converter ({', '.join(told)}){free}"
         return f"a share of {self.share:.2g} of the {what}{place} {how}"
-
-
-def neighbours(
-    values: NDArray[np.int64], place: tuple[int, int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the samples at a place beside those of frames (frame, y, x), and where there are any."""
-    to, source = [], []
-    for shift, size in zip(place, values.shape, strict=True):
-        to.append(slice(max(-shift, 0), max(size - max(shift, 0), 0)))
-        source.append(slice(max(shift, 0), max(size + min(shift, 0), 0)))
-    found, known = values.copy(), np.zeros(values.shape, np.bool_)
-    found[tuple(to)], known[tuple(to)] = values[tuple(source)], True
-    return found, known
 
 
 def _exchanged(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:

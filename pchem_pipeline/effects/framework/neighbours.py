@@ -1,0 +1,38 @@
+"""Samples beside a sample and before it: where they are, in arrays and in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def neighbour_words(place: tuple[int, int, int]) -> str:
+    """Return the place of a neighbour in words, for example ``the sample one column to the left``."""
+    frames, rows, columns = place
+    parts = []
+    for number, noun, (before, after) in (
+        (frames, "frame", ("earlier", "later")),
+        (rows, "row", ("above", "below")),
+        (columns, "column", ("to the left", "to the right")),
+    ):
+        if number:
+            count = "one" if abs(number) == 1 else str(abs(number))
+            parts.append(f"{count} {noun}{'s' if abs(number) > 1 else ''} {before if number < 0 else after}")
+    return f"the sample {' and '.join(parts)}"
+
+
+def neighbours(
+    values: NDArray[np.int64], place: tuple[int, int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the samples at a place beside those of frames (frame, y, x), and where there are any."""
+    to, source = [], []
+    for shift, size in zip(place, values.shape, strict=True):
+        to.append(slice(max(-shift, 0), max(size - max(shift, 0), 0)))
+        source.append(slice(max(shift, 0), max(size + min(shift, 0), 0)))
+    found, known = values.copy(), np.zeros(values.shape, np.bool_)
+    found[tuple(to)], known[tuple(to)] = values[tuple(source)], True
+    return found, known
