@@ -78,7 +78,7 @@ class Explainer(Protocol[Explanation]):
         ...
 
     def replaced(self, null: NullModel, z: Measured) -> NullModel | None:
-        """Put what no effect with a name makes in the place of all that were added, if it leaves nothing."""
+        """Put what no effect with a name makes in the place of all that were added, if it leaves less."""
         ...
 
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
@@ -122,7 +122,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     doubt = by.doubt()
     still = disagrees(null, z, significance)
     wanted = still or (not doubt and by.suspects(null, z))
-    limit = ""
+    limit, instead = "", None
     while wanted and rounds < by.most_rounds:
         try:
             extended = _round(by, null, z, still, tell)
@@ -137,7 +137,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         if instead is not None:
             null, still = instead, disagrees(instead, z, significance, by.tolerance())
             break
-    if still:
+    if still and instead is None:
         tell("measuring what no effect explains")
         try:
             described = by.describe(before, null, z)

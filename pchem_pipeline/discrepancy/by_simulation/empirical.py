@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -55,6 +56,7 @@ _ROWS_TOGETHER = 4  # neighbouring rows
 _RARE = 1e-6  # least mass of a code: what is rarer has other reasons
 _SURE = 30.0  # nats, the most that a sample says
 _MUTUAL = 0.5  # of rows that come in the place of the next, as many of this part in that of the one before
+_ALIGNED = 3.0  # times as many equal squares of one parity as of the others
 _FIRST_SHARE, _STEPS = 0.02, 60
 
 
@@ -209,11 +211,36 @@ def measured_moves(
     shifts = _measured_shifts(frames, maps, effects)
     towards = _measured_towards(frames, numbers, maps, effects)
     slips = _measured_slips(frames, maps, effects)
-    found = [one for one in (shifts, towards, slips) if one is not None]
+    squares = _measured_squares(frames, maps)
+    found = [one for one in (shifts, towards, slips, squares) if one is not None]
     if not found:
         return None
     best = max(found, key=lambda one: one.gain)
     return best._replace(gain=best.gain * len(frames) * int(np.count_nonzero(maps.usable)))
+
+
+def _measured_squares(frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> Measurement | None:
+    """Return squares of 2 x 2 pixels, of one parity of rows and columns, whose samples are all equal."""
+    equal, usable = equal_squares(frames), maps.usable
+    good = usable[1:, 1:] & usable[1:, :-1] & usable[:-1, 1:] & usable[:-1, :-1]
+    parities = [(y, x) for y in (0, 1) for x in (0, 1)]
+    number = np.array([np.count_nonzero(good[y::2, x::2]) * len(frames) for y, x in parities])
+    if not number.all():
+        return None
+    found = np.array([equal[y::2, x::2][good[y::2, x::2]].sum() for y, x in parities])
+    best = int(np.argmax(found / number))
+    others = np.delete(found, best).sum() + 1.0
+    expected = number[best] * others / np.delete(number, best).sum()
+    if found[best] < _ALIGNED * expected:
+        return None
+    gain = float(found[best] * np.log(found[best] / expected) - (found[best] - expected))
+    share = float(found[best] - expected) / float(number[best])
+    if gain < _CLEAR:
+        return None
+    return _component(
+        [Move()], [1], np.array([1.0 - share, share]), gain / (len(frames) * np.count_nonzero(usable)),
+        squares=parities[best],
+    )  # fmt: skip
 
 
 def _measured_shifts(

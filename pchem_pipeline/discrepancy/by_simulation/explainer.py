@@ -81,6 +81,7 @@ _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no s
 # standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 # than a single one would by chance
 _ESTABLISHED = 4.5
+_CLEARLY_LESS = 0.5  # of the gap that named effects leave, the most that may stay with another form
 _DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
 
@@ -295,17 +296,20 @@ class FrameExplainer:
         return self.gaps.gap(z.final, mean, added.vectors).interval[0] > before.value
 
     def replaced(self, null: NullModel, z: Measured) -> NullModel | None:
-        """Put what no effect with a name makes in the place of all that were added, if it leaves nothing.
+        """Put what no effect with a name makes in the place of all that were added, if it leaves less.
 
-        Effects that leave something merely mimic it. None where it leaves more than chance.
+        Effects that leave something merely mimic it.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
         """
-        found = None if self.gap(null, z).at_floor else self._unexplained(z).by_itself()
-        if found is None or not self._gap_of(found, z).at_floor:
+        left = self.gap(null, z)
+        found = None if left.at_floor else self._unexplained(z).by_itself()
+        if found is None:
             return None
-        return self._put_measured(found)
+        gap = self._gap_of(found, z)
+        clearly = gap.at_floor or gap.interval[1] < _CLEARLY_LESS * left.value
+        return self._put_measured(found) if clearly else None
 
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
         """Measure what no effect explains in the samples, and put it into the model.

@@ -42,6 +42,7 @@ Model = tuple[Effect, ...]
 Measure = Callable[[Part, Model, Model], Measurement | None]
 
 _CONVINCING = 6.0  # nats that a form must add
+_LITTLE = 0.03  # of what there is to explain, nats
 _MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
@@ -111,19 +112,25 @@ class Unexplained:
         return self._likeliest((), self._forms)
 
     def by_itself(self) -> Refitted | None:
-        """Return what no known effect makes, where it leaves nothing by itself; None where it does not."""
+        """Return what no known effect makes, where it leaves little by itself; None where it does not."""
         for likely in self._of_all:
             if likely.measured.effect.unlisted:
                 found = self._tried((), likely, whole=True)
-                if found is not None and leaves_nothing(self.refitter, found):
+                if found is not None and self._leaves_little(found):
                     return found
         return None
+
+    def _leaves_little(self, one: Refitted) -> bool:
+        """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
+        return leaves_nothing(self.refitter, one) or one.chance - one.score < _LITTLE * (
+            one.chance - self.refitter.nothing
+        )
 
     def measured(self, kept: tuple[Hypothesis, ...]) -> Refitted | None:
         """Return effects with what is best measured beside them, and with other forms beside all of these."""
         forms = dict(self._forms)
         found: Refitted | None = None
-        while forms and not (found is not None and leaves_nothing(self.refitter, found)):
+        while forms and not (found is not None and self._leaves_little(found)):
             beside, better, score = kept, "", -np.inf
             if found is not None:
                 beside, score = found.hypotheses, found.score + _CONVINCING
@@ -139,7 +146,7 @@ class Unexplained:
                     return found
                 if one is not None and one.score > score:
                     found, better, score = one, likely.form, one.score
-                    if leaves_nothing(self.refitter, one):
+                    if self._leaves_little(one):
                         break
             if not better:
                 break

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
+from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares, square_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.predicted import predicted_samples, predicted_statistics
 from pchem_pipeline.discrepancy.observe.previous_bits import bit_statistics, previous_bits
@@ -107,7 +108,7 @@ def observe(
     predicted = predicted_samples(frames, edges, maps.usable)
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
-    lines = repeated_lines(frames)
+    lines, squares = repeated_lines(frames), equal_squares(frames)
     z = {
         **evidence.z,
         "tail.high.clusters": _clusters(sums.hits, laws, frames.shape),
@@ -117,6 +118,7 @@ def observe(
         **predicted_statistics(predicted),
         **bit_statistics(bits),
         **line_statistics(lines, alike, len(frames)),
+        **square_statistics(squares, counts, origin, maps.usable),
     }
     time = _time_series(view, lags, n_run)
     time = replace(time, predicted=predicted, previous_bits=bits, repeated_lines=lines)

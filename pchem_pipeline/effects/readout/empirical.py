@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.context import Dim, EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.region import Span
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: What is moved together.
@@ -111,6 +112,11 @@ class Empirical(Effect):
     exchange: Literal["even", "odd"] | None = Field(
         default=None, description="rows of this parity change places with the row below; null: none does"
     )
+    squares: tuple[int, int] | None = Field(
+        default=None,
+        description="squares of 2 x 2 pixels come as their mean, rounded down, from rows and "
+        "columns of this parity on (0 even, 1 odd); null: none does",
+    )
 
     @model_validator(mode="after")
     def _has_moves(self) -> Self:
@@ -118,7 +124,24 @@ class Empirical(Effect):
             raise ValueError("empirical: give at least one of moves a weight above 0")
         if self.exchange and (self.together != "row" or [m.towards for m in self.moves] != [(0, 1, 0)]):
             raise ValueError("empirical: a row exchanges its samples with the one below: (0, 1, 0)")
+        if self.squares and (self.together != "sample" or self.exchange or self.moves != (Move(),)):
+            raise ValueError(
+                "empirical: squares come as their mean and are not moved: leave moves at one of nothing"
+            )
         return self
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it as it acts on some rows and columns that are taken for a sensor of their own."""
+        y, x = self.squares or (0, 0)
+        squares = ((y + rows[0]) % 2, (x + columns[0]) % 2) if self.squares else None
+        exchange = self.exchange
+        if exchange and rows[0] % 2:
+            exchange = "odd" if exchange == "even" else "even"
+        return self.model_copy(update={"squares": squares, "exchange": exchange})
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return as an effect on the sensor what was found in some of its rows and columns."""
+        return self.seen_in(rows, columns, shape)  # of two parities each is the other of the other
 
     def shares(self) -> NDArray[np.float64]:
         """Return the share of the samples that each move has."""
@@ -128,7 +151,7 @@ class Empirical(Effect):
     @property
     def unlisted(self) -> bool:
         """Whether rows are exchanged or slip, or samples come nearer to those of an earlier frame."""
-        if self.exchange or self.together == "rest_of_row":
+        if self.squares or self.exchange or self.together == "rest_of_row":
             return True
         ways = [move.towards for move in self.moves if move.towards]
         along = self.together == "row" and any(way[2] for way in ways)
@@ -136,7 +159,7 @@ class Empirical(Effect):
 
     def halo(self) -> int:
         """Return how far the neighbours lie across rows, px."""
-        reach = max(abs(move.towards[1]) if move.towards else 0 for move in self.moves)
+        reach = max(abs(move.towards[1]) if move.towards else int(bool(self.squares)) for move in self.moves)
         return reach * (_DEPTH if self.history() else 1)
 
     def history(self) -> int:
@@ -151,6 +174,10 @@ class Empirical(Effect):
             begin = np.floor(context.random.uniform(("frame", "y"), 1) * values.shape[2])
             which = np.where(np.arange(values.shape[2]) >= begin, which, len(self.moves))
         own = values.astype(np.int64)
+        if self.squares:
+            rows, columns = context.rows % 2, np.arange(values.shape[2]) % 2
+            first = (rows == self.squares[0])[:, None] & (columns == self.squares[1])
+            return _averaged(own, (drawn < self.share) & first).astype(values.dtype)
         if self.exchange:
             parity = (context.rows % 2 == (self.exchange == "odd"))[:, None]
             return _exchanged(values, (which == 0) & parity)
@@ -201,6 +228,12 @@ class Empirical(Effect):
             return (
                 f"a share of {self.share:.2g} of the {self.exchange} rows{place} changes places with the next"
             )
+        if self.squares:
+            rows, columns = (("even", "odd")[parity] for parity in self.squares)
+            return (
+                f"a share of {self.share:.2g} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
+                f"{columns} columns on, comes as the mean of their samples"
+            )
         shares = self.shares()
         told = [f"{shares[i]:.2g} {self.moves[i].words()}" for i in np.argsort(-shares)[:_MOST_TOLD]]
         free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside it"
@@ -214,4 +247,16 @@ def _exchanged(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
     result: NDArray[Any] = values.copy()
     result[:, :-1] = np.where(first, values[:, 1:], result[:, :-1])
     result[:, 1:] = np.where(first, values[:, :-1], result[:, 1:])
+    return result
+
+
+def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return frames (frame, y, x) whose squares from chosen pixels on are their mean; none overlap."""
+    result = values.copy()
+    corners = [
+        (slice(y, values.shape[1] - 1 + y), slice(x, values.shape[2] - 1 + x)) for y in (0, 1) for x in (0, 1)
+    ]
+    mean = sum(values[:, y, x] for y, x in corners) // 4
+    for y, x in corners:
+        result[:, y, x] = np.where(chosen[:, :-1, :-1], mean, result[:, y, x])
     return result

@@ -99,6 +99,16 @@ def swapped(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.where(some, pairs[:, :, ::-1], pairs).reshape(code.shape)
 
 
+def merged(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Deliver squares of pixels, from the second row and the first column on, as their mean."""
+    code = codes(dn)
+    squares = code[:, 1:-1].reshape(FRAMES, SHAPE[0] // 2 - 1, 2, SHAPE[1] // 2, 2)
+    mean = squares.sum(axis=(2, 4), keepdims=True) // 4
+    some = rng.random(mean.shape) < 0.05
+    code[:, 1:-1] = np.where(some, mean, squares).reshape(FRAMES, SHAPE[0] - 2, SHAPE[1])
+    return code
+
+
 def frames(seed: int, move: Any = plain) -> tuple[np.ndarray, np.ndarray, PixelMaps]:
     """Return frames of a sensor, some samples moved, their numbers, and the true parameters."""
     dn, rng, maps = sensor(seed)
@@ -147,6 +157,28 @@ def test_what_depends_on_a_neighbour_is_measured(
     # the first column of a late row has no sample beside it; a few samples are taken for other moves
     assert found.share == pytest.approx(share, rel=0.25)
     assert neighbour_words(wanted.towards) in found.words() or found.exchange
+
+
+def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None:
+    found = measured(merged, 6)
+    assert found is not None
+    assert found.squares == (1, 0)
+    assert found.share == pytest.approx(0.05, rel=0.1)
+    assert "from odd rows and even columns on" in found.words()
+    # in a window that begins at an odd row they begin at even ones
+    assert found.seen_in((3, 9), (2, 12), SHAPE).squares == (0, 0)
+    assert found.found_in((3, 9), (2, 12), SHAPE).squares == (0, 0)
+
+
+def test_simulated_squares_are_the_mean_of_their_samples() -> None:
+    found, own = simulated(Empirical(share=0.3, moves=(Move(),), squares=(1, 0)), 400)
+    mean = own[:, 1:-1].reshape(400, SHAPE[0] // 2 - 1, 2, SHAPE[1] // 2, 2).sum(axis=(2, 4)) // 4
+    squares = found[:, 1:-1].reshape(400, SHAPE[0] // 2 - 1, 2, SHAPE[1] // 2, 2)
+    equal = (squares == mean[:, :, None, :, None]).all(axis=(2, 4))
+    assert abs(equal.mean() - 0.3) < 5 * np.sqrt(0.21 / equal.size) + 0.01
+    np.testing.assert_array_equal(found[:, 0], own[:, 0])
+    with pytest.raises(ValidationError, match="not moved"):
+        Empirical(share=0.3, moves=(Move(shift_dn=3),), squares=(1, 0))
 
 
 def test_nothing_is_measured_where_there_is_nothing() -> None:

@@ -389,3 +389,23 @@ def test_a_coarse_step_is_not_taken_for_a_comb_of_electrons_that_are_not_there()
         fit=FitSettings(likelihood="density"),
     )
     assert np.abs(1 / density.maps.conversion_gain / 3.45 - 1).max() > 0.5  # as it would be
+
+
+def test_squares_of_equal_samples_are_told_from_those_of_chance() -> None:
+    plain = small_stack((12, 14), 600, 7)
+    merged = plain.copy()
+    some = np.random.default_rng(1).random((600, 6, 7)) < 0.002
+    squares = plain.reshape(600, 6, 2, 7, 2).astype(np.int64)
+    mean = squares.sum(axis=(2, 4), keepdims=True) // 4
+    merged[:] = np.where(some[:, :, None, :, None], mean, squares).reshape(plain.shape)
+    by_chance, found = (
+        observe(each, np.arange(600), n_run=600, block_frames=50).z["space.equal.squares"]
+        for each in (plain, merged)
+    )
+    assert abs(by_chance) < 5
+    # some fifty of them, beside a few by chance
+    assert found > 10
+    # pixels of which all samples are equal, in a frame as in any other
+    saturated = plain.copy()
+    saturated[:, 3:6, 3:6] = plain.max()
+    assert abs(observe(saturated, np.arange(600), n_run=600, block_frames=50).z["space.equal.squares"]) < 5

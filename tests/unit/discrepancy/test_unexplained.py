@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-import pchem_pipeline.discrepancy.by_simulation.unexplained as module
 from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
@@ -54,7 +53,7 @@ def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_fi
     assert not leaves_too_much(Gap(0.3, 0.01, (-0.1, 0.7), {}), 1.0)
 
 
-def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_leaves_nothing(
+def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_leaves_little(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bias = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
@@ -72,9 +71,9 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
         return one.form
 
     monkeypatch.setattr(unexplained, "_tried", described)
-    for leaves_nothing in (False, True):
-        monkeypatch.setattr(module, "leaves_nothing", lambda *_, answer=leaves_nothing: answer)
-        assert unexplained.by_itself() == ("gain" if leaves_nothing else None)
+    for little in (False, True):
+        monkeypatch.setattr(unexplained, "_leaves_little", lambda _, answer=little: answer)
+        assert unexplained.by_itself() == ("gain" if little else None)
     assert tried == ["gain", "gain"]
 
 
