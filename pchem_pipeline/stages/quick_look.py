@@ -147,22 +147,20 @@ def _repeated(store: RunStore, mean: NDArray[np.float64]) -> NDArray[np.int64]:
 
 def _codes(store: RunStore, maps: PixelMaps) -> CodeSample | None:
     """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor."""
-    chunks = store.array("histogram/counts").chunks
+    whole = store.file_shape("histogram/counts")
     ny, nx = maps.usable.shape
-    tiles = [(y, x) for y in range(0, ny, chunks[0]) for x in range(0, nx, chunks[1])]
+    tiles = [(y, x) for y in range(0, ny, whole[0]) for x in range(0, nx, whole[1])]
     origin = store.read("histogram/origin")
     counts, origins, parameters = [], [], []
     pieces = _spread(len(tiles), _PIECES)
     for y, x in (tiles[i] for i in pieces):
-        part = (slice(y, y + chunks[0]), slice(x, x + chunks[1]))
+        part = (slice(y, y + whole[0]), slice(x, x + whole[1]))
         inside = np.flatnonzero(maps.usable[part].ravel())
         if inside.size == 0:
             continue
         inside = inside[_spread(inside.size, -(-_PIXELS // pieces.size))]
-        place = np.divmod(inside, maps.usable[part].shape[1])
-        (rows, row), (columns, column) = (np.unique(each, return_inverse=True) for each in place)
-        block = store.read_crossings("histogram/counts", y + rows, x + columns)
-        counts.append(block[row, column])
+        rows, columns = np.divmod(inside, maps.usable[part].shape[1])
+        counts.append(store.read_pixels("histogram/counts", y + rows, x + columns))
         origins.append(origin[part].ravel()[inside].astype(np.int64))
         values = maps.maps
         parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))

@@ -16,6 +16,7 @@ machines, beside one of this machine in the user's cache.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import sys
@@ -46,6 +47,8 @@ SCHEMA_VERSION = 1
 _PRIVATE = ".pchem"
 _DESCRIPTION = "zarr.json"
 _Region = tuple[slice | int, ...]
+#: Pixels about each that is wanted which are rather read than left out.
+_SPARSE = 16
 
 
 class RunStore:
@@ -214,24 +217,33 @@ class RunStore:
         with self._translated(name, region):
             return np.asarray(array[region if region is not None else ...])
 
-    def read_crossings(self, name: str, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[Any]:
-        """Return the elements of an array (y, x, ...) where some rows and columns cross.
+    def file_shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of the parts of an array that are a file each, and that one task writes whole."""
+        array = self.array(name)
+        return array.shards or array.chunks
+
+    def read_pixels(self, name: str, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the elements of an array (y, x, ...) at some pixels, file by file.
 
         Args:
             name: of the array.
-            rows: increasing.
-            columns: increasing.
+            y: row of each, shape (n,).
+            x: column of each, shape (n,).
 
         Returns:
-            Shape (rows, columns, ...).
+            Shape (n, ...).
 
         Raises:
             StoreError: it is missing or a chunk is corrupt.
         """
-        array = self.array(name)
-        region = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-        with self._translated(name, region):
-            return np.asarray(array.oindex[rows, columns])
+        array, (high, wide) = self.array(name), self.file_shape(name)[:2]
+        found = np.empty((y.size, *array.shape[2:]), array.dtype)
+        file = (y // high) * (array.shape[1] // wide + 1) + x // wide
+        for each in np.unique(file):
+            here = np.flatnonzero(file == each)
+            with self._translated(name):
+                found[here] = _pixels_of(array, y[here], x[here])
+        return found
 
     def write(self, name: str, region: _Region, data: NDArray[Any]) -> None:
         """Write ``data`` into a region made of whole chunks.
@@ -415,6 +427,17 @@ def _one_line(path: Path, where: object) -> Iterator[None]:
         ):
             raise refused(where, error) from error
         raise
+
+
+def _pixels_of(array: zarr.Array[Any], y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[Any]:
+    """Return the elements of an array (y, x, ...) at some pixels, read as what they lie in, or one by one."""
+    (top, left), rest = (int(y.min()), int(x.min())), array.shape[2:]
+    high, wide = int(y.max()) + 1 - top, int(x.max()) + 1 - left
+    if high * wide <= _SPARSE * y.size:
+        return np.asarray(array[top : top + high, left : left + wide])[y - top, x - left]
+    inner = np.indices(rest).reshape(len(rest), math.prod(rest))
+    places = [np.repeat(each, inner.shape[1]) for each in (y, x)] + [np.tile(each, y.size) for each in inner]
+    return np.asarray(array.get_coordinate_selection(tuple(places))).reshape(y.size, *rest)
 
 
 def _words(region: _Region) -> str:

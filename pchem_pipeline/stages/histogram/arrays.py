@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, block_starts
 from pchem_pipeline.run.stage import StageContext, open_store
@@ -15,6 +18,8 @@ ROW_FRAMES = 4096
 CHUNK_BLOCKS = 8
 #: a chunk of row sums of all rows is read at once in the end: fewer frames on tall sensors
 _ROWS_AT_ONCE = 2048
+#: rows and columns of pixels that are decoded to read the histogram of one, where tiles are larger than a few
+_READ_ROWS, _READ_COLUMNS, _FEW_PIXELS = 16, 64, 4096
 
 
 def row_frames(ny: int) -> int:
@@ -22,11 +27,32 @@ def row_frames(ny: int) -> int:
     return max(ROW_FRAMES // 16, ROW_FRAMES // -(-ny // _ROWS_AT_ONCE))
 
 
+def create_counts(context: StageContext, bins: int, dtype: Any) -> None:
+    """Make the array of the histograms: a file for each tile, of pieces that can be read by themselves."""
+    layout = counts_layout(context, bins)
+    context.create("histogram/counts", (*context.sensor.shape, bins), dtype=dtype, **layout)
+
+
+def counts_layout(context: StageContext, bins: int) -> dict[str, tuple[int, ...]]:
+    """Return the chunks of the histograms, and the shards where these are smaller than a tile."""
+    tile = tuple(min(size, length) for size, length in zip(context.tile, context.sensor.shape, strict=True))
+    if math.prod(tile) <= _FEW_PIXELS:
+        return {"chunks": (*tile, bins)}
+    read = (_part(side, most) for side, most in zip(tile, (_READ_ROWS, _READ_COLUMNS), strict=True))
+    return {"chunks": (*read, bins), "shards": (*tile, bins)}
+
+
+def _part(side: int, most: int) -> int:
+    """Return the largest divisor of a length up to a number; the length itself where that is small."""
+    found = next(part for part in range(min(side, most), 0, -1) if side % part == 0)
+    return found if 2 * found > min(side, most) else side
+
+
 def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
     """Make the arrays of the stage for a stack of some shape (frames, rows, columns)."""
     n_frames, ny, nx = shape
     settings, tile = context.config.histogram, context.tile
-    context.create("histogram/counts", (ny, nx, bins), chunks=(*tile, bins), dtype=counts_dtype(n_frames))
+    create_counts(context, bins, counts_dtype(n_frames))
     context.create_maps([f"histogram/{name}" for name in MAPS])
     if not settings.summaries:
         context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
@@ -53,11 +79,11 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
 def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
     """Make the arrays along time longer, and the counts wide enough."""
     store, n_frames = context.store, shape[0]
-    tile, length = context.tile, context.config.histogram.block_frames
+    length = context.config.histogram.block_frames
     open_store.cache_clear()
     if store.array("histogram/counts").dtype != counts_dtype(n_frames):
-        counts = (*shape[1:], bins)
-        store.create_array("histogram/counts", counts, chunks=(*tile, bins), dtype=counts_dtype(n_frames))
+        counts, layout = (*shape[1:], bins), counts_layout(context, bins)
+        store.create_array("histogram/counts", counts, dtype=counts_dtype(n_frames), **layout)
     if context.config.input.mode == "copy":
         store.resize("frames/dn", n_frames)
     if context.config.histogram.summaries:

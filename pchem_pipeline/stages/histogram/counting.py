@@ -260,8 +260,8 @@ class _BandCounter:
             each.flush()
         opened = open_store(self._store)
         for name, values in vars(histograms).items():
-            # chunk by chunk: of each that is written there are copies in memory
-            step = opened.array(f"histogram/{name}").chunks[1]
+            # file by file: of each that is written there are copies in memory
+            step = opened.file_shape(f"histogram/{name}")[1]
             for x in range(0, values.shape[1], step):
                 opened.write(f"histogram/{name}", (self._rows, slice(x, x + step)), values[:, x : x + step])
         if covariances is not None:

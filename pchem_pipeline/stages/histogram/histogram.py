@@ -24,7 +24,7 @@ from pchem_pipeline.model.histogram.summaries import frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.bands import Band, plan_bands
-from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, row_frames
+from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
@@ -176,8 +176,7 @@ def _copy_histograms(context: StageContext) -> None:
     from pchem_pipeline.frames.histogram_files import read_histograms
 
     given = read_histograms(context.config.input, context.base_dir)
-    ny, nx, bins = given.counts.shape
-    context.create("histogram/counts", (ny, nx, bins), chunks=(*context.tile, bins), dtype=given.counts.dtype)
+    create_counts(context, given.counts.shape[2], given.counts.dtype)
     context.create_maps([f"histogram/{name}" for name in MAPS])
     context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
     task = functools.partial(_copy_tile, store=context.store.path, given=given)

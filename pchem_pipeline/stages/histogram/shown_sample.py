@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.stages.histogram.arrays import create_counts
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
 
@@ -25,9 +26,8 @@ def copy_shown_sample(context: StageContext) -> None:
         StoreError: the run of the sample is gone, or the store refuses.
     """
     place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
-    counts, tile = RunStore.open(place).array("histogram/counts"), context.tile
-    chunks = (*tile, counts.shape[2])
-    context.create("histogram/counts", counts.shape, chunks=chunks, dtype=counts.dtype)
+    counts = RunStore.open(place).array("histogram/counts")
+    create_counts(context, counts.shape[2], counts.dtype)
     context.create_maps([f"histogram/{name}" for name in _MAPS])
     context.store.set_attributes("summary", {"missing": "the samples keep their own"})
     context.run_units(context.tiles(), functools.partial(_copy_tile, store=context.store.path, sample=place))

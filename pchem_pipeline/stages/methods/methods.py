@@ -203,7 +203,7 @@ def _sample(store: RunStore, shape: tuple[int, int], place: NDArray[np.int64]) -
     """Read the histograms of some pixels, a band of rows at a time."""
     counts = store.array("histogram/counts")
     row_bytes = shape[1] * counts.shape[2] * counts.dtype.itemsize
-    rows = max(counts.chunks[0], _BAND_BYTES // max(row_bytes, 1))
+    rows = max(store.file_shape("histogram/counts")[0], _BAND_BYTES // max(row_bytes, 1))
     taken = []
     for first in range(0, shape[0], rows):
         last = min(first + rows, shape[0])

@@ -165,7 +165,7 @@ def read_model(store: RunStore) -> FittedModel:
 def read_histograms(
     store: RunStore, index: NDArray[np.int64], shape: tuple[int, int], model: FittedModel
 ) -> PixelHistograms:
-    """Read the histograms of pixels, chunk by chunk.
+    """Read the histograms of pixels.
 
     Args:
         store: the run.
@@ -177,18 +177,10 @@ def read_histograms(
         StoreError: an array is missing or corrupt.
     """
     y, x = np.divmod(index, shape[1])
-    high, wide = store.array("histogram/counts").chunks[:2]
-    chunk = (y // high) * (shape[1] // wide + 1) + x // wide
-    free = [(which, f"fit/{name}") for which, name in enumerate(FREE_SATELLITES) if store.has(f"fit/{name}")]
-    counts: list[NDArray[np.integer[Any]]] = [np.empty(0, np.int64)] * index.size
-    origin, satellites = np.zeros(index.size, np.int64), np.zeros((2, index.size))
-    for each in np.unique(chunk):
-        here = np.flatnonzero(chunk == each)
-        (rows, row), (columns, column) = (np.unique(at[here], return_inverse=True) for at in (y, x))
-        block = store.read_crossings("histogram/counts", rows, columns)
-        for i, j, k in zip(here, row, column, strict=True):
-            counts[i] = block[j, k].copy()
-        origin[here] = store.read_crossings("histogram/origin", rows, columns)[row, column]
-        for which, path in free:
-            satellites[which, here] = store.read_crossings(path, rows, columns)[row, column]
-    return PixelHistograms(origin, counts, satellites)
+    satellites = np.zeros((2, index.size))
+    for which, name in enumerate(FREE_SATELLITES):
+        if store.has(f"fit/{name}"):
+            satellites[which] = store.read_pixels(f"fit/{name}", y, x)
+    counts = store.read_pixels("histogram/counts", y, x)
+    origin = store.read_pixels("histogram/origin", y, x).astype(np.int64)
+    return PixelHistograms(origin, list(counts), satellites)

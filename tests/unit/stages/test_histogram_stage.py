@@ -135,6 +135,10 @@ def test_result_depends_on_neither_tile_nor_memory_nor_mode(tmp_path, frames, ex
     context = make_context(tmp_path, frames, mode=mode, tile=tile, band_memory=memory)
     assert execute("histogram", context).state == "complete"
     assert_equal(contents(context.store), expected)
+    # large tiles are one file each, and read in parts
+    counts = context.store.array("histogram/counts")
+    assert counts.shards == ((NY, NX, counts.shape[2]) if tile == 256 else None)
+    assert counts.chunks[:2] == {256: (15, NX), 64: (64, NX)}.get(tile, (tile, tile))
 
 
 def test_result_does_not_depend_on_threads(tmp_path, frames, expected):

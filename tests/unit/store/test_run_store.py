@@ -36,12 +36,26 @@ def test_integers_and_floats_come_back_exactly(store):
     store.create_array("histogram/counts", counts.shape, chunks=(8, 8, 40), dtype=np.uint16)
     store.write("histogram/counts", (slice(None),) * 3, counts)
     np.testing.assert_array_equal(store.read("histogram/counts"), counts)
-    rows, columns = np.array([0, 3, 9]), np.array([7, 8, 11])
-    crossings = store.read_crossings("histogram/counts", rows, columns)
-    np.testing.assert_array_equal(crossings, counts[np.ix_(rows, columns)])
     values = rng.normal(size=(9, 9))
     store.write_array("fit/log_likelihood", values)
     np.testing.assert_array_equal(store.read("fit/log_likelihood"), values)
+
+
+@pytest.mark.parametrize("shards", [None, (8, 32, 40)])
+def test_pixels_are_read_in_any_order_and_number(store, shards):
+    rng = np.random.default_rng(6)
+    counts = rng.integers(0, 2**16, (20, 70, 40), dtype=np.uint16)
+    chunks = (4, 8, 40) if shards else (8, 32, 40)
+    store.create_array("histogram/counts", counts.shape, chunks=chunks, shards=shards, dtype=np.uint16)
+    store.write("histogram/counts", (slice(None),) * 3, counts)
+    assert store.file_shape("histogram/counts") == (8, 32, 40)
+    assert len(list((store.path / "histogram/counts/c").rglob("0"))) >= 3
+    for n in (1, 5, 3000):
+        y, x = rng.integers(0, 20, n), rng.integers(0, 70, n)
+        np.testing.assert_array_equal(store.read_pixels("histogram/counts", y, x), counts[y, x])
+    store.write_array("fit/bias", np.arange(1400.0).reshape(20, 70))
+    y, x = np.array([19, 0]), np.array([0, 69])
+    np.testing.assert_array_equal(store.read_pixels("fit/bias", y, x), [1330.0, 69.0])
 
 
 def test_only_registered_arrays_are_stored(store):
