@@ -35,10 +35,10 @@ WITH_GAPS = tuple(np.where(np.arange(N) == 11, np.nan, column) for column in MAP
 
 def sums_of(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
     part = slice(start, stop)
-    chosen = PixelHistograms(COUNTS[part] // 2, OUTSIDE[part] // 2)
-    everything = PixelHistograms(COUNTS[part], OUTSIDE[part])
+    chosen = PixelHistograms(COUNTS[part] // 2, ORIGIN[part], OUTSIDE[part] // 2)
+    everything = PixelHistograms(COUNTS[part], ORIGIN[part], OUTSIDE[part])
     maps = tuple(column[part] for column in WITH_GAPS)
-    return ensemble_tile(maps, ORIGIN[part], chosen, everything, AXES)
+    return ensemble_tile(maps, chosen, everything, AXES)
 
 
 @given(st.sets(st.integers(1, N - 1)))

@@ -222,7 +222,7 @@ def tally(
     origin: NDArray[np.integer[Any]],
     pixels: UsablePixels,
     dn: DnAxis,
-    nuced: NucedAxis,
+    nuced: NucedAxis | None = None,
 ) -> Tally:
     """Sort the histograms of pixels onto the axes of the ensemble.
 
@@ -231,13 +231,13 @@ def tally(
         origin: DN of bin 0, shape (n,).
         pixels: parameters of the same n pixels, which give the two-point NUC ``(x - mu) g``.
         dn: axis of the raw histogram.
-        nuced: axis of the NUCed histogram.
+        nuced: axis of the NUCed histogram, or None for none.
 
     Returns:
         The tally; what falls beyond an axis is counted, not lost in silence.
     """
     raw = np.zeros(dn.size, dtype=np.int64)
-    bins = np.zeros(nuced.size, dtype=np.int64)
+    bins = np.zeros(nuced.size if nuced else 0, dtype=np.int64)
     sums = np.zeros((len(pixels), 2))
     outside, nuced_outside = ensemble_numba.tally_counts(
         kernel_counts(counts),
@@ -246,8 +246,8 @@ def tally(
         pixels.bias,
         dn.start,
         raw,
-        nuced.width,
-        nuced.start,
+        nuced.width if nuced else 0.0,
+        nuced.start if nuced else 0,
         bins,
         sums,
     )

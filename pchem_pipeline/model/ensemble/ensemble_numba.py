@@ -428,7 +428,7 @@ def tally_counts(
     """Sort per-pixel histograms onto the DN axis and onto the NUCed axis.
 
     ``nuced_sums[p]`` receives the sums of the NUCed value and of its square over the pixel's samples, exact
-    before any binning.
+    before any binning. ``width <= 0`` leaves all that is NUCed out.
 
     Returns:
         How many samples fell outside of the DN axis, and outside of the NUCed axis.
@@ -445,11 +445,7 @@ def tally_counts(
             total += c
             first += c * b
             second += c * b * b
-            value = np.floor((origin[p] + b - bias[p]) * gain[p] / width + 0.5)
-            places[b] = np.int32(min(max(value, low), high) - low)
         mean = first + offset * total
-        nuced_sums[p, 0] = gain[p] * mean
-        nuced_sums[p, 1] = gain[p] * gain[p] * (second + offset * (first + mean))
         shift = origin[p] - dn_start
         inside = min(max(begin, -shift), end), max(min(end, raw.size - shift), begin)
         for b in range(inside[0], inside[1]):
@@ -457,6 +453,13 @@ def tally_counts(
             raw[b + shift] += c
             total -= c
         outside += total
+        if width <= 0.0:
+            continue
+        nuced_sums[p, 0] = gain[p] * mean
+        nuced_sums[p, 1] = gain[p] * gain[p] * (second + offset * (first + mean))
+        for b in range(begin, end):
+            value = np.floor((origin[p] + b - bias[p]) * gain[p] / width + 0.5)
+            places[b] = np.int32(min(max(value, low), high) - low)
         for b in range(begin, end):
             held[places[b]] += np.int64(counts[p, b])
     for j in range(nuced.size):

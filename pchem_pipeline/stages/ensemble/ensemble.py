@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
@@ -61,7 +62,7 @@ _BAND_BYTES = 64 << 20
 #: of the maps of a tile
 _PIXEL_BYTES = 40 * 8
 _SUMS = ("integers", "floats")
-_HISTOGRAM = ("origin", "counts", "under", "over")
+_HISTOGRAM = ("origin", "minimum", "maximum")
 
 
 @dataclass(frozen=True)
@@ -270,14 +271,13 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
 def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
     store = open_store(job.store)
-    chosen = None if job.frames is None else _count(job, band)
+    chosen = None if job.frames is None else _count(job, band, job.frames)
     errors = {} if job.truth is None else _compare(job, band)
     for key in band.keys:
         number, tile = job.tiles[key]
         own = None
         if chosen is not None:
-            part = (slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
-            own = chosen[0][part], chosen[1][part]
+            own = chosen.of((slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)))
         integers, floats = _sum_tile(store, tile, job, own)
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size
@@ -288,8 +288,50 @@ def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
     return {}
 
 
+@dataclass(frozen=True)
+class _Counted:
+    """Histograms of some rows and columns of the sensor.
+
+    Attributes:
+        counts: samples per bin, shape (y, x, bin).
+        origin: DN of bin 0, shape (y, x).
+        outside: samples outside of the bins, shape (y, x).
+    """
+
+    counts: NDArray[Any]
+    origin: NDArray[np.int64]
+    outside: NDArray[np.uint32]
+
+    def of(self, part: tuple[slice, slice]) -> _Counted:
+        """Return those of a part."""
+        return _Counted(self.counts[part], self.origin[part], self.outside[part])
+
+    def cut(self, low: NDArray[Any], high: NDArray[Any]) -> PixelHistograms:
+        """Return them with as many bins as the widest range needs: a hot pixel widens those of the sensor.
+
+        Args:
+            low: smallest DN of each pixel, shape (y, x).
+            high: largest.
+        """
+        first, size = _occupied(self.origin, low, high, self.counts.shape[2])
+        y, x = np.ogrid[: first.shape[0], : first.shape[1]]
+        kept = sliding_window_view(self.counts, size, axis=2)[y, x, first]
+        return PixelHistograms(
+            kernel_counts(kept).reshape(first.size, size), (self.origin + first).ravel(), self.outside.ravel()
+        )
+
+
+def _occupied(
+    origin: NDArray[np.int64], low: NDArray[Any], high: NDArray[Any], bins: int
+) -> tuple[NDArray[np.int64], int]:
+    """Return the first of so many bins, the same number for each pixel, between which all samples lie."""
+    begin, end = np.clip(low - origin, 0, bins), np.clip(high + 1 - origin, 0, bins)
+    size = max(1, int(np.max(end - begin)))
+    return np.minimum(begin, bins - size), size
+
+
 def _sum_tile(
-    store: RunStore, tile: Tile, job: _Job, chosen: tuple[NDArray[Any], NDArray[Any]] | None
+    store: RunStore, tile: Tile, job: _Job, chosen: _Counted | None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return what a tile adds to the ensemble.
 
@@ -297,22 +339,22 @@ def _sum_tile(
         store: the run.
         tile: the tile.
         job: what is summed.
-        chosen: counts of the chosen frames, and samples outside of the bins; None: all frames.
+        chosen: histograms of the chosen frames; None: all frames.
     """
-    *maps, origin, counts, under, over = (
-        store.read(name, tile.region)
-        for name in (*(f"fit/{each}" for each in PARAMETERS), *(f"histogram/{each}" for each in _HISTOGRAM))
+    maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
+    origin, low, high = _ranges(store, tile.region)
+    counts, under, over = (
+        store.read(f"histogram/{name}", tile.region) for name in ("counts", "under", "over")
     )
-    outside = under + over
+    counted = _Counted(counts, origin, under + over)
     errors = _errors(store, tile)
     rows = []
     for part in parts_told(tile.parts()):
-        everything = _histograms(counts[part], outside[part])
-        some = everything if chosen is None else _histograms(*(values[part] for values in chosen))
+        everything = counted.of(part).cut(low[part], high[part])
+        some = everything if chosen is None else chosen.of(part).cut(low[part], high[part])
         place, of_pixels = tile.within(part), [values[part] for values in maps]
         row = ensemble_tile(
             tuple(values.ravel() for values in of_pixels),
-            origin[part].ravel(),
             some,
             everything,
             job.axes,
@@ -324,8 +366,9 @@ def _sum_tile(
     return np.sum([row[0] for row in rows], axis=0), np.sum([row[1] for row in rows], axis=0)
 
 
-def _histograms(counts: NDArray[Any], outside: NDArray[Any]) -> PixelHistograms:
-    return PixelHistograms(kernel_counts(counts).reshape(outside.size, -1), outside.ravel())
+def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[NDArray[np.int64]]:
+    """Return DN of bin 0, smallest and largest DN of the pixels of a region, (y, x)."""
+    return [store.read(f"histogram/{name}", region).astype(np.int64) for name in _HISTOGRAM]
 
 
 def _errors(store: RunStore, tile: Tile) -> PixelErrors | None:
@@ -354,18 +397,19 @@ def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStrea
     return FrameStream(job.source, [(band.y0, band.y1)], _BLOCK_FRAMES, frames=frames)
 
 
-def _count(job: _Job, band: Band | Tile) -> tuple[NDArray[Any], NDArray[np.uint32]]:
-    """Histogram the chosen frames of a band on the bins of the stored histograms."""
-    assert job.frames is not None
+def _count(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> _Counted:
+    """Histogram the chosen frames of a band; the same samples lie outside as in the stored histograms."""
     store = open_store(job.store)
     like = store.array("histogram/counts")
-    origin = store.read("histogram/origin", (slice(band.y0, band.y1), slice(None)))
-    counts = np.zeros((*origin.shape, like.shape[2]), like.dtype)
+    origin, low, high = _ranges(store, (slice(band.y0, band.y1), slice(None)))
+    first, size = _occupied(origin, low, high, like.shape[2])
+    origin += first
+    counts = np.zeros((*origin.shape, size), like.dtype)
     under, over = np.zeros((2, *origin.shape), dtype=np.uint32)
-    with _stream(job, band, job.frames) as stream:
+    with _stream(job, band, frames) as stream:
         for _, (block,) in stream:
-            count_frames(block, origin, counts, under, over)
-    return counts, under + over
+            count_frames(block, origin.astype(np.int32), counts, under, over)
+    return _Counted(counts, origin, under + over)
 
 
 def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:

@@ -27,15 +27,19 @@ class PixelHistograms:
 
     Attributes:
         counts: samples per bin, shape (n, n_bins).
+        origin: DN of bin 0, shape (n,).
         outside: samples outside of the bins, shape (n,).
     """
 
     counts: NDArray[np.integer[Any]]
+    origin: NDArray[np.integer[Any]]
     outside: NDArray[np.integer[Any]]
 
     def of(self, mask: NDArray[np.bool_]) -> PixelHistograms:
         """Return those of the chosen pixels."""
-        return self if mask.all() else PixelHistograms(self.counts[mask], self.outside[mask])
+        if mask.all():
+            return self
+        return PixelHistograms(self.counts[mask], self.origin[mask], self.outside[mask])
 
     @property
     def samples(self) -> NDArray[np.int64]:
@@ -45,7 +49,6 @@ class PixelHistograms:
 
 def ensemble_tile(
     maps: tuple[FloatArray, ...],
-    origin: NDArray[np.integer[Any]],
     chosen: PixelHistograms,
     everything: PixelHistograms,
     axes: EnsembleAxes,
@@ -57,9 +60,8 @@ def ensemble_tile(
 
     Args:
         maps: (H, g, mu, sigma) of the pixels, each of shape (n,); NaN where the fit failed.
-        origin: DN of bin 0 of their histograms, shape (n,).
         chosen: histograms of the chosen frames.
-        everything: histograms of all frames, on the same bins.
+        everything: histograms of all frames.
         axes: axes of the ensemble, ``extended`` where the law is that of a model with effects.
         law: of the samples; None: that of the PCD.
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
@@ -75,7 +77,7 @@ def ensemble_tile(
     satellites = None if satellites is None else (satellites[0][mask], satellites[1][mask])
     integers[axes.integers["pixels"]] = len(pixels)
     integers[axes.integers["excluded"]] = mask.size - len(pixels)
-    same, origin = chosen is everything, origin[mask]
+    same = chosen is everything
     chosen = chosen.of(mask)
     everything = chosen if same else everything.of(mask)
     samples = chosen.samples
@@ -93,7 +95,7 @@ def ensemble_tile(
         own = None if satellites is None else (satellites[0][group], satellites[1][group])
         of_group = chosen.of(group)
         sets = (of_group, n), (of_group if same else everything.of(group), n_all)
-        tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, origin[group], *sets, axes)
+        tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, *sets, axes)
         for name, tallied in tallies.items():
             integers[axes.integers[name]] += tallied
         for name, summed in parts.items():
@@ -112,10 +114,10 @@ def _numbers(
     known: KnownPixels,
     pixels: UsablePixels,
     histograms: PixelHistograms,
-    origin: NDArray[np.integer[Any]],
     axes: EnsembleAxes,
 ) -> tuple[NDArray[np.int64], int, Outcomes, NumberTables | None]:
     """Return the samples of each electron number, those beyond, what is expected, and the tables, if any."""
+    origin = histograms.origin
     if not axes.extended:
         return (*numbers_by_thresholds(histograms.counts, origin, pixels, axes.n_k), None)
     low, high = known.codes(histograms.counts, origin)
@@ -146,20 +148,16 @@ def _predicted(
 def _group_sums(
     known: KnownPixels,
     pixels: UsablePixels,
-    origin: NDArray[np.integer[Any]],
     chosen: tuple[PixelHistograms, int],
     everything: tuple[PixelHistograms, int],
     axes: EnsembleAxes,
 ) -> tuple[dict[str, NDArray[np.int64] | int], dict[str, Any]]:
     """Return the tallies and sums of pixels that have the same number of samples."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
-    data = tally(histograms.counts, origin, pixels, axes.dn, axes.nuced)
-    data_all = (
-        data
-        if histograms_all is histograms
-        else tally(histograms_all.counts, origin, pixels, axes.dn, axes.nuced)
-    )
-    numbers, beyond, expected, tables = _numbers(known, pixels, histograms, origin, axes)
+    data = data_all = tally(histograms.counts, histograms.origin, pixels, axes.dn, axes.nuced)
+    if histograms_all is not histograms:
+        data_all = tally(histograms_all.counts, histograms_all.origin, pixels, axes.dn)
+    numbers, beyond, expected, tables = _numbers(known, pixels, histograms, axes)
     outside = int(histograms.outside.sum())
     tallies: dict[str, NDArray[np.int64] | int] = {
         "counts": data.raw,
