@@ -29,17 +29,18 @@ def row_frames(ny: int) -> int:
 
 def create_counts(context: StageContext, bins: int, dtype: Any) -> None:
     """Make the array of the histograms: a file for each tile, of pieces that can be read by themselves."""
-    layout = counts_layout(context, bins)
-    context.create("histogram/counts", (*context.sensor.shape, bins), dtype=dtype, **layout)
+    chunks, shards = counts_layout(context, bins)
+    shape = (*context.sensor.shape, bins)
+    context.create("histogram/counts", shape, chunks=chunks, shards=shards, dtype=dtype)
 
 
-def counts_layout(context: StageContext, bins: int) -> dict[str, tuple[int, ...]]:
-    """Return the chunks of the histograms, and the shards where these are smaller than a tile."""
+def counts_layout(context: StageContext, bins: int) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
+    """Return the chunks of the histograms, and the shards; None where a chunk is a tile."""
     tile = tuple(min(size, length) for size, length in zip(context.tile, context.sensor.shape, strict=True))
     if math.prod(tile) <= _FEW_PIXELS:
-        return {"chunks": (*tile, bins)}
+        return (*tile, bins), None
     read = (_part(side, most) for side, most in zip(tile, (_READ_ROWS, _READ_COLUMNS), strict=True))
-    return {"chunks": (*read, bins), "shards": (*tile, bins)}
+    return (*read, bins), (*tile, bins)
 
 
 def _part(side: int, most: int) -> int:
@@ -82,8 +83,10 @@ def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
     length = context.config.histogram.block_frames
     open_store.cache_clear()
     if store.array("histogram/counts").dtype != counts_dtype(n_frames):
-        counts, layout = (*shape[1:], bins), counts_layout(context, bins)
-        store.create_array("histogram/counts", counts, dtype=counts_dtype(n_frames), **layout)
+        chunks, shards = counts_layout(context, bins)
+        store.create_array(
+            "histogram/counts", (*shape[1:], bins), chunks=chunks, shards=shards, dtype=counts_dtype(n_frames)
+        )
     if context.config.input.mode == "copy":
         store.resize("frames/dn", n_frames)
     if context.config.histogram.summaries:
