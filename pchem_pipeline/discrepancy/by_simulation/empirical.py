@@ -10,7 +10,7 @@ than a sample of the same pixel from another time, which stands for it where the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +56,7 @@ _ROWS_TOGETHER = 4  # neighbouring rows
 _RARE = 1e-6  # least mass of a code: what is rarer has other reasons
 _SURE = 30.0  # nats, the most that a sample says
 _MUTUAL = 0.5  # of rows that come in the place of the next, as many of this part in that of the one before
+_CHUNK = 256  # frames at once
 _ALIGNED = 3.0  # times as many equal squares of one parity as of the others
 _FIRST_SHARE, _STEPS = 0.02, 60
 
@@ -357,6 +358,71 @@ def _measured_slips(
         [Move(towards=place)], [1], np.array([1.0 - share, share]), gain / max(n_samples, 1),
         together=together, exchange=exchange,
     )  # fmt: skip
+
+
+def without_moved_rows(
+    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
+) -> NDArray[np.unsignedinteger]:
+    """Return frames in which rows that were likely moved by effects are replaced by the same row of others.
+
+    Each sample in a pixel's histogram is then its own, as many as there were.
+
+    Args:
+        frames: (frame, y, x), DN.
+        maps: parameters of the pixels, shape (y, x).
+        effects: of the model; those that move rows to the values beside count.
+    """
+    for effect in effects:
+        if not isinstance(effect, Empirical) or effect.together not in ("row", "rest_of_row"):
+            continue
+        place = effect.moves[0].towards
+        if len(effect.moves) == 1 and place in _BESIDE and effect.moves[0].part == 1.0 and effect.share < 1.0:
+            own = (
+                maps
+                if effect.region is None
+                else replace(maps, usable=maps.usable & effect.region.mask(maps.usable.shape))
+            )
+            frames = _with_others(frames, _moved_rows(frames, own, effect, place))
+    return frames
+
+
+def _moved_rows(
+    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effect: Empirical, place: Place
+) -> NDArray[np.bool_]:
+    """Return which rows were more likely moved than not, (frame, y)."""
+    n, ny, _ = frames.shape
+    pixels = np.flatnonzero(maps.usable.ravel())
+    laws = _Laws.of(frames, maps, (), pixels, 1)
+    if laws is None or not pixels.size:
+        return np.zeros((n, ny), np.bool_)
+
+    def sums(way: Place) -> FloatArray:
+        found = []
+        for begin in range(0, n, _CHUNK):
+            some = frames[begin : begin + _CHUNK]
+            each = _of_beside(some, laws, pixels, way, np.arange(len(some)))
+            found.append(_of_groups(*each, effect.together, some.shape).reshape(-1, ny))
+        return np.concatenate(found)
+
+    odds = sums(place) + np.log(effect.share / (1.0 - effect.share))
+    if effect.exchange:
+        odds[:, :-1] += sums((0, -1, 0))[:, 1:]
+        odds[:, effect.exchange == "even" :: 2] = -np.inf
+    moved = np.asarray(odds > 0.0)
+    if effect.exchange:
+        moved[:, 1:] |= moved[:, :-1].copy()
+    return moved
+
+
+def _with_others(
+    frames: NDArray[np.unsignedinteger], moved: NDArray[np.bool_]
+) -> NDArray[np.unsignedinteger]:
+    """Return frames with rows (frame, y) replaced by those of other frames, drawn at random."""
+    found, rng = frames.copy(), np.random.default_rng(0)
+    for y in np.flatnonzero(moved.any(axis=0) & ~moved.all(axis=0)):
+        gone, left = np.flatnonzero(moved[:, y]), np.flatnonzero(~moved[:, y])
+        found[gone, y] = frames[rng.choice(left, gone.size), y]
+    return found
 
 
 def _of_beside(
