@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -355,8 +356,9 @@ class _Common:
         """Covariance of pixels of a column, DN^2."""
         return self._value(self.columns if math.isfinite(self.columns.error) else self.frame)
 
+    @cached_property
     def inflation(self) -> float:
-        """Return by how much correlated pixels raise the variance of a mean over them."""
+        """By how much correlated pixels raise the variance of a mean over them."""
         ny, nx = self.sums.shape
         variance = self.sums.variance
         typical = float(np.median(variance[variance > 0]))
@@ -369,7 +371,7 @@ def _mean_correlation(z: FloatArray, common: _Common) -> tuple[float, float]:
     """Return the mean of correlations that are z standard errors each, and its error, both over 1."""
     freedom = common.sums.freedom_of_all
     kept = np.clip(z, -_CLIP, _CLIP)
-    return float(kept.mean()) / math.sqrt(freedom), math.sqrt(common.inflation() / freedom / kept.size)
+    return float(kept.mean()) / math.sqrt(freedom), math.sqrt(common.inflation / freedom / kept.size)
 
 
 def _lag_check(sums: StackSums, common: _Common) -> list[Check]:

@@ -162,7 +162,8 @@ def _spread(values: FloatArray, variance: FloatArray) -> tuple[float, float]:
         return np.nan, np.nan
     whole = float(values.var(ddof=1))
     own = max(whole - float(np.mean(variance)), 0.0)
-    fourth = float(np.mean((values - values.mean()) ** 4))
+    square = (values - values.mean()) ** 2
+    fourth = float(np.mean(square * square))
     error = np.sqrt(max(fourth - whole**2, 0.0) / values.size)
     return float(np.sqrt(own)), float(error / (2.0 * np.sqrt(own))) if own > 0 else np.nan
 
