@@ -178,6 +178,18 @@ def yaml_text(content: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
+def states(config: RunConfig, dotted: str) -> bool:
+    """Tell whether a YAML states a setting such as ``fit.likelihood``, or leaves it at its default."""
+    value: Any = config
+    for name in dotted.split("."):
+        if not isinstance(value, BaseModel):
+            return True
+        if name not in value.model_fields_set:
+            return False
+        value = getattr(value, name)
+    return True
+
+
 def setting_of(config: RunConfig, dotted: str) -> Any:
     """Return the value of ``section.key`` as plain JSON data."""
     value: Any = config

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
@@ -273,6 +273,12 @@ class ReportData:
     def mostly_flagged(self) -> bool:
         """Tell whether most pixels with a value are flagged: medians of the rest describe no sensor."""
         return self.flagged_share > 0.5
+
+    @property
+    def mostly_coarse(self) -> bool:
+        """Tell whether rounding, which the fit did not count, biases the estimates of most pixels."""
+        status = self.fit.get("fit_status")
+        return status is not None and bool(np.mean((status & int(FitStatus.COARSE_STEPS)) != 0) > 0.5)
 
     @property
     def often_flagged(self) -> bool:

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.config.load import setting_of
+from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions, present_content
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 
 if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
@@ -94,7 +95,7 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
     same = fingerprint_of(content) in (record.fingerprint, fingerprint_of(before))
     if not same and not _grew(content, replace(record, content=before)):
         numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}
-        return "stale", "; ".join(differences(before, content, numbers))
+        return "stale", "; ".join(differences(before, content, numbers, context.config))
     if done < record.keys or record.keys == 0:
         reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
         return "partial", reason
@@ -136,15 +137,28 @@ def _base(fingerprint: str | None) -> str | None:
 
 
 def differences(
-    old: dict[str, Any], new: dict[str, Any], models: Mapping[Any, int] | None = None
+    old: dict[str, Any],
+    new: dict[str, Any],
+    models: Mapping[Any, int] | None = None,
+    config: RunConfig | None = None,
 ) -> list[str]:
-    """Say in words why two fingerprint contents differ; ``models`` are the numbers of models, by digest."""
+    """Say in words why two fingerprint contents differ, and what keeps a result whose default has changed.
+
+    Args:
+        old: content before.
+        new: content now.
+        models: numbers of models, by digest.
+        config: of which the new content is; None: nothing is said of defaults.
+    """
     words: list[str] = []
     if old.get("version") != new["version"]:
         words.append(f"algorithm version {old.get('version')} -> {new['version']}")
     before: dict[str, Any] = old.get("settings", {})
-    for key in sorted(before.keys() | new["settings"].keys()):
-        words += _changes(key, before.get(key), new["settings"].get(key))
+    for section in sorted(before.keys() | new["settings"].keys()):
+        for key, was, now in _changes(section, before.get(section), new["settings"].get(section)):
+            default = config is not None and was is not None and not states(config, key)
+            keep = f" (the default; {key}: {was} in the YAML keeps the result)" if default else ""
+            words.append(f"{key} {was} -> {now}{keep}")
     for name in new["upstream"]:
         if old.get("upstream", {}).get(name) != new["upstream"][name]:
             words.append(f"{name} was done again")
@@ -159,14 +173,16 @@ def _input_changes(old: Any, new: Any, models: Mapping[Any, int]) -> list[str]:
         return ["the content of the input changed"]
     before, after = (models.get(facts.get("model"), "unknown") for facts in (old, new))
     words = [] if old.get("model") == new.get("model") else [f"model {before} -> {after}"]
-    return words + _changes("input", {**old, "model": None}, {**new, "model": None})
+    changes = _changes("input", {**old, "model": None}, {**new, "model": None})
+    return words + [f"{key} {was} -> {now}" for key, was, now in changes]
 
 
-def _changes(key: str, old: Any, new: Any) -> list[str]:
+def _changes(key: str, old: Any, new: Any) -> list[tuple[str, Any, Any]]:
+    """Return the entries that differ: their dotted names, what they were and what they are."""
     if isinstance(old, dict) and isinstance(new, dict):
         return [
-            word
+            change
             for name in sorted(old.keys() | new.keys())
-            for word in _changes(f"{key}.{name}", old.get(name), new.get(name))
+            for change in _changes(f"{key}.{name}", old.get(name), new.get(name))
         ]
-    return [] if old == new else [f"{key} {old} -> {new}"]
+    return [] if old == new else [(key, old, new)]

@@ -43,6 +43,8 @@ def execute(name: str, context: StageContext) -> StageState:
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
+    if before.state == "stale":
+        context.reporter.info(f"{name}: {before.words()} -> done again")
     prepared = context.prepared.get(name)
     if prepared is not None and prepared.clock is not None:
         clock = prepared.clock

@@ -15,6 +15,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from scipy.special import gammaln, logsumexp
 from pchem_pipeline.model.errors.fisher import cramer_rao
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
 
@@ -170,6 +172,42 @@ def bench_speed(rng: np.random.Generator, n: int, n_peer: int, n_frames: int) ->
         print(f"  {name}: median {np.median(gap):.1e}, largest {gap.max():.1e} s.e. from fit_histograms")
 
 
+def bench_rounding(rng: np.random.Generator, n: int) -> None:
+    """Print what counting rounding costs on fine and coarse DN, and what it mends."""
+    ways = [FitSettings(likelihood="density"), FitSettings()]
+    titles = ("density, px/s", "auto, px/s", "refitted", "density, wrong", "auto, wrong")
+    print("\nRounding: fit.likelihood density, and auto, the default; wrong as below")
+    print(
+        f"{'1/g, DN':>10s}{'H':>11s}{'s_e':>12s}{'frames':>8s}" + "".join(f"{each:>16s}" for each in titles)
+    )
+    for step, exposure, noise, n_frames in (
+        ((8, 14), (0.5, 8), (0.22, 0.42), 17_750),
+        ((8, 14), (0.5, 8), (0.22, 0.42), 800),
+        ((7, 10), (0.3, 6), (0.12, 0.35), 4000),
+        ((19, 21), (0.3, 6), (0.2, 0.35), 4000),
+        ((4.8, 5.2), (0.3, 6), (0.22, 0.35), 4000),
+        ((3.3, 3.7), (0.5, 5), (0.2, 0.35), 4000),
+        ((3.3, 3.7), (0.05, 0.2), (0.18, 0.25), 2000),
+        ((2.0, 2.4), (0.5, 5), (0.25, 0.4), 4000),
+    ):
+        pixels = draw_range(rng, n, exposure, noise, n_frames, step)
+        found, rates = [], []
+        for settings in ways:
+            fit = partial(fit_histograms, pixels.counts, pixels.origin, settings=settings)
+            found.append(fit())
+            rates.append(n / min(cpu(fit) for _ in range(3)))
+        moved = np.mean(found[0].n_iterations != found[1].n_iterations)
+        wrong = [is_wrong(estimates(each), pixels.truth).mean() for each in found]
+        ranges = (
+            f"{step[0]:g}..{step[1]:g}",
+            f"{exposure[0]:g}..{exposure[1]:g}",
+            f"{noise[0]:g}..{noise[1]:g}",
+        )
+        print("{:>10s}{:>11s}{:>12s}".format(*ranges) + f"{n_frames:8d}", end="")
+        print("".join(f"{rate:16.0f}" for rate in rates) + f"{moved:16.1%}", end="")
+        print("".join(f"{each:16.2%}" for each in wrong))
+
+
 def bench_maxima(rng: np.random.Generator, n: int, n_frames: int) -> None:
     """Print how many pixels end at a wrong maximum, with and without a word."""
     print(
@@ -233,7 +271,7 @@ def bench_efficiency(rng: np.random.Generator, n: int, n_pulls: int, n_frames: i
 
 
 def main() -> None:
-    """Run the three benchmarks."""
+    """Run the benchmarks."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--pixels", type=int, default=20_000, help="pixels of the speed test")
@@ -248,6 +286,7 @@ def main() -> None:
     share = 10 if options.quick else 1
     rng = np.random.default_rng(options.seed)
     bench_speed(rng, options.pixels // share, max(8, options.peer_pixels // share), options.frames)
+    bench_rounding(rng, options.pixels // share // 4)
     bench_maxima(rng, options.maxima // share, options.frames)
     bench_efficiency(rng, options.grid // share, options.pulls // share, options.frames)
 

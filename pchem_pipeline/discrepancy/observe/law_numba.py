@@ -200,6 +200,9 @@ def within(law: FloatArray, n: float, allowed: float) -> tuple[int, int, float, 
 def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
     """Make the first columns of ``law`` orthonormal, and the tests orthogonal to them.
 
+    A parameter on which the law does not depend here, or not in a way of its own, takes nothing from the
+    tests: its column becomes 0. The read noise is one where each electron number has the same two codes.
+
     Args:
         law: columns times mass; changed in place.
         inverse: 1/p, or 0 for codes to be left out, (code,).
@@ -207,7 +210,7 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
             (N_NUISANCE, N_COLUMNS).
 
     Returns:
-        False if the parameters cannot be told apart.
+        False if no code has any mass.
     """
     fill_zeros(gram)
     for x in range(law.shape[0]):
@@ -218,9 +221,7 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
                 gram[i, j] += value * row[j]
     # Gaussian elimination of the Gram matrix is Gram-Schmidt of the columns
     for i in range(N_NUISANCE):
-        if not gram[i, i] > _SINGULAR:
-            return False
-        scale = 1.0 / math.sqrt(gram[i, i])
+        scale = 1.0 / math.sqrt(gram[i, i]) if gram[i, i] > _SINGULAR else 0.0
         for j in range(i, N_COLUMNS):
             gram[i, j] *= scale
         for k in range(i + 1, N_NUISANCE):
@@ -229,11 +230,11 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
     for x in range(law.shape[0]):
         row = law[x]
         for i in range(N_NUISANCE):
-            value = row[i] / gram[i, i]
+            value = row[i] / gram[i, i] if gram[i, i] > 0.0 else 0.0
             row[i] = value
             for j in range(i + 1, N_COLUMNS):
                 row[j] -= gram[i, j] * value
-    return True
+    return gram[0, 0] > 0.0
 
 
 @kernel
@@ -241,12 +242,14 @@ def _fit_covariance(gram: FloatArray, covariance: FloatArray, inverse: FloatArra
     """Fill the covariance of the fit, times n, along C1, He1, He1 C1, He2 from the triangular factor."""
     fill_zeros(inverse)
     for j in range(_N_DIRECTIONS):
+        if not gram[j + 1, j + 1] > 0.0:
+            continue
         inverse[j, j] = 1.0 / gram[j + 1, j + 1]
         for i in range(j - 1, -1, -1):
             total = 0.0
             for k in range(i + 1, j + 1):
                 total += gram[i + 1, k + 1] * inverse[k, j]
-            inverse[i, j] = -total / gram[i + 1, i + 1]
+            inverse[i, j] = -total / gram[i + 1, i + 1] if gram[i + 1, i + 1] > 0.0 else 0.0
     for i in range(_N_DIRECTIONS):
         for j in range(_N_DIRECTIONS):
             total = 0.0

@@ -48,7 +48,6 @@ MINIMUM_BLOCKS = 4
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
 #: with an unambiguous sample would bias the statistics of the rest.
 UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
-_OTHER_COMB = 0.2  # difference of the logarithms of two conversion gains
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 
 
@@ -70,7 +69,7 @@ def observe(
         numbers: their frame numbers in the run, increasing, (n,).
         n_run: frames of the whole run.
         block_frames: frames in a block; blocks begin anew where numbers are missing.
-        fit: settings of the fit; None: the defaults, and rounding counted where DN are coarse.
+        fit: settings of the fit; the defaults if None.
         exclude: pixels not to look at, (y, x).
         start: parameters near those of these frames, where they are known: saves time.
         fitted: take the parameters from a fit of these frames; False: take ``start`` as it is, for frames too
@@ -137,7 +136,7 @@ def observe_histograms(
     Args:
         counts: one histogram per pixel (and sample), (n, B).
         origin: DN of bin 0, (n,).
-        fit: settings of the fit; None: the defaults, and rounding counted where DN are coarse.
+        fit: settings of the fit; the defaults if None.
         parameters: (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not usable;
             None: each histogram is fitted by itself.
 
@@ -246,32 +245,13 @@ def _fitted(
     fit: FitSettings | None,
     near: PixelMaps | None,
 ) -> tuple[FitResult, FloatArray, NDArray[np.bool_]]:
-    """Return the fit, its parameters (n, 4), and which pixels can be used.
-
-    Where a DN is coarse the density at whole DN may be largest at a comb of electrons that are not there:
-    such pixels are fitted again with rounding counted, and take that fit where its gain is another one.
-    """
+    """Return the fit, its parameters (n, 4), and which pixels can be used."""
     start = None if near is None else near.columns
-    under, over = outside.T.astype(np.int64)
     # every sample counts here: what the tail guard would leave out is what is looked for
     settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
-    result = fit_histograms(counts, origin, under, over, settings=settings, start=start)
-    found = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0)
-    some = np.flatnonzero(found & ((result.fit_status & FitStatus.COARSE_STEPS) != 0))
-    if some.size and fit is None:
-        again = fit_histograms(
-            counts[some],
-            origin[some],
-            under[some],
-            over[some],
-            settings=settings.model_copy(update={"likelihood": "exact"}),
-            start=None if start is None else start[some],
-        )
-        other = np.abs(np.log(again.conversion_gain / result.conversion_gain[some])) > _OTHER_COMB
-        better = other & ((again.fit_status & UNTRUSTWORTHY) == 0)
-        result = result.with_pixels(some[better], again.of(better))
+    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
     parameters = result.columns
-    usable = found & np.isfinite(parameters).all(axis=1)
+    usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
     return result, parameters, usable & _inside(counts, outside)
 
 

@@ -302,7 +302,7 @@ def summarise_pixels(
         allowed_far: the same for samples far beyond.
         moments: see the constants, (n, N_MOMENTS).
         scores: standardised score, its skewness and kurtosis excess, (n, 3, N_TESTS).
-        good: pixels to do; unset where the parameters cannot be told apart, (n,).
+        good: pixels to do; unset where no code has any mass, (n,).
         support: first code and number of codes, and the row of the first one in ``tables``, (n, 3).
         tables: k and r, centred on the samples, one pixel after the other; enough rows for all, (rows, 2).
         codes: counts, expectation, residual and its variance per DN, (4, n_codes).

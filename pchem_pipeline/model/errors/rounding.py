@@ -46,6 +46,12 @@ def rounding_bias(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic
     return out
 
 
+def rounding_may_matter(variance: FloatArray, n_frames: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Tell where peaks, or whole histograms, of these variances (DN^2) are not so wide that they are safe."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray(np.sqrt(np.asarray(n_frames, np.float64)) > _SAFE * variance**2)
+
+
 def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> NDArray[np.bool_]:
     """Tell in which pixels rounding biases the density's estimates by more than :data:`LARGEST_BIAS`.
 
@@ -54,8 +60,7 @@ def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.ge
         n_frames: frames of each pixel, shape (n,).
     """
     sigma, frames = np.asarray(parameters[3], np.float64), np.asarray(n_frames, np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        suspects = np.flatnonzero(np.isfinite(sigma) & (np.sqrt(frames) > _SAFE * sigma**4))
+    suspects = np.flatnonzero(np.isfinite(sigma) & rounding_may_matter(sigma**2, frames))
     biased = np.zeros(sigma.shape, np.bool_)
     found = rounding_bias([np.asarray(each)[suspects] for each in parameters], frames[suspects])
     biased[suspects] = ~(np.abs(found).max(axis=1, initial=0.0) < LARGEST_BIAS)

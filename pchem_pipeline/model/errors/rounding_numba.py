@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow, solve_arrow
-from pchem_pipeline.model.law.pcd_numba import masses
+from pchem_pipeline.model.law.normal_numba import add_mass
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CUMULATIVE,
@@ -32,6 +32,7 @@ from pchem_pipeline.model.law.pixel_numba import (
 )
 
 _REACH = 8.0  # standard deviations
+_NO_FRAMES = 1e-9  # expected with a number of electrons that hardly occurs
 
 
 @kernel(inline=True)
@@ -59,19 +60,22 @@ def _shift(parameters: NDArray[np.float64], n: float, evaluate: Any, shift: NDAr
     offset = bias - math.floor(bias)
     pixel = make_pixel(np.zeros(1, np.bool_), n_bins, 0, 0)
     scratch = make_scratch(1, n_bins, np.bool_(False))
-    places = np.arange(n_bins) + float(first)
-    same = np.ones(n_bins)
     weights, cumulative, facts = pixel.bins[0, WEIGHT, :n_bins], pixel.bins[0, CUMULATIVE], pixel.facts[0]
-    masses(places, exposure * same, same / a, offset * same, math.sqrt(analog2) / a * same, weights)
+    electrons, holding = 0.0, n
+    weights[:] = 0.0
+    while electrons < exposure or holding > _NO_FRAMES:
+        holding = n * math.exp(electrons * math.log(exposure) - exposure - math.lgamma(electrons + 1.0))
+        if holding > _NO_FRAMES:
+            add_mass(weights, float(first), holding, offset + electrons * a, math.sqrt(analog2))
+        electrons += 1.0
     total = mean = variance = 0.0
     for i in range(n_bins):
-        weights[i] *= n
         cumulative[i + 1] = cumulative[i] + weights[i]
         total += weights[i]
-        mean += weights[i] * places[i]
+        mean += weights[i] * (first + i)
     mean /= total
     for i in range(n_bins):
-        variance += weights[i] * (places[i] - mean) ** 2 / total
+        variance += weights[i] * (first + i - mean) ** 2 / total
     facts[N_BINS], facts[FIRST], facts[N_FRAMES], facts[MEAN] = float(n_bins), float(first), total, mean
     facts[VARIANCE] = variance
     theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]

@@ -12,7 +12,7 @@ from scipy.special import chdtrc, chdtri
 
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import observed_covariance
-from pchem_pipeline.model.errors.rounding import biased_by_rounding
+from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
 from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
@@ -156,17 +156,18 @@ def likelihood_moments(
         adc_limits: first and last code of the ADC, DN.
     """
     settings = settings or FitSettings()
-    batch = _Batch([counts], [origin], [False], settings, adc_limits, None, None)
-    cells = law is not None or settings.likelihood == "exact"
-    laws = ([law] if law is not None else batch.neutral()) if cells else [SampleLaw()]
-    limits = batch.limits(laws if cells else None)
-    evaluate = cells_likelihood() if cells else density_likelihood()
-    columns = np.ascontiguousarray(known[:, :4])
-    batch.leave_out_again(columns, outlier_share, laws, limits)
-    gap = known[:, 4]
-    reach = np.where(gap < _RIVAL_GAP, _RIVAL_REACH, 0.0)
-    own = np.zeros((batch.n, 2)) if satellites is None else np.nan_to_num(satellites)
-    return profile.moments_along_bias(batch.given, pack(laws, batch.n), limits, evaluate, columns, own, reach)
+    cells = np.full(len(known), law is not None or settings.likelihood == "exact")
+    if law is None and settings.likelihood == "auto":
+        frames = counts.sum(axis=1, dtype=np.int64) * (1.0 - outlier_share)
+        cells = biased_by_rounding([*known[:, :4].T], frames)
+    free = np.zeros((len(known), 2)) if satellites is None else np.nan_to_num(satellites)
+    parts = []
+    for pixels in (np.flatnonzero(~cells), np.flatnonzero(cells)):
+        if pixels.size:
+            batch = _Batch([counts[pixels]], [origin[pixels]], [False], settings, adc_limits, None, None)
+            own = None if not cells[pixels[0]] else batch.neutral() if law is None else [law.of(pixels)]
+            parts.append((pixels, batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])))
+    return profile.Moments.joined(len(known), parts)
 
 
 def satellite_threshold(law: SampleLaw) -> float:
@@ -293,8 +294,7 @@ class _Batch:
         elif self.settings.likelihood == "exact":
             pixels = np.flatnonzero((plain.fit_status & int(_NO_FIT)) == 0)
         elif self.settings.likelihood == "auto":
-            failed = (plain.fit_status & int(FAILED & ~_NO_FIT)) != 0
-            pixels = np.flatnonzero(self._biased(plain) | failed)
+            pixels = np.flatnonzero(self._coarse(plain))
         else:
             pixels = np.empty(0, np.intp)
         if pixels.size == 0:
@@ -394,6 +394,22 @@ class _Batch:
             np.zeros((n, tile_numba.N_WORDS), np.int64),
         )
 
+    def moments(
+        self,
+        known: FloatArray,
+        outlier_share: FloatArray,
+        laws: Sequence[SampleLaw] | None,
+        satellites: FloatArray,
+    ) -> profile.Moments:
+        """Return moments over the likelihood of the cells under these laws, or of the density."""
+        limits, evaluate = self.limits(laws), cells_likelihood() if laws else density_likelihood()
+        laws = laws or [SampleLaw()]
+        columns = np.ascontiguousarray(known[:, :4])
+        self.leave_out_again(columns, outlier_share, laws, limits)
+        reach = np.where(known[:, 4] < _RIVAL_GAP, _RIVAL_REACH, 0.0)
+        law = pack(laws, self.n)
+        return profile.moments_along_bias(self.given, law, limits, evaluate, columns, satellites, reach)
+
     # -- what they are told
 
     def limits(self, laws: Sequence[SampleLaw] | None, *, warm: bool = False, scan: bool = False) -> Limits:
@@ -438,14 +454,20 @@ class _Batch:
             found |= (beyond & (self.given.counts[:, part] > 0)).any(axis=1)
         return found
 
-    def _biased(self, plain: FitResult) -> NDArray[np.bool_]:
-        """Tell in which pixels rounding biases the density's estimates, of any sample."""
-        columns, found = plain.columns, np.zeros(self.n, np.bool_)
-        kept = np.where(self.given.mask == LEFT_OUT, 0, self.given.counts)
+    def _coarse(self, plain: FitResult) -> NDArray[np.bool_]:
+        """Tell in which pixels rounding biases the density's estimates, of any sample, or may deny them."""
+        columns, words = plain.columns, plain.fit_status
+        found = (words & int(FitStatus.COARSE_STEPS | FitStatus.NOT_CONVERGED)) != 0
+        denied = (words & int(FAILED & ~_NO_FIT)) != 0
+        variance = plain.variance.reshape(self.n, -1)
+        fewer = np.flatnonzero(plain.outlier_share > 0)
         for j in np.flatnonzero(~self.given.dark):
-            frames = kept[:, self.given.places[j] : self.given.places[j + 1]].sum(axis=1, dtype=np.float64)
-            own = [columns[:, j], *columns[:, self.n_samples :].T]
-            found |= biased_by_rounding(own, frames)
+            part = slice(self.given.places[j], self.given.places[j + 1])
+            frames = self.given.counts[:, part].sum(axis=1, dtype=np.int64)
+            gone = self.given.mask[fewer, part] == LEFT_OUT
+            frames[fewer] -= np.where(gone, self.given.counts[fewer, part], 0).sum(axis=1, dtype=np.int64)
+            found |= biased_by_rounding([columns[:, j], *columns[:, self.n_samples :].T], frames)
+            found |= denied & rounding_may_matter(variance[:, j], frames)
         return found
 
     # -- what they found

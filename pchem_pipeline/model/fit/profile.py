@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,15 @@ class Moments:
     covariance: FloatArray
     rival_weight: FloatArray
     rivals: FloatArray
+
+    @classmethod
+    def joined(cls, n: int, parts: Iterable[tuple[NDArray[np.intp], Moments]]) -> Moments:
+        """Return the moments of n pixels, put together from those of some of them each."""
+        found = cls(np.full((n, 4, 4), np.nan), np.zeros((n, 2)), np.full((n, 2, 4), np.nan))
+        for pixels, part in parts:
+            for each in fields(cls):
+                getattr(found, each.name)[pixels] = getattr(part, each.name)
+        return found
 
 
 def moments_along_bias(

@@ -105,11 +105,6 @@ class FitResult(PixelParameters):
         more = self.bias.size - len(rows)
         return html_table(head, rows) + (f"<p>and {more:,} more</p>" if more else "")
 
-    def of(self, pixels: NDArray[Any]) -> FitResult:
-        """Return the fit of some pixels alone."""
-        given = {each.name: getattr(self, each.name) for each in fields(self)}
-        return replace(self, **{name: a[pixels] for name, a in given.items() if a is not None})
-
     def with_pixels(self, pixels: NDArray[np.intp], part: FitResult) -> FitResult:
         """Return a copy with the fit of some pixels in their places."""
         arrays: dict[str, Any] = {}

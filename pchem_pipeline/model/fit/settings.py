@@ -18,10 +18,11 @@ class FitSettings(Section):
         "help. em: the plain EM of the paper (slow when the read noise exceeds 0.4 e-)",
     )
     likelihood: Literal["density", "exact", "auto"] = Field(
-        default="density",
+        default="auto",
         description="density: the PCD at whole DN, as in the paper. exact: each component integrated over "
         "the cell of its code, codes at the limits of the ADC censored (three times slower). auto: exact in "
-        "the pixels where rounding would bias the density's estimates by more than 0.05 standard errors",
+        "the pixels whose DN are coarse, where rounding would bias the density's estimates by more than 0.05 "
+        "standard errors, and density in the others",
     )
     max_iterations: int = Field(
         default=200,

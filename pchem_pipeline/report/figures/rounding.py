@@ -27,8 +27,8 @@ _NAMES = ("quanta exposure", "conversion gain", "bias", "read noise")
 _CAPTION = (
     "Bias that rounding gives to estimates from the density of the PCD, in standard errors of one pixel, "
     "at the median quanta exposure and read noise of this run and its number of frames; the worst of all "
-    "places of the bias between two whole DN. Above the dotted line (0.05) "
-    "fit.likelihood: auto fits with the exact masses."
+    "places of the bias between two whole DN. Above the dotted line (0.05) the fit takes the exact masses, "
+    "unless fit.likelihood is density."
 )
 
 

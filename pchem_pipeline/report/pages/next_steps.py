@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import ReportData
 
 #: Stands for the run in a command.
@@ -58,9 +55,12 @@ def next_steps(data: ReportData) -> list[Step]:
                 "how many frames of which exposures are enough, at the read noise that you expect",
             ),
         ]
-    if _coarse(data):
+    if data.mostly_coarse:
         found.append(
-            Step(f"pchem run {RUN}", "with fit.likelihood: auto in the YAML, which integrates the codes")
+            Step(
+                f"pchem run {RUN}",
+                "without fit.likelihood: density in the YAML: auto counts rounding",
+            )
         )
     if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
         found.append(Step(f"pchem discrepancy {RUN}", "look for what the model is missing"))
@@ -74,9 +74,3 @@ def _read_noise(data: ReportData) -> str:
     if data.mostly_flagged or not data.has_values("read_noise_e"):
         return "0.6"
     return f"{data.summary('read_noise_e').median:.2g}"
-
-
-def _coarse(data: ReportData) -> bool:
-    """Tell whether rounding biases most pixels."""
-    status = data.fit.get("fit_status")
-    return status is not None and bool(np.mean((status & int(FitStatus.COARSE_STEPS)) != 0) > 0.5)

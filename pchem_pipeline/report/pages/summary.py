@@ -337,12 +337,9 @@ def _conditions(data: ReportData) -> list[Flag]:
         found.append(
             Flag("caution", "Read noise above 0.5 e⁻: one exposure tells little; take several exposures.")
         )
-    if data.has_values("conversion_gain") and data.summary("conversion_gain").median > 0.4:
+    if data.mostly_coarse:
         found.append(
-            Flag(
-                "caution",
-                "Conversion gain above 0.4 e⁻/DN: rounding to whole DN biases the read noise upwards.",
-            )
+            Flag("caution", "DN too coarse for fit.likelihood: density: rounding biases the estimates.")
         )
     for stage in data.stages:
         if stage.get("state") not in (None, "complete"):

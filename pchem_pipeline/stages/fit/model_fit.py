@@ -46,7 +46,9 @@ def fit_model(
     """
     if not effects:
         return fit(settings=settings, start=start, excluding=set_aside)
-    simple = settings.model_copy(update={"likelihood": "density", "intervals": "normal"})
+    # the law is integrated over the cells: a start with all of them would be in vain
+    likelihood = "density" if settings.likelihood == "density" else "auto"
+    simple = settings.model_copy(update={"likelihood": likelihood, "intervals": "normal"})
     plain = fit(settings=simple, start=start)
     return fit(settings=settings, start=plain, law=_laws(plain, effects, added, places), excluding=set_aside)
 

@@ -86,6 +86,28 @@ def test_scores_are_orthogonal_to_the_parameters_and_know_their_variance() -> No
     assert out[0, 2] - still[2] == pytest.approx(0.05 * np.sqrt(1e4 * variance), rel=1e-3)
 
 
+def test_a_parameter_without_a_trace_in_the_law_takes_nothing_from_the_scores() -> None:
+    # each electron number has the same two codes, half of its samples in each, whatever the read noise
+    first, last = law_numba.electron_range(H, np.log(1e-12))
+    law = np.zeros((160, law_numba.N_COLUMNS))
+    law_numba.fill_law(H, 4.0, 40.5, 0.1, first, last, law)
+    inverse = np.divide(1.0, law[:, 0], out=np.zeros(160), where=law[:, 0] > 1e-14)
+    raw, gram = law.copy(), np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
+    assert law_numba.whiten(law, inverse, gram)
+    n = law_numba.N_NUISANCE
+    products = (law * inverse[:, None]).T @ law
+    lost = np.diagonal(products)[:n] < 0.5
+    assert lost[4]
+    assert not lost[:3].any()
+    np.testing.assert_allclose(products[:n, :n], np.diag(~lost), atol=1e-9)
+    np.testing.assert_allclose((law[:, n:] * inverse[:, None]).T @ raw[:, :n], 0.0, atol=1e-7)
+    out = np.empty((3, law_numba.N_TESTS))
+    law_numba.pixel_scores(law, inverse, 1e4 * raw[:, 0], gram, H, out)
+    known = np.isfinite(out[0])
+    assert known.any()
+    assert np.abs(out[0, known]).max() < 0.2
+
+
 def test_bias_of_the_scores_is_that_of_fitted_samples() -> None:
     # the second-order expectation against its definition by finite differences of the law
     gram = np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))

@@ -411,20 +411,19 @@ def test_poor_goodness_of_fit_is_said(data: ReportData) -> None:
     assert flags(data)[0].level != "serious"
 
 
-def test_unfinished_stages_and_high_read_noise_are_said(data: ReportData) -> None:
+def test_unfinished_stages_high_read_noise_and_coarse_steps_are_said(data: ReportData) -> None:
+    status = data.fit["fit_status"] | np.uint16(FitStatus.COARSE_STEPS)
     odd = replace(
         data,
         stages=[{"stage": "fit", "state": "3 of 4 units"}],
-        maps={
-            **data.maps,
-            "read_noise_e": data.maps["read_noise_e"] + 0.4,
-            "conversion_gain": data.maps["conversion_gain"] * 6,
-        },
+        maps={**data.maps, "read_noise_e": data.maps["read_noise_e"] + 0.4},
+        fit={**data.fit, "fit_status": status},
     )
     words = " ".join(flag.text for flag in flags(odd))
     assert "Stage fit is 3 of 4 units" in words
     assert "above 0.5 e⁻" in words
-    assert "above 0.4 e⁻/DN" in words
+    assert "too coarse for fit.likelihood: density" in words
+    assert "too coarse" not in " ".join(flag.text for flag in flags(data))
 
 
 def test_a_pixel_beside_its_numbers() -> None:

@@ -5,17 +5,20 @@ import pytest
 from helpers.drawn_pixels import draw
 from scipy.optimize import minimize
 
+from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.model.errors.fisher import cramer_rao
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias
-from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.api import fit_histograms, likelihood_moments
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
-from pchem_pipeline.run.session import Command, run_stages
+from pchem_pipeline.run.session import Command, run_stages, run_status
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.stages.fit.fit import fit_tile
 from pchem_pipeline.store.run_store import RunStore
 
-EXACT, AUTO = FitSettings(likelihood="exact"), FitSettings(likelihood="auto")
+EXACT, DENSITY = FitSettings(likelihood="exact"), FitSettings(likelihood="density")
+AUTO = FitSettings()
 
 
 def stack(results):
@@ -71,14 +74,58 @@ def test_pixels_are_named_where_rounding_matters_and_what_is_skipped_is_safe():
 def test_density_is_left_alone_and_auto_refits_only_what_rounding_biases():
     fine, coarse = (draw(np.random.default_rng(2), [1.0, 2.0], step, 0.3) for step in (10.0, 2.5))
     for drawn, changes in ((fine, False), (coarse, True)):
-        plain = fit_histograms(drawn.counts, drawn.origin)
-        same = fit_histograms(drawn.counts, drawn.origin, start=plain)
+        plain = fit_histograms(drawn.counts, drawn.origin, settings=DENSITY)
+        same = fit_histograms(drawn.counts, drawn.origin, settings=DENSITY, start=plain)
         np.testing.assert_array_equal(same.conversion_gain, plain.conversion_gain)
         auto = fit_histograms(drawn.counts, drawn.origin, settings=AUTO, start=plain)
         assert ((auto.conversion_gain != plain.conversion_gain) == changes).all()
     exact = fit_histograms(drawn.counts, drawn.origin, settings=EXACT, start=plain)
     np.testing.assert_array_equal(exact.conversion_gain, auto.conversion_gain)
     assert (plain.fit_status & FitStatus.COARSE_STEPS == 0).all() or (exact.fit_status == 0).all()
+
+
+def few_electrons(seed, n, n_frames=2000):
+    """Return histograms by plain numpy, where a DN is coarse and few frames hold electrons."""
+    rng = np.random.default_rng(seed)
+    step, bias = rng.uniform(3.3, 3.7, n), rng.uniform(95.0, 105.0, n)
+    electrons = rng.poisson(0.1, (n_frames, n)) + 0.2 * rng.standard_normal((n_frames, n))
+    codes = np.rint(bias + step * electrons).astype(np.int64) - 85
+    return np.stack([np.bincount(pixel, minlength=60) for pixel in codes.T]).astype(np.uint32), step
+
+
+def test_the_default_takes_no_pixel_for_a_comb_of_electrons_that_are_not_there():
+    counts, step = few_electrons(31, 300)
+    origin = np.full(300, 85)
+    by_default, by_density = (
+        fit_histograms(counts, origin, settings=each).conversion_gain * step for each in (AUTO, DENSITY)
+    )
+    assert np.abs(by_default - 1).max() < 0.25
+    wrong = np.abs(by_density - 1) > 1
+    assert wrong.sum() > 5  # as it would be
+    assert (by_density[wrong] > 2).all()
+
+
+@pytest.mark.parametrize("start", ["density", "auto"])
+def test_a_law_with_effects_starts_at_the_comb_of_electrons_that_are_there(start):
+    counts, step = few_electrons(32, 100)
+    histogram = {"counts": counts[:, None], "origin": np.full((100, 1), 85, np.int32)}
+    histogram |= {name: np.zeros((100, 1), np.int32) for name in ("under", "over")}
+    found = fit_tile(histogram, FitSettings(likelihood=start), None, [RowNoise(row_noise_dn=0.1)])
+    off = np.abs(found["conversion_gain"][:, 0] * step - 1)
+    assert (off > 1).any() == (start == "density")
+
+
+def test_moments_are_those_of_the_likelihood_of_each_pixel():
+    drawn = draw(np.random.default_rng(2), [1.0, 2.0, 1.0, 2.0], [10.0, 3.0, 3.0, 10.0], 0.3)
+    fit = fit_histograms(drawn.counts, drawn.origin)
+    known = np.column_stack([fit.columns, fit.likelihood_gap])
+    auto, density, exact = (
+        likelihood_moments(drawn.counts, drawn.origin, known, fit.outlier_share, settings=settings).covariance
+        for settings in (AUTO, DENSITY, EXACT)
+    )
+    np.testing.assert_array_equal(auto[[0, 3]], density[[0, 3]])
+    np.testing.assert_array_equal(auto[[1, 2]], exact[[1, 2]])
+    assert (density[1] != exact[1]).all()
 
 
 def test_the_exact_maximum_is_that_of_scipy():
@@ -105,7 +152,7 @@ def test_the_exact_maximum_is_that_of_scipy():
 
 def test_few_dn_per_electron_have_their_own_starts():
     drawn = draw(np.random.default_rng(1), np.full(8, 2.0), 1.2, 0.384)
-    plain = fit_histograms(drawn.counts, drawn.origin)
+    plain = fit_histograms(drawn.counts, drawn.origin, settings=DENSITY)
     mine = fit_histograms(drawn.counts, drawn.origin, settings=AUTO, start=plain)
     good = mine.fit_status == 0
     assert good.sum() >= 5
@@ -127,18 +174,15 @@ def test_nothing_to_fit_stays_nothing():
     assert np.isnan(found.conversion_gain).all()
 
 
-def test_a_run_says_how_many_pixels_rounding_biases(tmp_path):
+def test_a_run_says_how_many_pixels_rounding_biases_and_that_a_default_would_do_it_again(tmp_path, capsys):
     drawn = draw(np.random.default_rng(3), [1.0, 2.0, 1.5], 2.5, 0.3)
     dn = drawn.origin[0] + np.arange(drawn.counts.shape[1])
     np.savez(tmp_path / "h.npz", dn=dn, counts=drawn.counts)
     gains = {}
+    path, common = tmp_path / "run.yaml", "run: {store: run.zarr, tile: 8}\ninput: {files: [h.npz]}\n"
     for likelihood, words in (("density", "biases 100.0% of the pixels by more than 0.05"), ("auto", "")):
-        path = tmp_path / "run.yaml"
-        path.write_text(
-            "run: {store: run.zarr, tile: 8}\ninput: {files: [h.npz]}\n"
-            f"fit: {{likelihood: {likelihood}}}\n"
-        )
-        run_stages(find_run(path), ["ingest", "histogram", "fit"], Command(quiet=True, progress="off"))
+        path.write_text(common + ("fit: {likelihood: density}\n" if likelihood == "density" else ""))
+        run_stages(find_run(path), ["ingest", "histogram", "fit"], Command(progress="off"))
         store = RunStore.open(tmp_path / "run.zarr")
         record = store.records.read("fit")
         assert record is not None
@@ -146,3 +190,8 @@ def test_a_run_says_how_many_pixels_rounding_biases(tmp_path):
         assert ("rounding" in " ".join(record.notes)) == bool(words)
         gains[likelihood] = store.read("fit/conversion_gain")
     assert (gains["density"] != gains["auto"]).all()
+    change = "density -> auto (the default; fit.likelihood: density in the YAML keeps the result)"
+    assert f"fit: stale - fit.likelihood {change} -> done again" in capsys.readouterr().err
+    path.write_text(common + "fit: {likelihood: exact}\n")
+    [words] = [state.words() for state in run_status(find_run(path)) if state.stage == "fit"]
+    assert words == "stale - fit.likelihood auto -> exact"
