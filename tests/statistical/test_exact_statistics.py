@@ -17,7 +17,7 @@ def test_exact_is_unbiased_and_the_density_biased_as_predicted(step, exposure):
     rng = np.random.default_rng(int(10 * step))
     frames = 100_000
     drawn = draw(rng, np.full(N, exposure), step, noise, np.full(N, 100.3), frames)
-    plain = fit_histograms(drawn.counts, drawn.origin)
+    plain = fit_histograms(drawn.counts, drawn.origin, settings=FitSettings(likelihood="density"))
     exact = fit_histograms(drawn.counts, drawn.origin, settings=FitSettings(likelihood="exact"), start=plain)
     predicted = rounding_bias(list(drawn.truth[:1].T), np.array([float(frames)]))[0]
     names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
