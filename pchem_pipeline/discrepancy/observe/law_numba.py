@@ -234,7 +234,7 @@ def whiten(law: FloatArray, inverse: FloatArray, gram: FloatArray) -> bool:
             row[i] = value
             for j in range(i + 1, N_COLUMNS):
                 row[j] -= gram[i, j] * value
-    return gram[0, 0] > 0.0
+    return bool(gram[0, 0] > 0.0)
 
 
 @kernel

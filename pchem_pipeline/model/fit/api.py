@@ -468,7 +468,7 @@ class _Batch:
             frames[fewer] -= np.where(gone, self.given.counts[fewer, part], 0).sum(axis=1, dtype=np.int64)
             found |= biased_by_rounding([columns[:, j], *columns[:, self.n_samples :].T], frames)
             found |= denied & rounding_may_matter(variance[:, j], frames)
-        return found
+        return np.asarray(found)
 
     # -- what they found
 
