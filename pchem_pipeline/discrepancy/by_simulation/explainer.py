@@ -304,13 +304,15 @@ class FrameExplainer:
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
         """
-        left = self.gap(null, z)
-        found = None if left.at_floor else self._unexplained(z).by_itself()
+        unexplained, left = self._unexplained(z), self.gap(null, z)
+        found = unexplained.by_itself()
         if found is None:
             return None
         gap = self._gap_of(found, z)
-        clearly = gap.at_floor or gap.interval[1] < _CLEARLY_LESS * left.value
-        return self._put_measured(found) if clearly else None
+        better = gap.interval[1] < _CLEARLY_LESS * left.value
+        # effects that the final frames do not tell from the truth are known to leave something by the others
+        as_good = gap.at_floor and (not left.at_floor or unexplained.leaves_nothing(found))
+        return self._put_measured(found) if better or as_good else None
 
     def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
         """Measure what no effect explains in the samples, and put it into the model.
@@ -324,10 +326,10 @@ class FrameExplainer:
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
         """
-        left = self.gap(null, z)
-        if left.at_floor:
-            return None
         self.effort.release()
+        instead, left = self.replaced(null, z), self.gap(null, z)
+        if instead is not None or left.at_floor:
+            return instead
         unexplained, sure = self._unexplained(z), self._sure(null, z)
         best: tuple[tuple[bool, float], Refitted] | None = None
         for kept in ((), sure) if sure else ((),):

@@ -120,9 +120,13 @@ class Unexplained:
                     return found
         return None
 
+    def leaves_nothing(self, one: Refitted) -> bool:
+        """Tell whether a set leaves no statistic beyond chance."""
+        return leaves_nothing(self.refitter, one)
+
     def _leaves_little(self, one: Refitted) -> bool:
         """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
-        return leaves_nothing(self.refitter, one) or one.chance - one.score < _LITTLE * (
+        return self.leaves_nothing(one) or one.chance - one.score < _LITTLE * (
             one.chance - self.refitter.nothing
         )
 

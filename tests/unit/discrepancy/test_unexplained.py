@@ -135,7 +135,7 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
         return None if how is None else SimpleNamespace(name=name, effects=effects, closes=how[0])
 
     known = {0: found("alone", alone), 1: found("beside", beside)}
-    measures = SimpleNamespace(measured=lambda kept: known[len(kept)])
+    measures = SimpleNamespace(measured=lambda kept: known[len(kept)], by_itself=lambda: None)
     wide, closed = Gap(1.0, 0.01, (0.9, 1.1), {}), Gap(0.0, 0.01, (-0.01, 0.01), {})
     part = Gap(0.2, 0.01, (0.1, 0.3), {})
     monkeypatch.setattr(search, "_unexplained", lambda _: measures)
@@ -145,3 +145,31 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
     monkeypatch.setattr(search, "_put_measured", lambda one: one.name)
     nothing: Any = None
     assert search.describe(wide, nothing, nothing) == chosen
+
+
+@pytest.mark.parametrize(
+    ("left", "found", "nothing", "replaced"),
+    [
+        ("part", "closed", False, True),
+        ("part", "part", False, False),
+        ("wide", "part", False, True),
+        ("closed", "closed", False, False),  # what has a name is kept where it does as well
+        ("closed", "closed", True, True),
+    ],
+)
+def test_what_leaves_clearly_less_replaces_effects_with_a_name(
+    monkeypatch: pytest.MonkeyPatch, left: str, found: str, nothing: bool, replaced: bool
+) -> None:
+    gaps = {
+        "wide": Gap(1.0, 0.01, (0.9, 1.1), {}),
+        "part": Gap(0.2, 0.01, (0.1, 0.3), {}),
+        "closed": Gap(0.0, 0.01, (-0.01, 0.01), {}),
+    }
+    search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
+    measures = SimpleNamespace(by_itself=lambda: "one", leaves_nothing=lambda _: nothing)
+    monkeypatch.setattr(search, "_unexplained", lambda _: measures)
+    monkeypatch.setattr(search, "gap", lambda *_: gaps[left])
+    monkeypatch.setattr(search, "_gap_of", lambda *_: gaps[found])
+    monkeypatch.setattr(search, "_put_measured", lambda one: one)
+    unused: Any = None
+    assert search.replaced(unused, unused) == ("one" if replaced else None)
