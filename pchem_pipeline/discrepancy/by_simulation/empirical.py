@@ -62,10 +62,16 @@ _FIRST_SHARE, _STEPS = 0.02, 60
 
 
 class Measurement(NamedTuple):
-    """What was measured, and by how much likelier the samples are with it, nats."""
+    """What was measured, by how much likelier the samples are with it, nats, and what it may be as well."""
 
     effect: Effect
     gain: float
+    others: tuple[Effect, ...] = ()
+
+    @property
+    def unlisted(self) -> bool:
+        """Whether it may be of a kind that no effect with a name makes."""
+        return any(effect.unlisted for effect in (self.effect, *self.others))
 
 
 @dataclass(frozen=True)
@@ -360,30 +366,50 @@ def _measured_slips(
     )  # fmt: skip
 
 
-def without_moved_rows(
+def without_moved(
     frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
 ) -> NDArray[np.unsignedinteger]:
-    """Return frames in which rows that were likely moved by effects are replaced by the same row of others.
+    """Return frames in which samples that were likely moved by effects are replaced by those of other frames.
 
     Each sample in a pixel's histogram is then its own, as many as there were.
 
     Args:
         frames: (frame, y, x), DN.
         maps: parameters of the pixels, shape (y, x).
-        effects: of the model; those that move rows to the values beside count.
+        effects: of the model; those count that move rows to the values beside, or average squares.
     """
     for effect in effects:
-        if not isinstance(effect, Empirical) or effect.together not in ("row", "rest_of_row"):
+        if not isinstance(effect, Empirical) or not 0.0 < effect.share < 1.0:
             continue
+        own = maps
+        if effect.region is not None:
+            own = replace(maps, usable=maps.usable & effect.region.mask(maps.usable.shape))
         place = effect.moves[0].towards
-        if len(effect.moves) == 1 and place in _BESIDE and effect.moves[0].part == 1.0 and effect.share < 1.0:
-            own = (
-                maps
-                if effect.region is None
-                else replace(maps, usable=maps.usable & effect.region.mask(maps.usable.shape))
-            )
+        if effect.squares:
+            moved = _in_equal_squares(frames, effect.squares) & own.usable
+            alone = (len(frames), own.usable.size)
+            frames = _with_others(frames.reshape(*alone, 1), moved.reshape(alone)).reshape(frames.shape)
+        elif (
+            effect.together in ("row", "rest_of_row")
+            and len(effect.moves) == 1
+            and effect.moves[0].part == 1.0
+            and place in _BESIDE
+        ):
             frames = _with_others(frames, _moved_rows(frames, own, effect, place))
     return frames
+
+
+def _in_equal_squares(frames: NDArray[np.unsignedinteger], parity: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return which samples lie in squares of equal ones, from a parity on, (frame, y, x)."""
+    found = np.zeros(frames.shape, np.bool_)
+    first = frames[:, parity[0] :: 2, parity[1] :: 2]
+    others = [frames[:, parity[0] + y :: 2, parity[1] + x :: 2] for y, x in ((0, 1), (1, 0), (1, 1))]
+    ny, nx = others[-1].shape[1:]
+    equal = np.logical_and.reduce([first[:, :ny, :nx] == each[:, :ny, :nx] for each in others])
+    for y in (0, 1):
+        for x in (0, 1):
+            found[:, parity[0] + y :: 2, parity[1] + x :: 2][:, :ny, :nx] = equal
+    return found
 
 
 def _moved_rows(

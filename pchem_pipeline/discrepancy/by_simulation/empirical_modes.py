@@ -24,6 +24,7 @@ BoolArray = NDArray[np.bool_]
 _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light")
 _OF: tuple[Shared, ...] = ("frame", "row", "column")
 _CLEAR = 15.0  # nats
+_NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
 # times what a Gaussian explains that bursts must, and nats: the scores are skewed themselves
 _OF_GAUSSIAN, _BURST = 1.3, 10.0
 _CHUNK = 256  # frames at once
@@ -143,29 +144,49 @@ def measured_mode(
         maps: parameters of the pixels.
         inside: pixels that were looked at, shape (y, x).
     """
-    best: tuple[Shared, Changed, Sums, tuple[tuple[float, ...], ...], float] | None = None
-    gain = _CLEAR
+    found: list[tuple[float, Shared, Changed]] = []
     for (of, changed), sums in data.items():
-        one, blocks = _shaped(sums)
-        expected = max(model[of, changed].ratio, 1.0)
-        ratio = max(one.ratio / expected, 1.0)
-        here = 0.5 * one.number * (ratio - 1.0 - np.log(ratio))
-        if here > gain:
-            best, gain = (of, changed, one, blocks, one.ratio - expected), here
-    if best is None or best[1] == "offset":
+        one, _ = _shaped(sums)
+        ratio = max(one.ratio / max(model[of, changed].ratio, 1.0), 1.0)
+        found.append((0.5 * one.number * (ratio - 1.0 - np.log(ratio)), of, changed))
+    found.sort(key=lambda one: -one[0])
+    if not found or found[0][0] <= _CLEAR or found[0][2] == "offset":
         return None
-    of, changed, one, blocks, excess = best
-    power = excess / float(np.mean(one.information[one.information > 0.0]))
+    most, of, _ = found[0]
+    # a strong change has spoilt the fit of the pixels by which they are told apart
+    near = [
+        changed
+        for gain, where, changed in found
+        if where == of and changed != "offset" and gain > max(_CLEAR, _NEARLY * most)
+    ]
+    first, *others = (
+        _of_change(data[of, changed], model[of, changed], (of, changed), maps, inside, most)
+        for changed in near
+    )
+    return Measurement(first, float(most), tuple(others))
+
+
+def _of_change(
+    data: Sums,
+    model: Sums,
+    what: tuple[Shared, Changed],
+    maps: PixelMaps,
+    inside: BoolArray,
+    gain: float,
+) -> EmpiricalNoise:
+    """Return a common change of a kind at the size that it has beyond a model."""
+    one, blocks = _shaped(data)
+    power = (one.ratio - max(model.ratio, 1.0)) / float(np.mean(one.information[one.information > 0.0]))
     inside = inside & maps.usable
     signal = float(np.median((maps.quanta_exposure / maps.conversion_gain)[inside]))
     burst, size = _bursts(one, gain)
     lags, correlation = ((), ()) if burst else _correlation(one, power)
     mode = NoiseMode(
-        of=of, share=1.0, changes=changed, signal_dn=round(signal, 3), lags=lags, correlation=correlation,
-        burst=burst, negative=size < 0.0, shape=blocks,
+        of=what[0], share=1.0, changes=what[1], signal_dn=round(signal, 3), lags=lags,
+        correlation=correlation, burst=burst, negative=size < 0.0, shape=blocks,
     )  # fmt: skip
     rms = abs(size) * np.sqrt(burst) if burst else np.sqrt(power)
-    return Measurement(EmpiricalNoise(noise_dn=float(rms * signal), modes=(mode,)), float(gain))
+    return EmpiricalNoise(noise_dn=float(rms * signal), modes=(mode,))
 
 
 def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:

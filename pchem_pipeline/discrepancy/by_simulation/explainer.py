@@ -30,7 +30,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     serial,
 )
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.empirical import without_moved_rows
+from pchem_pipeline.discrepancy.by_simulation.empirical import without_moved
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
@@ -462,7 +462,7 @@ class FrameExplainer:
         if not model:
             return Refit(plain.maps, {}, plain.covariance)
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = without_moved_rows(self.frames.stack[self.frames.seen], plain.maps, own)
+        frames = without_moved(self.frames.stack[self.frames.seen], plain.maps, own)
         fit = refit_maps(frames, plain.maps, own, plain.covariance, numbers=numbers)
         tags = (effect.tag for effect in model)
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
@@ -471,7 +471,7 @@ class FrameExplainer:
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
         """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = without_moved_rows(self.frames.stack[self.frames.seen], self.plain.maps, own)
+        frames = without_moved(self.frames.stack[self.frames.seen], self.plain.maps, own)
         fit = self._refit(model)
         sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
         self.lost = sensor.lost

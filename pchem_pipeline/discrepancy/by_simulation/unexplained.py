@@ -114,9 +114,9 @@ class Unexplained:
     def by_itself(self) -> Refitted | None:
         """Return what no known effect makes, where it leaves little by itself; None where it does not."""
         for likely in self._of_all:
-            if likely.measured.effect.unlisted:
+            if likely.measured.unlisted:
                 found = self._tried((), likely, whole=True)
-                if found is not None and self._leaves_little(found):
+                if found is not None and found.effects[0].unlisted and self._leaves_little(found):
                     return found
         return None
 
@@ -190,27 +190,37 @@ class Unexplained:
 
         Effects of which nothing is certain beside it are left out; ``whole``: see `Refitter.refined`.
         """
-        refitter, effects, measured = self.refitter, tuple(h.effect for h in kept), None
+        refitter, effects = self.refitter, tuple(h.effect for h in kept)
+        measured: tuple[Effect, ...] = ()
         for _ in range(_MEASUREMENTS):
-            present = refitter.model(effects if measured is None else (*effects, measured))
-            seen = measure(part, present, refitter.model(effects))
+            seen = measure(part, refitter.model((*effects, *measured[:1])), refitter.model(effects))
             if seen is None:
                 return None
-            measured = seen.effect.at_place(part.region, part.when)
-        assert measured is not None
-        refitter.allow(measured.tag)
-        _, vectors = refitter.draw((*effects, measured), self.replicates)
-        shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
-        found = refitter.refined((*kept, Hypothesis(measured, shift)), whole=whole)
-        if found.short:
+            measured = tuple(e.at_place(part.region, part.when) for e in (seen.effect, *seen.others))
+        best: Refitted | None = None
+        for effect in measured:
+            found = self._fitted(kept, effect, whole)
+            if found is not None and (best is None or found.score > best.score):
+                best = found
+            if best is not None and self._leaves_little(best):
+                break
+        if best is None:
             return None
-        found = refitter.sharpened(found, self.replicates)
-        proven = {h.tag for h in self.proven(found)}
-        if proven == found.tags:
-            return found
-        if measured.tag not in proven:
+        proven = {h.tag for h in self.proven(best)}
+        if proven == best.tags:
+            return best
+        if measured[0].tag not in proven:
             return None
         return self._described(tuple(h for h in kept if h.tag in proven), part, measure, whole)
+
+    def _fitted(self, kept: tuple[Hypothesis, ...], effect: Effect, whole: bool) -> Refitted | None:
+        """Return effects with what was measured at their best fit; None where that was not gone for."""
+        refitter = self.refitter
+        refitter.allow(effect.tag)
+        _, vectors = refitter.draw((*(h.effect for h in kept), effect), self.replicates)
+        shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
+        found = refitter.refined((*kept, Hypothesis(effect, shift)), whole=whole)
+        return None if found.short else refitter.sharpened(found, self.replicates)
 
     def _moves(
         self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]

@@ -66,14 +66,15 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
     unexplained.__dict__["_of_all"] = likely
     tried = []
 
-    def described(_: Any, one: _Likely, **__: Any) -> str:
+    def described(_: Any, one: _Likely, **__: Any) -> Any:
         tried.append(one.form)
-        return one.form
+        return SimpleNamespace(effects=(one.measured.effect,))
 
     monkeypatch.setattr(unexplained, "_tried", described)
     for little in (False, True):
         monkeypatch.setattr(unexplained, "_leaves_little", lambda _, answer=little: answer)
-        assert unexplained.by_itself() == ("gain" if little else None)
+        found = unexplained.by_itself()
+        assert (found is not None and found.effects == (gain,)) is little
     assert tried == ["gain", "gain"]
 
 
