@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.ensemble.ensemble_numba import capacity, occupied, poisson_weights
+from pchem_pipeline.model.ensemble.ensemble_numba import (
+    capacity,
+    log_factorials,
+    occupied,
+    poisson_weights,
+    reach_of,
+)
 from pchem_pipeline.model.law.normal_numba import NARROW, REACH, normal_mass
 from pchem_pipeline.model.law.simd_math_numba import simd_tail
 from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, simd_load, simd_store
@@ -22,7 +28,7 @@ _LEAST_VARIANCE = 1e-6  # DN^2
 _LEAST_LIKELY = 1e-17  # of an electron number
 _NEGLIGIBLE = 1e-13  # of what is expected of an electron number
 _SURE = 0.02  # of a code: thresholds of densities and of masses are nearer to each other
-_INFINITE = 1e300
+_INFINITE, _LEAST_LOG = 1e300, -1e3
 _EDGE, _TAIL = 0, 1
 
 
@@ -49,7 +55,7 @@ def sum_by_thresholds(
     """
     weights = np.zeros(capacity(parameters[:, 0]))
     rows = np.empty((2, weights.size + 1 + 2 * SIMD_WIDTH))
-    logs = np.log(np.arange(1.0, weights.size + 1.0))
+    logs, log_factorial = np.log(np.arange(1.0, weights.size + 1.0)), log_factorials(weights.size)
     beyond = np.int64(0)
     for p in range(origin.size):
         exposure, step, bias = parameters[p, 0], 1.0 / parameters[p, 1], parameters[p, 2]
@@ -74,7 +80,10 @@ def sum_by_thresholds(
                 if low + j < expected.size:
                     expected[low + j] += weights[low + j]
                 continue
-            right += _spread(rows, j, n, bias + (low + j) * step, sd, weights[low + j], low, expected)
+            log_weight = (low + j) * max(log_exposure, _LEAST_LOG) - exposure - log_factorial[low + j]
+            reach = reach_of(log_weight) * sd
+            level = bias + (low + j) * step, reach, weights[low + j]
+            right += _spread(rows, j, n, sd, level, low, expected)
         errors[p] = 1.0 - right
         # farther from all levels than any sample of the law: the nearest
         ends = bias + low * step, bias + high * step
@@ -159,10 +168,20 @@ def _last_code(k: int, odds: float, step: float, bias: float, variance: float, w
 
 @kernel(borrows=True)
 def _spread(
-    rows: FloatArray, j: int, n: int, mean: float, sd: float, weight: float, low: int, out: FloatArray
+    rows: FloatArray, j: int, n: int, sd: float, level: tuple[float, float, float], low: int, out: FloatArray
 ) -> float:
-    """Add the mass that a level gives to the codes of each number; return that of its own number."""
-    reach = _reach(weight) * sd
+    """Add the mass that a level gives to the codes of each number; return that of its own number.
+
+    Args:
+        rows: edges between the numbers, DN, and working memory for tails.
+        j: place of the level among the n.
+        n: number of levels.
+        sd: standard deviation, DN.
+        level: its mean, how far its samples are seen, both DN, and its weight.
+        low: number of the first level.
+        out: in and out, mass of each number.
+    """
+    mean, reach, weight = level
     first, end = j, j + 1
     while first > 0 and rows[_EDGE, first] > mean - reach:
         first -= 1

@@ -21,6 +21,8 @@ IntArray = NDArray[np.int64]
 
 #: Poisson weights below this part of the largest are left out.
 SMALLEST = 1e-18
+#: For the logarithm of an exposure of none.
+LEAST_EXPOSURE = 1e-300
 
 _ERROR_SHARE = 1e-10  # of a pixel's highest component: less is not seen in an error
 _ROOM = 2 * SIMD_WIDTH  # after the last place, for loops that write some places at a time
@@ -65,6 +67,21 @@ def capacity(exposure: FloatArray) -> int:
 
 
 @kernel
+def log_factorials(n: int) -> FloatArray:
+    """Return the logarithms of 0!, 1!, ... (n - 1)!."""
+    found = np.zeros(n)
+    for k in range(1, n):
+        found[k] = found[k - 1] + math.log(k)
+    return found
+
+
+@kernel(borrows=True)
+def reach_of(log_weight: float) -> float:
+    """Return the standard deviations within which a component of a weight is seen."""
+    return math.sqrt(max(REACH * REACH + 2.0 * log_weight, 0.0))
+
+
+@kernel
 def sum_pcd_pixels(
     exposure: FloatArray,
     gain: FloatArray,
@@ -84,11 +101,12 @@ def sum_pcd_pixels(
     data do. ``width <= 0`` leaves the NUCed sums out.
     """
     weights = np.zeros(capacity(exposure))
+    log_factorial = log_factorials(weights.size)
     row = np.zeros((1, total.size + _ROOM))
     places, held = np.zeros(total.size, np.int32), np.zeros(nuced.size + 2)
     for p in range(exposure.size):
         low, high = poisson_weights(exposure[p], weights)
-        step = 1.0 / gain[p]
+        step, log_exposure = 1.0 / gain[p], math.log(max(exposure[p], LEAST_EXPOSURE))
         reach = (REACH + 1.0) * sigma[p] + 1.0
         first = max(0, math.floor(bias[p] + low * step - reach) - dn_start)
         last = min(total.size - 1, math.ceil(bias[p] + high * step + reach) - dn_start)
@@ -101,7 +119,8 @@ def sum_pcd_pixels(
         for k in range(low, high + 1):
             centre = bias[p] + k * step
             if sigma[p] >= NARROW:
-                _add_bell(row, centre - dn_start, sigma[p], weights[k], decay, total.size)
+                within = reach_of(k * log_exposure - exposure[p] - log_factorial[k]) * sigma[p]
+                _add_bell(row, centre - dn_start, sigma[p], weights[k], within, decay, total.size)
             else:
                 add_component(part, base, weights[k], centre, sigma[p])
         for i in range(part.size):
@@ -112,7 +131,9 @@ def sum_pcd_pixels(
 
 
 @kernel(borrows=True)
-def _add_bell(row: FloatArray, centre: float, sigma: float, weight: float, decay: float, n: int) -> None:
+def _add_bell(
+    row: FloatArray, centre: float, sigma: float, weight: float, reach: float, decay: float, n: int
+) -> None:
     """Add a component of the PCD at the places 0 ... n - 1 of a row; a few after these are written, too.
 
     From one group of w places to the next a Gaussian changes by a ratio, and the ratio by ``decay = exp(-(w /
@@ -120,7 +141,6 @@ def _add_bell(row: FloatArray, centre: float, sigma: float, weight: float, decay
     """
     if weight <= 0.0:
         return
-    reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(weight), 0.0)) * sigma
     inverse, end = 1.0 / sigma, min(n, math.floor(centre + reach) + 1)
     peak, pace = weight * _PER_ROOT_2PI * inverse, SIMD_WIDTH * inverse
     for begin in range(max(0, math.ceil(centre - reach)), end, _GROUPS * SIMD_WIDTH):
@@ -160,9 +180,9 @@ def _add_nuced(
         places: working memory, as long as ``part``.
         held: working memory, all 0 before and after; one longer than ``nuced`` at either end.
     """
-    low, high = nuced_start - 1.0, nuced_start + float(nuced.size)
+    low, high, scale = nuced_start - 1.0, nuced_start + float(nuced.size), gain / width
     for i in range(part.size):
-        value = np.floor((base + i - bias) * gain / width + 0.5)
+        value = np.floor((base + i - bias) * scale + 0.5)
         places[i] = np.int32(min(max(value, low), high) - low)
     for i in range(part.size):
         held[places[i]] += part[i]
@@ -457,8 +477,9 @@ def tally_counts(
             continue
         nuced_sums[p, 0] = gain[p] * mean
         nuced_sums[p, 1] = gain[p] * gain[p] * (second + offset * (first + mean))
+        scale = gain[p] / width
         for b in range(begin, end):
-            value = np.floor((origin[p] + b - bias[p]) * gain[p] / width + 0.5)
+            value = np.floor((origin[p] + b - bias[p]) * scale + 0.5)
             places[b] = np.int32(min(max(value, low), high) - low)
         for b in range(begin, end):
             held[places[b]] += np.int64(counts[p, b])
