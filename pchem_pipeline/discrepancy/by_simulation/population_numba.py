@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.errors.algebra_numba import back_substitute, cholesky
 
 FloatArray = NDArray[np.float64]
 
@@ -16,32 +17,23 @@ _APART = 4.0  # squared standard deviations between two maxima
 
 
 @kernel
-def invert(matrix: FloatArray, lower: FloatArray, inverse: FloatArray) -> float:
-    """Fill the inverse of a positive definite matrix, by its Cholesky factor; return log |matrix|."""
+def _invert(
+    matrix: FloatArray, free: NDArray[np.bool_], lower: FloatArray, column: FloatArray, inverse: FloatArray
+) -> float:
+    """Fill the inverse of a positive definite matrix, NaN for another; return log |matrix|."""
     n, log_determinant = matrix.shape[0], 0.0
+    if not cholesky(matrix, np.int64(0), n, 0.0, free, lower):
+        for i in range(n):
+            for j in range(n):
+                inverse[i, j] = math.nan
+        return math.nan
     for i in range(n):
-        for j in range(i + 1):
-            left = matrix[i, j]
-            for k in range(j):
-                left -= lower[i, k] * lower[j, k]
-            lower[i, j] = math.sqrt(left) if i == j else left / lower[j, j]
         log_determinant += 2.0 * math.log(lower[i, i])
-    # the factor's inverse goes into the upper triangle of the inverse, column by column
-    for j in range(n):
-        for i in range(j, n):
-            left = 1.0 if i == j else 0.0
-            for k in range(j, i):
-                left -= lower[i, k] * inverse[j, k]
-            inverse[j, i] = left / lower[i, i]
-    for i in range(n):
-        for j in range(i, n):
-            total = 0.0
-            for k in range(j, n):
-                total += inverse[i, k] * inverse[j, k]
-            inverse[i, j] = total
-    for i in range(n):
-        for j in range(i):
-            inverse[i, j] = inverse[j, i]
+        for j in range(n):
+            column[j] = 1.0 if i == j else 0.0
+        back_substitute(lower, np.int64(0), n, column)
+        for j in range(n):
+            inverse[j, i] = column[j]
     return log_determinant
 
 
@@ -79,12 +71,13 @@ def solve_parabolas(
     n_kinds, n, size = theta.shape
     precision, lower = np.empty((n_kinds, size, size)), np.zeros((size, size))
     off, slope, ends = np.empty(size), np.empty(size), np.empty((n_kinds, size))
+    free = np.zeros(size, np.bool_)
     for pixel in range(n):
         for j in range(n_kinds):
             for a in range(size):
                 for b in range(size):
                     precision[j, a, b] = information[j, pixel, a, b] + prior[a, b] / widening[pixel]
-            determinant = invert(precision[j], lower, covariance[j, pixel])
+            determinant = _invert(precision[j], free, lower, slope, covariance[j, pixel])
             far = promised = 0.0
             for a in range(size):
                 off[a] = theta[j, pixel, a] - centre[a]

@@ -38,29 +38,31 @@ _SMALLEST = 1e-10  # of the damping matrix: less is lost in rounding
 
 
 @kernel(borrows=True)
-def cholesky(matrix: FloatArray, held: NDArray[np.bool_], first: int, size: int, lower: FloatArray) -> bool:
-    """Factor the rows 1 ... size - 1 of a matrix; False unless positive definite.
+def cholesky(
+    matrix: FloatArray, start: int, end: int, least: float, held: NDArray[np.bool_], lower: FloatArray
+) -> bool:
+    """Factor the rows start ... end - 1 of a matrix; False unless positive definite.
 
     Args:
         matrix: its lower triangle.
-        held: which rows stay, from place ``first`` (that of row 1) on: they are taken for those of a unit
-            matrix.
-        first: place of row 1 in ``held``.
-        size: end of the rows.
+        start: first row.
+        end: of the rows.
+        least: share of a diagonal element that must be left of it.
+        held: which rows stay, the first row first: they are taken for those of a unit matrix.
         lower: out.
     """
-    for row in range(1, size):
-        for column in range(1, row + 1):
+    for row in range(start, end):
+        for column in range(start, row + 1):
             value = matrix[row, column]
-            if held[first + row - 1] or held[first + column - 1]:
+            if held[row - start] or held[column - start]:
                 value = 1.0 if row == column else 0.0
-            for k in range(1, column):
+            for k in range(start, column):
                 value -= lower[row, k] * lower[column, k]
             if row != column:
                 lower[row, column] = value / lower[column, column]
-            elif held[first + row - 1]:
+            elif held[row - start]:
                 lower[row, row] = 1.0
-            elif value > _SINGULAR * abs(matrix[row, row]):
+            elif value > least * abs(matrix[row, row]):
                 lower[row, row] = math.sqrt(value)
             else:
                 return False
@@ -68,16 +70,16 @@ def cholesky(matrix: FloatArray, held: NDArray[np.bool_], first: int, size: int,
 
 
 @kernel(borrows=True)
-def back_substitute(lower: FloatArray, size: int, vector: FloatArray) -> float:
-    """Solve ``L L' x = vector`` in rows 1 ... size - 1 in place; return ``vector' x``, squared decrement."""
+def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray) -> float:
+    """Solve ``L L' x = vector`` in rows start ... end - 1, in place; return ``vector' x``."""
     squared = 0.0
-    for row in range(1, size):
-        for k in range(1, row):
+    for row in range(start, end):
+        for k in range(start, row):
             vector[row] -= lower[row, k] * vector[k]
         vector[row] /= lower[row, row]
         squared += vector[row] * vector[row]
-    for row in range(size - 1, 0, -1):
-        for k in range(row + 1, size):
+    for row in range(end - 1, start - 1, -1):
+        for k in range(row + 1, end):
             vector[row] -= lower[k, row] * vector[k]
         vector[row] /= lower[row, row]
     return squared
@@ -127,9 +129,9 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
     for row in range(1, size):
         if held[n + row - 1]:
             right[row] = 0.0
-    if not cholesky(schur, held, n, size, lower):
+    if not cholesky(schur, np.int64(1), size, _SINGULAR, held[n:], lower):
         return math.nan
-    squared += float(back_substitute(lower, size, right))
+    squared += float(back_substitute(lower, np.int64(1), size, right))
     step[n + SATELLITE] = 0.0
     for row in range(1, size):
         step[n + row - 1] = 0.0 if held[n + row - 1] else right[row]
@@ -183,14 +185,14 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: NDArray[np.bool_], cov
         for row in range(1, N_BLOCK):
             for other in range(1, row + 1):
                 schur[row, other] -= factors[j, row] * factors[j, other] * own[j]
-    if not cholesky(schur, held, n, end, lower):
+    if not cholesky(schur, np.int64(1), end, _SINGULAR, held[n:], lower):
         return False
     for i in range(1, N_BLOCK):
         if held[n + i - 1]:
             continue
         for row in range(1, N_BLOCK):
             column[row] = 1.0 if row == i else 0.0
-        back_substitute(lower, end, column)
+        back_substitute(lower, np.int64(1), end, column)
         for row in range(1, N_BLOCK):
             covariance[n + row - 1, n + i - 1] = 0.0 if held[n + row - 1] else column[row]
     for j in range(n):
