@@ -16,13 +16,14 @@ EFFECTS = (
     "exposure_flicker", "overdispersed_counts", "branching_counts", "optical_crosstalk", "cosmic_rays",
     "repeated_frames", "pixel_correction", "bit_errors",
     "binary_offset", "repeated_lines", "gain_stitch", "black_clamp", "glow", "read_order_noise",
+    "misplaced_lines",
 )  # fmt: skip
 UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
 OUTSIDE = ("trap_limited_lag", "self_trigger_cut", "output_crosstalk", "checkerboard_offset")
 #: left out of the library on purpose; those of ``SEALED`` are for the last look, when nothing changes
 TRIED = (
-    "temporal_filter", "row_gain", "slipped_rows", "shifted_rows", "settling_rows", "tap_gain",
-    "afterpulses", "dead_time", "repelled_charge", "hysteresis", "row_swap", "block_mean",
+    "temporal_filter", "row_gain", "row_droop", "distant_crosstalk", "settling_rows", "tap_gain",
+    "afterpulses", "dead_time", "repelled_charge", "hysteresis", "noisy_frames", "block_mean",
 )  # fmt: skip
 SEALED = (
     "mains_gain", "blended_frames", "bursting_block", "row_tilt", "noisy_time",

@@ -32,16 +32,47 @@ class TemporalFilter(Hidden):
         return found
 
 
-class ShiftedRows(Hidden):
-    """Rows that come one column late; strength: share of the rows."""
+class RowDroop(Hidden):
+    """The level of a row falls with the charge that the row holds (supply); strength: part of its mean."""
 
-    tag: ClassVar[str] = "shifted_rows"
-    s95: ClassVar[float] = 5e-3
-    most: ClassVar[float] = 0.5
+    tag: ClassVar[str] = "row_droop"
+    s95: ClassVar[float] = 0.03
+    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    most: ClassVar[float] = 0.9
 
-    def convert(self, t, dn, code):
-        late = self.rng.random((code.shape[0], 1)) < self.strength
-        return np.where(late, np.roll(code, 1, axis=1), code)
+    def signal(self, t, v):
+        return v - self.strength * v.mean(axis=1, keepdims=True)
+
+
+class DistantCrosstalk(Hidden):
+    """A sample gets a part of the one read some columns before (a pipeline); strength: that part."""
+
+    tag: ClassVar[str] = "distant_crosstalk"
+    s95: ClassVar[float] = 1e-3
+    most: ClassVar[float] = 0.2
+
+    def draw(self):
+        self.columns = self.pick("columns", 4, 8)
+
+    def signal(self, t, v):
+        found = v.copy()
+        found[:, self.columns :] += self.strength * v[:, : -self.columns]
+        return found
+
+
+class NoisyFrames(Hidden):
+    """Read noise that is larger in one frame of thirty, by chance; strength: relative."""
+
+    tag: ClassVar[str] = "noisy_frames"
+    s95: ClassVar[float] = 0.03
+    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+    most: ClassVar[float] = 1.5
+
+    def draw(self):
+        self.loud = self.rng.random(self.sensor.n_frames) < 1 / 30
+
+    def noise(self, t, n, k):
+        return n * (1 + self.strength * self.loud[max(t, 0)])
 
 
 class SettlingRows(Hidden):
@@ -98,35 +129,6 @@ class Hysteresis(Hidden):
         if self.before is not None:
             found = np.floor(dn + self.strength * np.sign(self.before - dn) + 0.5).astype(np.int64)
         self.before = found
-        return found
-
-
-class RowSwap(Hidden):
-    """Neighbouring rows that change places; strength: share of the rows."""
-
-    tag: ClassVar[str] = "row_swap"
-    s95: ClassVar[float] = 5e-3
-    most: ClassVar[float] = 0.5
-
-    def convert(self, t, dn, code):
-        found = code.copy()
-        for y in np.flatnonzero(self.rng.random(code.shape[0] // 2) < 2 * self.strength) * 2:
-            found[[y, y + 1]] = code[[y + 1, y]]
-        return found
-
-
-class SlippedRows(Hidden):
-    """Rows that lose a sample, so that the later ones come one column early; strength: share of rows."""
-
-    tag: ClassVar[str] = "slipped_rows"
-    s95: ClassVar[float] = 5e-3
-    most: ClassVar[float] = 0.5
-
-    def convert(self, t, dn, code):
-        found = code.copy()
-        for y in np.flatnonzero(self.rng.random(code.shape[0]) < self.strength):
-            x = int(self.rng.integers(code.shape[1] - 1))
-            found[y, x:-1] = code[y, x + 1 :]
         return found
 
 

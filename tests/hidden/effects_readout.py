@@ -309,6 +309,39 @@ class RepeatedLines(Hidden):
         return np.moveaxis(found, 0, self.axis)
 
 
+class MisplacedLines(Hidden):
+    """Rows or columns that hold the samples of other pixels; strength: share of them, or of the frames."""
+
+    tag: ClassVar[str] = "misplaced_lines"
+    s95: ClassVar[float] = 5e-3
+    most: ClassVar[float] = 0.3
+
+    def draw(self):
+        self.axis = 0 if self.pick("lines", "rows", "columns") == "rows" else 1
+        self.move = self.pick("move", "swapped", "early", "late", "sample_lost", "sample_twice", "line_lost")
+        if self.move in ("swapped", "line_lost"):  # lines are more alike than pixels of a line
+            self.strength = min(16 * self.strength, self.most)
+
+    def convert(self, t, dn, code):
+        lines = np.moveaxis(code, self.axis, 0)
+        found, (n, m) = lines.copy(), lines.shape
+        if self.move == "line_lost":
+            if self.rng.random() < self.strength:
+                y = int(self.rng.integers(n - 1))
+                found[y:-1] = lines[y + 1 :]
+        elif self.move == "swapped":
+            for y in np.flatnonzero(self.rng.random(n // 2) < 2 * self.strength) * 2:
+                found[[y, y + 1]] = lines[[y + 1, y]]
+        else:
+            for y in np.flatnonzero(self.rng.random(n) < self.strength):
+                x = int(self.rng.integers(m - 1)) if "sample" in self.move else 0
+                if self.move in ("early", "sample_lost"):
+                    found[y, x:-1] = lines[y, x + 1 :]
+                else:
+                    found[y, x + 1 :] = lines[y, x:-1]
+        return np.moveaxis(found, 0, self.axis)
+
+
 class GainStitch(Hidden):
     """Above a code the gain is another; strength: relative change.
 

@@ -144,6 +144,8 @@ def _space() -> list[Statistic]:
         Statistic("space.predicted.above", "digital", "samples far exceed what their neighbours predict"),
         Statistic("space.equal.squares", "digital", "samples of squares of 2 x 2 pixels are all equal"),
         Statistic("space.x.bits", "digital", "samples follow bits of the sample read before"),
+        Statistic("space.misplaced.rows", "digital", "rows hold the samples of other pixels"),
+        Statistic("space.misplaced.columns", "digital", "columns hold the samples of other pixels"),
         Statistic("space.repeated.rows", "digital", "rows repeat the one above exactly"),
         Statistic("space.repeated.columns", "digital", "columns repeat the one on the left exactly"),
     ]

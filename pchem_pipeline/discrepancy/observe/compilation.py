@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel_cache import in_any_order
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS
+from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics, sum_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import N_MOMENTS
@@ -46,6 +47,7 @@ def compile_observation(dtype: np.dtype[Any]) -> None:
         [
             partial(pixel_laws, counts, origin, outside, parameters, usable),
             partial(_sum, frames),
+            partial(misplaced_lines, frames, counts, origin, usable.reshape(_SIDE, _SIDE)),
             partial(sample_mass, SampleLaw(), list(parameters.T), codes),
             _simulate,
             *compilations(numba.typeof(given), False),

@@ -17,6 +17,7 @@ from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares, square_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
+from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.predicted import predicted_samples, predicted_statistics
 from pchem_pipeline.discrepancy.observe.previous_bits import bit_statistics, previous_bits
 from pchem_pipeline.discrepancy.observe.repeated_lines import line_statistics, repeated_lines
@@ -108,6 +109,7 @@ def observe(
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
     lines, squares = repeated_lines(frames), equal_squares(frames)
+    misplaced_z, misplaced = misplaced_lines(frames, counts, origin, maps.usable)
     z = {
         **evidence.z,
         "tail.high.clusters": _clusters(sums.hits, laws, frames.shape),
@@ -118,9 +120,12 @@ def observe(
         **bit_statistics(bits),
         **line_statistics(lines, alike, len(frames)),
         **square_statistics(squares, counts, origin, maps.usable),
+        **misplaced_z,
     }
     time = _time_series(view, lags, n_run)
-    time = replace(time, predicted=predicted, previous_bits=bits, repeated_lines=lines)
+    time = replace(
+        time, predicted=predicted, previous_bits=bits, repeated_lines=lines, misplaced_lines=misplaced
+    )
     return replace(evidence, time=time, z=in_order(z))
 
 

@@ -22,6 +22,9 @@ from pchem_pipeline.model.law.parameters import PixelParameters
 #: Per-pixel efficient scores: products of Hermite (readout) and Charlier (charge) polynomials beyond the four
 #: that are the PCD's own parameters.
 SCORES = ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1")
+#: Whose samples a misplaced line holds: those of the line after or before it, its own a sample early or late,
+#: or that from some sample on only, as where one is lost or delivered twice.
+PLACES = ("next", "before", "early", "late", "lost", "twice")
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,8 @@ class TimeSeries:
         predicted: samples beside what their neighbours predict, by kind of prediction.
         previous_bits: samples beside the bits of those read before; None where there are too few.
         repeated_lines: number of "rows" and of "columns" that are the one before them in the same frame.
+        misplaced_lines: likeliest share of "rows" and of "columns" that hold the samples of other pixels, by
+            :data:`PLACES`, shape (6,); none where chance explains them.
         hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
             20,000.
     """
@@ -186,6 +191,7 @@ class TimeSeries:
     predicted: Mapping[str, PredictedSamples] = field(default_factory=dict)
     previous_bits: PreviousBits | None = None
     repeated_lines: Mapping[str, int] = field(default_factory=dict)
+    misplaced_lines: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,157 @@
+"""Misplaced lines: rows or columns of a frame whose samples are delivered as those of other pixels.
+
+Two lines that change places, a line that comes a sample early or late, a sample or a whole line that is lost
+or delivered twice so that all that follow move up or down: what a frame grabber makes of a lost clock, a
+cable of the end of a packet. Every sample is then a good one, of another pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.evidence import PLACES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence
+
+Move = Literal["swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice"]
+
+_WHERE = 1  # draw of the sample or line from which on others follow
+# of the shares of lines from the line after and before, by which two that are alike differ at most
+_ALIKE = 2.0
+# share of the lines that moves make, of those they can make, by which a guess is worth a try
+_WORTH = 0.1
+
+
+@register_effect
+class MisplacedLines(Effect):
+    """In some frames a row, or a column, holds the samples of other pixels.
+
+    Signature: samples of a line that are likelier by the histograms of the pixels beside it than by their
+    own, all together; nothing where pixels are alike. A pixel's own histogram gets a share of its neighbour's
+    samples, with that one's bias and gain, so it has no law of its own.
+    """
+
+    tag: Literal["misplaced_lines"] = Field(default="misplaced_lines", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.READOUT
+    title: ClassVar[str] = "misplaced rows or columns"
+    source: ClassVar[str] = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
+    signature: ClassVar[tuple[str, ...]] = ("space.misplaced.rows", "space.misplaced.columns")
+    strength: ClassVar[str] = "share"
+    separate: ClassVar[Mapping[str, str]] = {
+        "repeated_lines": "equality of neighbouring lines: lines that change places differ from each other",
+        "interpixel_capacitance": "a line's samples taken together: a coupling moves all lines a little",
+    }
+    share: float = Field(
+        ge=0,
+        le=0.5,
+        description="probability that this happens to a line, no unit; of a line lost or delivered twice: "
+        "that it happens in a frame",
+    )
+    move: Move = Field(
+        default="swapped",
+        description="swapped: with the next line; early, late: by one sample; sample_lost, sample_twice: "
+        "the same from a random sample of the line on; line_lost, line_twice: all lines from a random one on "
+        "hold those after or before them",
+    )
+    lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
+
+    def halo(self) -> int:
+        """Return 2: whether a row changes places with the next depends on the two before."""
+        return 2
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the digital numbers (frame, y, x), DN; at the end of a line the last sample is repeated."""
+        along, across = (2, 1) if self.lines == "rows" else (1, 2)
+        moved = self._by_line(context) if self.move in ("swapped", "line_lost", "line_twice") else 0
+        if isinstance(moved, int):
+            return _taken(values, self._by_sample(context), along)
+        return _taken(values, moved, across)
+
+    def _by_line(self, context: EffectContext) -> NDArray[np.int64]:
+        """Return from how many lines later the samples of each line come."""
+        rows = self.lines == "rows"
+        if self.move != "swapped":
+            size, at = (
+                (context.shape[0], context.rows) if rows else (context.shape[1], np.arange(context.shape[1]))
+            )
+            from_line = np.floor(context.random.uniform(("frame",), _WHERE) * size)
+            hit = context.random.uniform(("frame",)) < self.share
+            position = at[None, :, None] if rows else at[None, None, :]
+            return np.where(hit & (position >= from_line), 1 if self.move == "line_lost" else -1, 0)
+        hit = context.random.uniform(("frame", "y" if rows else "x")) < self.share
+        axis = 1 if rows else 2
+        last = (
+            context.rows == context.shape[0] - 1
+            if rows
+            else np.arange(context.shape[1]) == context.shape[1] - 1
+        )
+        hit = hit & ~(last[None, :, None] if rows else last[None, None, :])
+        # of overlapping pairs the first one
+        first = hit & ~_before(hit, axis)
+        return np.where(first, 1, np.where(_before(first, axis), -1, 0))
+
+    def _by_sample(self, context: EffectContext) -> NDArray[np.int64]:
+        """Return from how many samples later in its line each sample comes."""
+        rows = self.lines == "rows"
+        line: tuple[Any, ...] = ("frame", "y") if rows else ("frame", "x")
+        hit = context.random.uniform(line) < self.share
+        if self.move in ("sample_lost", "sample_twice"):
+            size, at = (
+                (context.shape[1], np.arange(context.shape[1])[None, None, :])
+                if rows
+                else (context.shape[0], context.rows[None, :, None])
+            )
+            hit = hit & (at >= np.floor(context.random.uniform(line, _WHERE) * size))
+        return np.where(hit, 1 if self.move in ("early", "sample_lost") else -1, 0)
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return rows that change places, come late, and lose a sample, one in a hundred."""
+        return cls(share=1e-2), cls(share=1e-2, move="late"), cls(share=1e-2, move="sample_lost")
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the moves that leave lines where they are found, with the shares found there."""
+        if evidence.time is None:
+            return ()
+        found: list[Self] = []
+        for lines, shares in evidence.time.misplaced_lines.items():
+            share = dict(zip(PLACES, (float(s) for s in shares), strict=True))
+            guesses: dict[str, float] = {"early": share["early"], "late": share["late"]}
+            guesses |= {"sample_lost": share["lost"], "sample_twice": share["twice"]}
+            after, before = share["next"], share["before"]
+            if min(after, before) * _ALIKE > max(after, before):
+                guesses["swapped"] = (after + before) / 2.0
+            else:
+                # from a random line on: half of them
+                guesses["line_lost"], guesses["line_twice"] = 2.0 * after, 2.0 * before
+            most = max(guesses.values())
+            found += [
+                cls.model_validate({"share": min(guess, 0.5), "move": move, "lines": lines})
+                for move, guess in guesses.items()
+                if guess > _WORTH * most
+            ]
+        return sorted(found, key=lambda one: -one.share)
+
+
+def _before(lines: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+    """Return for each line whether the one before it is marked; the first one has none."""
+    moved = np.roll(lines, 1, axis)
+    moved[(slice(None),) * axis + (0,)] = False
+    return moved
+
+
+def _taken(values: NDArray[Any], step: NDArray[np.int64], axis: int) -> NDArray[Any]:
+    """Return the values so many places later along an axis, those at the ends instead of what is beyond."""
+    at = np.arange(values.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
+    index = np.clip(at + step, 0, values.shape[axis] - 1)
+    return np.take_along_axis(values, np.broadcast_to(index, values.shape), axis)

@@ -1,0 +1,148 @@
+"""Misplaced lines: the forward model, in pieces too, the likelihood ratios, and what is made of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+
+from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
+from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.readout.misplaced_lines import MisplacedLines
+from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
+from pchem_pipeline.model.histogram.count import histogram_frames
+
+SHAPE, FRAMES = (9, 11), 300
+MOVES = ("swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice")
+
+
+def origins(shape, frames):
+    """Return frames whose values tell where in the frame they come from."""
+    return np.broadcast_to(
+        np.arange(shape[0] * shape[1], dtype=np.uint16).reshape(shape), (frames, *shape)
+    ).copy()
+
+
+def turned(frames, lines):
+    """Return frames (frame, line, sample)."""
+    return frames if lines == "rows" else frames.swapaxes(1, 2)
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_every_sample_comes_from_where_the_move_says(move, lines):
+    frames, share = origins(SHAPE, FRAMES), 0.1
+    found = MisplacedLines(share=share, move=move, lines=lines).apply(frames, context_of(SHAPE, FRAMES))
+    found, plain = turned(found, lines), turned(frames, lines)[0]
+    n, m = plain.shape
+    hits = 0
+    for one in found:
+        if move.startswith("line"):
+            moved = np.flatnonzero((one != plain).any(axis=1))
+            if moved.size:
+                hits += 1
+                come = np.clip(np.arange(n) + (1 if move == "line_lost" else -1), 0, n - 1)
+                np.testing.assert_array_equal(one[moved[0] :], plain[come][moved[0] :])
+            continue
+        y = 0
+        while y < n:
+            at = np.flatnonzero(one[y] != plain[y])
+            if at.size and move == "swapped":
+                np.testing.assert_array_equal(one[[y, y + 1]], plain[[y + 1, y]])
+                y += 1
+            elif at.size:
+                step = 1 if move in ("early", "sample_lost") else -1
+                come = np.clip(np.arange(m) + step, 0, m - 1)
+                np.testing.assert_array_equal(one[y, at[0] :], plain[y, come][at[0] :])
+                assert move not in ("early", "late") or at[0] == (0 if step == 1 else 1)
+            hits += at.size > 0
+            y += 1
+    # of a line lost at the end, or a sample twice at the end, nothing is seen
+    trials = FRAMES * (1 if move.startswith("line") else n)
+    shown = {"swapped": 1 - 1 / n - share, "line_lost": 1 - 1 / n, "sample_lost": 1 - 1 / m}.get(move, 1.0)
+    expected = trials * share * shown
+    assert abs(hits - expected) < 5 * np.sqrt(expected)
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_a_band_of_rows_is_as_in_the_whole(move, lines):
+    frames, effect = origins(SHAPE, FRAMES), MisplacedLines(share=0.3, move=move, lines=lines)
+    whole = effect.apply(frames, context_of(SHAPE, FRAMES))
+    first, last, halo = 4, 7, effect.halo()
+    rows = np.arange(first - halo, min(last + halo, SHAPE[0]))
+    band = effect.apply(frames[:, rows], context_of(SHAPE, FRAMES, rows=rows))
+    np.testing.assert_array_equal(band[:, halo : halo + last - first], whole[:, first:last])
+
+
+def test_the_ratios_are_those_of_the_likelihoods():
+    """A plain transcription: sums of logarithms of the histograms' shares, less those at the own place."""
+    frames = np.random.default_rng(2).integers(95, 105, (64, 3, 4)).astype(np.uint16)
+    frames[:, 1] += 4
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(12, -1)
+    z, _ = misplaced_lines(frames, counts, histograms.origin.ravel().astype(np.int64), np.ones((3, 4), bool))
+    codes = np.arange(94, 111)
+    share = np.array(
+        [[(frames[:, y, x, None] == codes).sum(axis=0) + 0.5 for x in range(4)] for y in range(3)]
+    )
+    # every histogram is as wide as the widest, and one code more on either side
+    width = np.flatnonzero((counts > 0).any(axis=0))
+    log = np.log(share / (64 + 0.5 * (width[-1] - width[0] + 3)))
+
+    def at(y, x, code):
+        low = histograms.origin[y, x] + width[0] - 1
+        return log[y, x, np.clip(code, low, low + width[-1] - width[0] + 2) - 94]
+
+    def gain(mixed):
+        total = []
+        for y in range(3):
+            for t in range(64):
+                row = [int(frames[(t + mixed * x) % 64, y, x]) for x in range(4)]
+                own = np.array([at(y, x, row[x]) for x in range(4)])
+                ratios = [
+                    sum(at(y + dy, x, row[x]) for x in range(4)) - own.sum() if 0 <= y + dy < 3 else 0.0
+                    for dy in (1, -1)
+                ]
+                for dx in (1, -1):
+                    moved = np.array(
+                        [at(y, x + dx, row[x]) - own[x] if 0 <= x + dx < 4 else 0 for x in range(4)]
+                    )
+                    from_there = moved[::-1].cumsum()
+                    ratios += [moved.sum(), max(0.0, from_there.max()) - np.log(4)]
+                total.append(np.log(1 - 1e-3 + 1e-3 * np.exp(ratios).mean()))
+        return np.array(total)
+
+    seen_gain, chance = gain(0), gain(64 // 4)
+    wanted = (seen_gain.sum() - chance.sum()) / np.sqrt(2 * (chance**2).sum() + 4.0)
+    assert z["space.misplaced.rows"] == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_the_move_is_found(move, lines):
+    shape, share = ((24, 20) if lines == "rows" else (20, 24)), 0.06
+    effect = MisplacedLines(share=share, move=move, lines=lines)
+    evidence = seen(taken(drawn_truth(shape), effect, n_frames=1200, seed=3))
+    assert evidence.z[f"space.misplaced.{lines}"] > 8
+    first, *_ = MisplacedLines.estimate(evidence)
+    assert (first.move, first.lines) == (move, lines)
+    # the pixels' histograms hold a share of their neighbours', so that the ratios are too small
+    assert 0.4 < first.share / share < 1.3
+
+
+def test_nothing_else_misplaces_lines():
+    truth = drawn_truth((18, 26))
+    for effects in ((), (RowNoise(row_noise_dn=4.0),), (InterpixelCapacitance(coupling=0.02),)):
+        evidence = seen(taken(truth, *effects, n_frames=1200, seed=4))
+        assert all(abs(evidence.z[f"space.misplaced.{lines}"]) < 4 for lines in ("rows", "columns"))
+        assert list(MisplacedLines.estimate(evidence)) == []
+    assert MisplacedLines.estimate(replace(evidence, time=None)) == ()
+
+
+def test_a_line_in_two_places_is_misplaced_too_and_its_equality_tells():
+    evidence = seen(taken(drawn_truth((18, 26)), RepeatedLines(share=0.05), n_frames=1200, seed=4))
+    assert evidence.z["space.repeated.rows"] > evidence.z["space.misplaced.rows"] > 8
