@@ -62,6 +62,7 @@ from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT
+from pchem_pipeline.discrepancy.observe.misplaced import own_lines
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
@@ -462,16 +463,21 @@ class FrameExplainer:
         if not model:
             return Refit(plain.maps, {}, plain.covariance)
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = without_moved(self.frames.stack[self.frames.seen], plain.maps, own)
+        frames = self._own_samples(own)
         fit = refit_maps(frames, plain.maps, own, plain.covariance, numbers=numbers)
         tags = (effect.tag for effect in model)
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
         return fit
 
+    def _own_samples(self, effects: Sequence[Effect]) -> NDArray[np.unsignedinteger]:
+        """Return the seen frames without the samples that effects likely gave to other pixels."""
+        frames = without_moved(self.frames.stack[self.frames.seen], self.plain.maps, effects)
+        return own_lines(frames, self.plain.maps.usable, effects)
+
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
         """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = without_moved(self.frames.stack[self.frames.seen], self.plain.maps, own)
+        frames = self._own_samples(own)
         fit = self._refit(model)
         sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
         self.lost = sensor.lost

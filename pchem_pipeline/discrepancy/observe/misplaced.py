@@ -9,14 +9,22 @@ histograms are.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.misplaced_numba import N_PLACES, STEPS, compare_rows, fill_ratios
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Lines = Literal["rows", "columns"]
+
+_LINES: tuple[Lines, Lines] = ("rows", "columns")
 
 _MOST_SAMPLES = 1 << 19
 _SHARE = 1e-3  # of the lines, for which the statistic is the best one
@@ -50,34 +58,104 @@ def misplaced_lines(
     if min(usable.shape) < 2:
         return z, shares
     chosen = frames[:: max(1, -(-frames.size // _MOST_SAMPLES))]
-    some = np.flatnonzero((counts > 0).any(axis=0))
-    # one more on either side stands for all codes beyond
-    real = np.pad(counts[:, some[0] : some[-1] + 1], ((0, 0), (1, 1))) + np.float32(0.5)
-    logs = np.log(real / real.sum(axis=1, keepdims=True)).astype(np.float32).reshape(*usable.shape, -1)
-    first = (origin + some[0] - 1).reshape(usable.shape)
-    for axis, name in ((0, "rows"), (1, "columns")):
-        own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
-        table = np.empty((*own.shape, len(STEPS)), np.float32)
-        fill_ratios(own, begin, count, table)
-        lines = np.ascontiguousarray(chosen.swapaxes(1, 1 + axis))
-        strides = 0, max(1, len(lines) // lines.shape[2])
-        gain, chance = (_compared(lines, begin, table, each, whole=False)[0] for each in strides)
+    for lines in _LINES:
+        table = _Table.of(counts, origin, usable, lines)
+        turned = _turned(chosen, lines)
+        strides = 0, max(1, len(turned) // turned.shape[2])
+        gain, chance = (table.compared(turned, each, whole=False)[0] for each in strides)
         beyond = float((gain.sum() - chance.sum()) / np.sqrt(2.0 * (chance**2).sum() + _CHANCE))
-        z[f"space.misplaced.{name}"] = beyond
+        z[f"space.misplaced.{lines}"] = beyond
         if beyond > _CLEAR:
-            seen, mixed = (_shares(_compared(lines, begin, table, each, whole=True)[1]) for each in strides)
-            shares[name] = np.maximum(seen - mixed, 0.0)
+            seen, mixed = (_shares(table.compared(turned, each, whole=True)[1]) for each in strides)
+            shares[lines] = np.maximum(seen - mixed, 0.0)
     return z, shares
 
 
-def _compared(
-    lines: NDArray[Any], first: NDArray[np.int64], table: NDArray[np.float32], stride: int, *, whole: bool
-) -> tuple[FloatArray, NDArray[np.float32]]:
-    """Return what a share of misplaced rows gains each, and likelihood ratios (frame, y, N_PLACES)."""
-    ratios = np.empty((*lines.shape[:2], N_PLACES), np.float32)
-    gains = np.empty(lines.shape[:2])
-    compare_rows(lines, first, table, stride, _SHARE, whole, ratios, gains)
-    return gains, ratios
+def own_lines(
+    frames: NDArray[np.unsignedinteger[Any]], usable: NDArray[np.bool_], effects: Iterable[Effect]
+) -> NDArray[np.unsignedinteger[Any]]:
+    """Return frames in which lines that effects likely misplaced are those of other frames, drawn at random.
+
+    Each sample in a pixel's histogram is then its own, as many as there were.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        usable: pixels that count, (y, x).
+        effects: of the model.
+    """
+    found = frames
+    for effect in effects:
+        for lines, share in effect.displaced().items():
+            inside = usable if effect.region is None else usable & effect.region.mask(usable.shape)
+            if share.any() and inside.any() and min(usable.shape) > 1:
+                # the histograms of the first pass hold the misplaced samples, too
+                for _ in range(2):
+                    moved = _moved(frames, found, inside, lines, share)
+                    found = _without(frames, moved, lines)
+    return found
+
+
+def _moved(
+    frames: NDArray[Any], own: NDArray[Any], usable: NDArray[np.bool_], lines: Lines, share: FloatArray
+) -> NDArray[np.bool_]:
+    """Return which lines are likelier misplaced than not, (frame, line), by the histograms of ``own``."""
+    histograms = histogram_frames(own)
+    counts = histograms.counts.reshape(usable.size, -1)
+    table = _Table.of(counts, histograms.origin.ravel().astype(np.int64), usable, lines)
+    ratios = table.compared(_turned(frames, lines), 0, whole=True)[1].astype(np.float64)
+    likelier = (np.exp(np.minimum(ratios, _FARTHEST)) * share).sum(axis=2)
+    return np.asarray(likelier > 1.0 - share.sum())
+
+
+def _without(frames: NDArray[Any], moved: NDArray[np.bool_], lines: Lines) -> NDArray[Any]:
+    """Return frames with some lines, (frame, line), replaced by the same lines of others."""
+    found, rng = frames.copy(), np.random.default_rng(0)
+    turned = found if lines == "rows" else found.swapaxes(1, 2)
+    for y in np.flatnonzero(moved.any(axis=0) & ~moved.all(axis=0)):
+        gone, left = np.flatnonzero(moved[:, y]), np.flatnonzero(~moved[:, y])
+        turned[gone, y] = turned[rng.choice(left, gone.size), y]
+    return found
+
+
+def _turned(values: NDArray[Any], lines: Lines) -> NDArray[Any]:
+    """Return frames (frame, y, x) with the lines in the place of the rows."""
+    return np.ascontiguousarray(values if lines == "rows" else values.swapaxes(1, 2))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Likelihood ratios of the codes of pixels, the lines in the place of the rows.
+
+    Attributes:
+        first: DN of the first code, shape (y, x).
+        ratios: see :func:`~.misplaced_numba.fill_ratios`, shape (y, x, B, 4).
+    """
+
+    first: IntArray
+    ratios: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, counts: NDArray[Any], origin: IntArray, usable: NDArray[np.bool_], lines: Lines) -> _Table:
+        """Return it for histograms (y * x, B) whose bins begin at ``origin``, DN."""
+        some = np.flatnonzero((counts > 0).any(axis=0))
+        # one more on either side stands for all codes beyond
+        real = np.pad(counts[:, some[0] : some[-1] + 1], ((0, 0), (1, 1))) + np.float32(0.5)
+        logs = np.log(real / real.sum(axis=1, keepdims=True)).astype(np.float32).reshape(*usable.shape, -1)
+        first = (origin + some[0] - 1).reshape(usable.shape)
+        axis = _LINES.index(lines)
+        own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
+        ratios = np.empty((*own.shape, len(STEPS)), np.float32)
+        fill_ratios(own, begin, count, ratios)
+        return cls(begin, ratios)
+
+    def compared(
+        self, lines: NDArray[Any], stride: int, *, whole: bool
+    ) -> tuple[FloatArray, NDArray[np.float32]]:
+        """Return what a share of misplaced rows gains each, and likelihood ratios (frame, y, N_PLACES)."""
+        ratios = np.empty((*lines.shape[:2], N_PLACES), np.float32)
+        gains = np.empty(lines.shape[:2])
+        compare_rows(lines, self.first, self.ratios, stride, _SHARE, whole, ratios, gains)
+        return gains, ratios
 
 
 def _shares(ratios: NDArray[np.float32]) -> FloatArray:

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -244,6 +244,13 @@ class Effect(Section):
             Levels and weights, (j, y, x) each; None where it adds nothing, or only in proportion to H.
         """
         return None
+
+    def displaced(self) -> Mapping[Literal["rows", "columns"], NDArray[np.float64]]:
+        """Return the shares of lines that hold the samples of other pixels, by :data:`~.evidence.PLACES`.
+
+        Of these no pixel's own histogram has a law: the search fits it without lines that are likely such.
+        """
+        return {}
 
     def halo(self) -> int:
         """Return how many rows on either side a row depends on, px."""

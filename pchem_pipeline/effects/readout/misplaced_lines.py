@@ -113,6 +113,20 @@ class MisplacedLines(Effect):
             hit = hit & (at >= np.floor(context.random.uniform(line, _WHERE) * size))
         return np.where(hit, 1 if self.move in ("early", "sample_lost") else -1, 0)
 
+    def displaced(self) -> Mapping[Literal["rows", "columns"], NDArray[np.float64]]:
+        """Return the shares of lines that hold the samples of other pixels."""
+        some = self.share / 2.0  # of the lines of a frame those after a random one
+        found = {
+            "swapped": {"next": self.share, "before": self.share},
+            "early": {"early": self.share},
+            "late": {"late": self.share},
+            "sample_lost": {"lost": self.share},
+            "sample_twice": {"twice": self.share},
+            "line_lost": {"next": some},
+            "line_twice": {"before": some},
+        }[self.move]
+        return {self.lines: np.array([found.get(place, 0.0) for place in PLACES])}
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return rows that change places, come late, and lose a sample, one in a hundred."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
+from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines, own_lines
 from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.readout.misplaced_lines import MisplacedLines
@@ -132,6 +132,21 @@ def test_the_move_is_found(move, lines):
     assert (first.move, first.lines) == (move, lines)
     # the pixels' histograms hold a share of their neighbours', so that the ratios are too small
     assert 0.4 < first.share / share < 1.3
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_pixels_are_fitted_without_the_lines_that_were_moved(move, lines):
+    shape, n_frames = ((16, 40) if lines == "rows" else (40, 16)), 600
+    truth, effect = drawn_truth(shape), MisplacedLines(share=0.1, move=move, lines=lines)
+    frames, plain = taken(truth, effect, n_frames=n_frames, seed=5), taken(truth, n_frames=n_frames, seed=5)
+    found = own_lines(frames, np.ones(shape, np.bool_), [effect])
+    moved = turned(frames != plain, lines).any(axis=2)
+    replaced = turned(found != frames, lines).any(axis=2)
+    # where a line is cut, few of its samples may have moved
+    assert replaced[moved].mean() > (0.5 if "sample" in move else 0.8)
+    assert replaced[~moved].mean() < 0.01
+    assert own_lines(frames, np.ones(shape, np.bool_), [RowNoise(row_noise_dn=1.0)]) is frames
 
 
 def test_nothing_else_misplaces_lines():
