@@ -43,6 +43,7 @@ Measure = Callable[[Part, Model, Model], Measurement | None]
 
 _CONVINCING = 6.0  # nats that a form must add
 _LITTLE = 0.03  # of what there is to explain, nats
+_WORTHWHILE = 0.25  # of the nats of what is clearest: less cannot be all there is
 _MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
@@ -114,7 +115,8 @@ class Unexplained:
     def by_itself(self) -> Refitted | None:
         """Return what no known effect makes, where it leaves little by itself; None where it does not."""
         for likely in self._of_all:
-            if likely.measured.unlisted:
+            clear = likely.measured.gain > _WORTHWHILE * self._of_all[0].measured.gain
+            if clear and likely.measured.unlisted:
                 found = self._tried((), likely, whole=True)
                 if found is not None and found.effects[0].unlisted and self._leaves_little(found):
                     return found
