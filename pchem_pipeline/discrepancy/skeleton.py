@@ -126,14 +126,14 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     while wanted and rounds < by.most_rounds:
         try:
             extended = _round(by, null, z, still, tell)
-            if extended is None:
-                break
-            null, rounds = extended, rounds + 1
-            wanted = still = disagrees(null, z, significance, by.tolerance())
-            instead = by.replaced(null, z) if still else None
         except EffortSpentError as spent:
             limit = spent.words()
             break
+        if extended is None:
+            break
+        null, rounds = extended, rounds + 1
+        wanted = still = disagrees(null, z, significance, by.tolerance())
+        instead = _replaced(by, null, z) if still else None
         if instead is not None:
             null, still = instead, disagrees(instead, z, significance, by.tolerance())
             break
@@ -158,6 +158,17 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         defects=by.defects,
         n_replicates=by.n_replicates,
     )
+
+
+def _replaced(by: Explainer[Explanation], null: NullModel, z: Measured) -> NullModel | None:
+    """Return the null with what replaces the effects that were added; None where nothing does.
+
+    At the limit of the work it is left to the end, for which some of that is kept.
+    """
+    try:
+        return by.replaced(null, z)
+    except EffortSpentError:
+        return None
 
 
 def _round(
