@@ -10,7 +10,7 @@ than a sample of the same pixel from another time, which stands for it where the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy import optimize, special
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares
+from pchem_pipeline.discrepancy.observe.misplaced import with_others
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -44,9 +45,6 @@ _LEAST = 1e-6  # share
 _PLACES: tuple[Place, ...] = (
     (-1, 0, 0), (-2, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1),
 )  # fmt: skip
-_BESIDE: tuple[Place, ...] = ((0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0))
-_ACROSS: tuple[Place, ...] = ((0, -1, 0), (0, 1, 0))
-_SLIPPING: tuple[Together, ...] = ("row", "rest_of_row", "frame")
 _TOWARDS = (1, 2, 4, 8)  # DN
 _WITHIN = (0.5, 1.0)  # electrons
 _CHANCE = 7  # frames between a sample and the one that stands for a neighbour by chance
@@ -55,8 +53,6 @@ _TOGETHER: tuple[Together, ...] = ("row", "column", "frame")
 _ROWS_TOGETHER = 4  # neighbouring rows
 _RARE = 1e-6  # least mass of a code: what is rarer has other reasons
 _SURE = 30.0  # nats, the most that a sample says
-_MUTUAL = 0.5  # of rows that come in the place of the next, as many of this part in that of the one before
-_CHUNK = 256  # frames at once
 _ALIGNED = 3.0  # times as many equal squares of one parity as of the others
 _FIRST_SHARE, _STEPS = 0.02, 60
 
@@ -217,9 +213,8 @@ def measured_moves(
     """
     shifts = _measured_shifts(frames, maps, effects)
     towards = _measured_towards(frames, numbers, maps, effects)
-    slips = _measured_slips(frames, maps, effects)
     squares = _measured_squares(frames, maps)
-    found = [one for one in (shifts, towards, slips, squares) if one is not None]
+    found = [one for one in (shifts, towards, squares) if one is not None]
     if not found:
         return None
     best = max(found, key=lambda one: one.gain)
@@ -331,71 +326,22 @@ def _measured_towards(
     return _component(moves, used, shares, gain / samples.code.size, together=together)
 
 
-def _measured_slips(
-    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
-) -> Measurement | None:
-    """Return the rows whose samples follow the laws of the pixels beside them."""
-    pixels, some = _chosen(maps.usable, len(frames))
-    laws = _Laws.of(frames, maps, effects, np.flatnonzero(maps.usable.ravel()), 1)
-    if laws is None:
-        return None
-    beside = {place: _of_beside(frames, laws, pixels, place, some) for place in _BESIDE}
-    n_samples = max(ratio.size for ratio, _ in beside.values())
-    best: tuple[float, Together, FloatArray] | None = None
-    for together in _SLIPPING:
-        sums = [_of_groups(*each, together, frames.shape) for each in beside.values()]
-        shares, gain = shares_of(np.stack(sums))
-        if gain > (_CLEAR if best is None else best[0]):
-            best = gain, together, shares
-    if best is None:
-        return None
-    gain, together, shares = best
-    place, share = _BESIDE[int(shares.argmax())], float(shares.max())
-    across = [float(shares[_BESIDE.index(way)]) for way in _ACROSS]
-    exchange: str | None = None
-    if together == "row" and place in _ACROSS and min(across) > _MUTUAL * max(across):
-        place = (0, 1, 0)
-        down = _of_groups(*beside[place], together, frames.shape).reshape(frames.shape[:2])
-        share, exchange = max(
-            (float(shares_of(down[:, parity::2].reshape(1, -1))[0][0]), name)
-            for parity, name in enumerate(("even", "odd"))
-        )
-    return _component(
-        [Move(towards=place)], [1], np.array([1.0 - share, share]), gain / max(n_samples, 1),
-        together=together, exchange=exchange,
-    )  # fmt: skip
-
-
-def without_moved(
-    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effects: Sequence[Effect]
+def without_squares(
+    frames: NDArray[np.unsignedinteger], usable: NDArray[np.bool_], effects: Sequence[Effect]
 ) -> NDArray[np.unsignedinteger]:
-    """Return frames in which samples that were likely moved by effects are replaced by those of other frames.
-
-    Each sample in a pixel's histogram is then its own, as many as there were.
+    """Return frames in which squares that effects likely averaged are replaced by the pixels' other samples.
 
     Args:
         frames: (frame, y, x), DN.
-        maps: parameters of the pixels, shape (y, x).
-        effects: of the model; those count that move rows to the values beside, or average squares.
+        usable: pixels that count, (y, x).
+        effects: of the model.
     """
     for effect in effects:
-        if not isinstance(effect, Empirical) or not 0.0 < effect.share < 1.0:
-            continue
-        own = maps
-        if effect.region is not None:
-            own = replace(maps, usable=maps.usable & effect.region.mask(maps.usable.shape))
-        place = effect.moves[0].towards
-        if effect.squares:
-            moved = _in_equal_squares(frames, effect.squares) & own.usable
-            alone = (len(frames), own.usable.size)
-            frames = _with_others(frames.reshape(*alone, 1), moved.reshape(alone)).reshape(frames.shape)
-        elif (
-            effect.together in ("row", "rest_of_row")
-            and len(effect.moves) == 1
-            and effect.moves[0].part == 1.0
-            and place in _BESIDE
-        ):
-            frames = _with_others(frames, _moved_rows(frames, own, effect, place))
+        if isinstance(effect, Empirical) and effect.squares:
+            inside = usable if effect.region is None else usable & effect.region.mask(usable.shape)
+            moved = _in_equal_squares(frames, effect.squares) & inside
+            alone = len(frames), inside.size
+            frames = with_others(frames.reshape(*alone, 1), moved.reshape(alone)).reshape(frames.shape)
     return frames
 
 
@@ -410,61 +356,6 @@ def _in_equal_squares(frames: NDArray[np.unsignedinteger], parity: tuple[int, in
         for x in (0, 1):
             found[:, parity[0] + y :: 2, parity[1] + x :: 2][:, :ny, :nx] = equal
     return found
-
-
-def _moved_rows(
-    frames: NDArray[np.unsignedinteger], maps: PixelMaps, effect: Empirical, place: Place
-) -> NDArray[np.bool_]:
-    """Return which rows were more likely moved than not, (frame, y)."""
-    n, ny, _ = frames.shape
-    pixels = np.flatnonzero(maps.usable.ravel())
-    laws = _Laws.of(frames, maps, (), pixels, 1)
-    if laws is None or not pixels.size:
-        return np.zeros((n, ny), np.bool_)
-
-    def sums(way: Place) -> FloatArray:
-        found = []
-        for begin in range(0, n, _CHUNK):
-            some = frames[begin : begin + _CHUNK]
-            each = _of_beside(some, laws, pixels, way, np.arange(len(some)))
-            found.append(_of_groups(*each, effect.together, some.shape).reshape(-1, ny))
-        return np.concatenate(found)
-
-    odds = sums(place) + np.log(effect.share / (1.0 - effect.share))
-    if effect.exchange:
-        odds[:, :-1] += sums((0, -1, 0))[:, 1:]
-        odds[:, effect.exchange == "even" :: 2] = -np.inf
-    moved = np.asarray(odds > 0.0)
-    if effect.exchange:
-        moved[:, 1:] |= moved[:, :-1].copy()
-    return moved
-
-
-def _with_others(
-    frames: NDArray[np.unsignedinteger], moved: NDArray[np.bool_]
-) -> NDArray[np.unsignedinteger]:
-    """Return frames with rows (frame, y) replaced by those of other frames, drawn at random."""
-    found, rng = frames.copy(), np.random.default_rng(0)
-    for y in np.flatnonzero(moved.any(axis=0) & ~moved.all(axis=0)):
-        gone, left = np.flatnonzero(moved[:, y]), np.flatnonzero(~moved[:, y])
-        found[gone, y] = frames[rng.choice(left, gone.size), y]
-    return found
-
-
-def _of_beside(
-    frames: NDArray[np.unsignedinteger], laws: _Laws, pixels: IntArray, place: Place, some: IntArray
-) -> tuple[FloatArray, IntArray]:
-    """Return by how much likelier samples are under the law of the pixel beside, nats, and their places."""
-    ny, nx = frames.shape[1:]
-    of = np.full(ny * nx, -1)
-    of[laws.pixels] = np.arange(laws.pixels.size)
-    y, x = pixels // nx + place[1], pixels % nx + place[2]
-    there = np.where((y >= 0) & (y < ny) & (x >= 0) & (x < nx), of[(y * nx + x).clip(0, ny * nx - 1)], -1)
-    t, i = (each.ravel() for each in np.meshgrid(some, np.flatnonzero(there >= 0), indexing="ij"))
-    at = np.stack([t, pixels[i] // nx, pixels[i] % nx])
-    code = frames[tuple(at)].astype(np.int64)
-    own, other = (np.maximum(laws.at(row, code), _RARE) for row in (of[pixels[i]], there[i]))
-    return np.log(other / own), at
 
 
 def _chosen(usable: NDArray[np.bool_], n_frames: int) -> tuple[IntArray, IntArray]:
@@ -544,19 +435,11 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
     t, y, x = place
     group, count = {
         "row": (t * shape[1] + y, shape[0] * shape[1]),
-        "rest_of_row": (t * shape[1] + y, shape[0] * shape[1]),
         "column": (t * shape[2] + x, shape[0] * shape[2]),
         "frame": (t, shape[0]),
     }[together]
     known = np.bincount(group, minlength=count) > 0
-    if together == "rest_of_row":
-        table = np.zeros((count, shape[2]))
-        table[group, x] = ratio
-        from_here = np.cumsum(table[:, ::-1], axis=1)
-        sums = special.logsumexp(from_here, axis=1) - np.log(shape[2])
-    else:
-        sums = np.bincount(group, ratio, count)
-    return np.where(known, sums, -np.inf)
+    return np.where(known, np.bincount(group, ratio, count), -np.inf)
 
 
 def shares_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[FloatArray, float]:

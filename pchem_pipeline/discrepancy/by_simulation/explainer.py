@@ -30,7 +30,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     serial,
 )
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.empirical import without_moved
+from pchem_pipeline.discrepancy.by_simulation.empirical import without_squares
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
@@ -471,8 +471,9 @@ class FrameExplainer:
 
     def _own_samples(self, effects: Sequence[Effect]) -> NDArray[np.unsignedinteger]:
         """Return the seen frames without the samples that effects likely gave to other pixels."""
-        frames = without_moved(self.frames.stack[self.frames.seen], self.plain.maps, effects)
-        return own_lines(frames, self.plain.maps.usable, effects)
+        usable = self.plain.maps.usable
+        frames = without_squares(self.frames.stack[self.frames.seen], usable, effects)
+        return own_lines(frames, usable, effects)
 
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
         """Return the fit of the seen frames under a model, and sensors to draw replicates from."""

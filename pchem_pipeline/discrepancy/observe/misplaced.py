@@ -91,7 +91,7 @@ def own_lines(
                 # the histograms of the first pass hold the misplaced samples, too
                 for _ in range(2):
                     moved = _moved(frames, found, inside, lines, share)
-                    found = _without(frames, moved, lines)
+                    found = _turned(with_others(_turned(frames, lines), moved), lines)
     return found
 
 
@@ -107,13 +107,12 @@ def _moved(
     return np.asarray(likelier > 1.0 - share.sum())
 
 
-def _without(frames: NDArray[Any], moved: NDArray[np.bool_], lines: Lines) -> NDArray[Any]:
-    """Return frames with some lines, (frame, line), replaced by the same lines of others."""
+def with_others(frames: NDArray[Any], moved: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return frames (frame, line, sample) with some lines replaced by those of others, drawn at random."""
     found, rng = frames.copy(), np.random.default_rng(0)
-    turned = found if lines == "rows" else found.swapaxes(1, 2)
     for y in np.flatnonzero(moved.any(axis=0) & ~moved.all(axis=0)):
         gone, left = np.flatnonzero(moved[:, y]), np.flatnonzero(~moved[:, y])
-        turned[gone, y] = turned[rng.choice(left, gone.size), y]
+        found[gone, y] = frames[rng.choice(left, gone.size), y]
     return found
 
 

@@ -29,10 +29,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: What is moved together.
-Together = Literal["sample", "row", "rest_of_row", "column", "frame"]
+Together = Literal["sample", "row", "column", "frame"]
 _DIMS: dict[Together, tuple[Dim, ...]] = {
-    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "rest_of_row": ("frame", "y"),
-    "column": ("frame", "x"), "frame": ("frame",),
+    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
 }  # fmt: skip
 _DEPTH = 4  # frames through which a move towards an earlier frame is followed
 _MOST_TOLD = 4
@@ -106,11 +105,7 @@ class Empirical(Effect):
     share: float = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
     moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
-        default="sample", description="what is moved alike: each sample by itself, a row, the rest of a row "
-        "from a random place on, a column or a frame"
-    )  # fmt: skip
-    exchange: Literal["even", "odd"] | None = Field(
-        default=None, description="rows of this parity change places with the row below; null: none does"
+        default="sample", description="what is moved alike: each sample by itself, a row, a column or a frame"
     )
     squares: tuple[int, int] | None = Field(
         default=None,
@@ -122,9 +117,7 @@ class Empirical(Effect):
     def _has_moves(self) -> Self:
         if not sum(move.weight for move in self.moves) > 0:
             raise ValueError("empirical: give at least one of moves a weight above 0")
-        if self.exchange and (self.together != "row" or [m.towards for m in self.moves] != [(0, 1, 0)]):
-            raise ValueError("empirical: a row exchanges its samples with the one below: (0, 1, 0)")
-        if self.squares and (self.together != "sample" or self.exchange or self.moves != (Move(),)):
+        if self.squares and (self.together != "sample" or self.moves != (Move(),)):
             raise ValueError(
                 "empirical: squares come as their mean and are not moved: leave moves at one of nothing"
             )
@@ -132,12 +125,10 @@ class Empirical(Effect):
 
     def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it as it acts on some rows and columns that are taken for a sensor of their own."""
-        y, x = self.squares or (0, 0)
-        squares = ((y + rows[0]) % 2, (x + columns[0]) % 2) if self.squares else None
-        exchange = self.exchange
-        if exchange and rows[0] % 2:
-            exchange = "odd" if exchange == "even" else "even"
-        return self.model_copy(update={"squares": squares, "exchange": exchange})
+        if not self.squares:
+            return self
+        squares = (self.squares[0] + rows[0]) % 2, (self.squares[1] + columns[0]) % 2
+        return self.model_copy(update={"squares": squares})
 
     def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return as an effect on the sensor what was found in some of its rows and columns."""
@@ -150,12 +141,9 @@ class Empirical(Effect):
 
     @property
     def unlisted(self) -> bool:
-        """Whether rows are exchanged or slip, or samples come nearer to those of an earlier frame."""
-        if self.squares or self.exchange or self.together == "rest_of_row":
-            return True
-        ways = [move.towards for move in self.moves if move.towards]
-        along = self.together == "row" and any(way[2] for way in ways)
-        return along or (self.together == "sample" and any(way[0] for way in ways))
+        """Whether squares come as their mean, or samples come nearer to those of an earlier frame."""
+        of_earlier = any(move.towards[0] for move in self.moves if move.towards)
+        return self.squares is not None or (self.together == "sample" and of_earlier)
 
     def halo(self) -> int:
         """Return how far the neighbours lie across rows, px."""
@@ -170,17 +158,11 @@ class Empirical(Effect):
         """Return the digital numbers (frame, y, x), DN, with some samples moved."""
         drawn = context.random.uniform(_DIMS[self.together])
         which = np.searchsorted(np.cumsum(self.shares()), drawn.ravel(), side="right").reshape(drawn.shape)
-        if self.together == "rest_of_row":
-            begin = np.floor(context.random.uniform(("frame", "y"), 1) * values.shape[2])
-            which = np.where(np.arange(values.shape[2]) >= begin, which, len(self.moves))
         own = values.astype(np.int64)
         if self.squares:
             rows, columns = context.rows % 2, np.arange(values.shape[2]) % 2
             first = (rows == self.squares[0])[:, None] & (columns == self.squares[1])
             return _averaged(own, (drawn < self.share) & first).astype(values.dtype)
-        if self.exchange:
-            parity = (context.rows % 2 == (self.exchange == "odd"))[:, None]
-            return _exchanged(values, (which == 0) & parity)
         found = own
         # each pass follows the moves of earlier frames one frame further back
         for _ in range(_DEPTH if self.history() else 1):
@@ -221,13 +203,8 @@ class Empirical(Effect):
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         what = {
-            "sample": "samples", "row": "rows", "rest_of_row": "rows, from a random place on,",
-            "column": "columns", "frame": "frames",
+            "sample": "samples", "row": "rows", "column": "columns", "frame": "frames",
         }[self.together]  # fmt: skip
-        if self.exchange:
-            return (
-                f"a share of {self.share:.2g} of the {self.exchange} rows{place} changes places with the next"
-            )
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
@@ -239,15 +216,6 @@ class Empirical(Effect):
         free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside it"
         how = f"comes out moved after the converter ({', '.join(told)}){free}"
         return f"a share of {self.share:.2g} of the {what}{place} {how}"
-
-
-def _exchanged(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return frames whose chosen rows, (frame, y, 1), no two successive ones, are exchanged with the next."""
-    first = chosen[:, :-1]
-    result: NDArray[Any] = values.copy()
-    result[:, :-1] = np.where(first, values[:, 1:], result[:, :-1])
-    result[:, 1:] = np.where(first, values[:, :-1], result[:, 1:])
-    return result
 
 
 def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.empirical import measured_moves, without_moved
+from pchem_pipeline.discrepancy.by_simulation.empirical import measured_moves, without_squares
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -75,30 +75,6 @@ def drawn(strength: float):
     return move
 
 
-def late(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Deliver rows one column late."""
-    code = codes(dn)
-    return np.where(rng.random((FRAMES, SHAPE[0], 1)) < 0.1, np.roll(code, 1, axis=2), code)
-
-
-def slipped(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Lose a sample of rows, so that later ones come early."""
-    code = codes(dn)
-    found = code.copy()
-    begin = np.where(rng.random((FRAMES, SHAPE[0])) < 0.1, rng.integers(0, SHAPE[1], code.shape[:2]), 99)
-    early = np.arange(SHAPE[1] - 1) >= begin[..., None]
-    found[:, :, :-1] = np.where(early, code[:, :, 1:], code[:, :, :-1])
-    return found
-
-
-def swapped(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Exchange even rows with the next ones."""
-    code = codes(dn)
-    pairs = code.reshape(FRAMES, SHAPE[0] // 2, 2, SHAPE[1])
-    some = rng.random((FRAMES, SHAPE[0] // 2, 1, 1)) < 0.1
-    return np.where(some, pairs[:, :, ::-1], pairs).reshape(code.shape)
-
-
 def merged(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Deliver squares of pixels, from the second row and the first column on, as their mean."""
     code = codes(dn)
@@ -135,28 +111,22 @@ def test_shifts_are_measured(share: float, shift: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("move", "share", "wanted", "together"),
+    ("move", "share", "wanted"),
     [
-        (averaged, 0.1, Move(towards=(-1, 0, 0), part=0.5, within_dn=6), "sample"),
-        (drawn(2.0), 1.0, Move(towards=(-1, 0, 0), shift_dn=2), "sample"),
-        (drawn(0.7), 0.7, Move(towards=(-1, 0, 0), shift_dn=1), "sample"),
-        (late, 0.1, Move(towards=(0, 0, -1)), "row"),
-        (slipped, 0.1, Move(towards=(0, 0, 1)), "rest_of_row"),
-        (swapped, 0.1, Move(towards=(0, 1, 0)), "row"),
+        (averaged, 0.1, Move(towards=(-1, 0, 0), part=0.5, within_dn=6)),
+        (drawn(2.0), 1.0, Move(towards=(-1, 0, 0), shift_dn=2)),
+        (drawn(0.7), 0.7, Move(towards=(-1, 0, 0), shift_dn=1)),
     ],
 )
-def test_what_depends_on_a_neighbour_is_measured(
-    move: Any, share: float, wanted: Move, together: str
-) -> None:
+def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted: Move) -> None:
     found = measured(move, 5)
     assert found is not None
     main = max(found.moves, key=lambda one: one.weight)
     assert main.model_copy(update={"weight": 1.0}) == wanted
-    assert found.together == together
-    assert found.exchange == ("even" if move is swapped else None)
-    # the first column of a late row has no sample beside it; a few samples are taken for other moves
+    assert found.together == "sample"
+    # a few samples are taken for other moves
     assert found.share == pytest.approx(share, rel=0.25)
-    assert neighbour_words(wanted.towards) in found.words() or found.exchange
+    assert neighbour_words(wanted.towards) in found.words()
 
 
 def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None:
@@ -181,18 +151,10 @@ def test_simulated_squares_are_the_mean_of_their_samples() -> None:
         Empirical(share=0.3, moves=(Move(shift_dn=3),), squares=(1, 0))
 
 
-@pytest.mark.parametrize(
-    ("move", "effect"),
-    [
-        (late, Empirical(share=0.1, moves=(Move(towards=(0, 0, -1)),), together="row")),
-        (swapped, Empirical(share=0.1, moves=(Move(towards=(0, 1, 0)),), together="row", exchange="even")),
-        (merged, Empirical(share=0.05, moves=(Move(),), squares=(1, 0))),
-    ],
-)
-def test_pixels_are_fitted_without_samples_that_were_moved(move: Any, effect: Empirical) -> None:
+def test_pixels_are_fitted_without_samples_that_were_averaged() -> None:
     dn, rng, maps = sensor(11)
-    found, own = move(dn, rng).astype(np.uint16), codes(dn)
-    left = without_moved(found, maps, (effect,))
+    found, own = merged(dn, rng).astype(np.uint16), codes(dn)
+    left = without_squares(found, maps.usable, (Empirical(share=0.05, moves=(Move(),), squares=(1, 0)),))
     error = np.sqrt(2.0) * own.std(axis=0) / np.sqrt(FRAMES)
     inside = np.s_[:, 1:-1]
 
@@ -200,9 +162,9 @@ def test_pixels_are_fitted_without_samples_that_were_moved(move: Any, effect: Em
         return float(np.abs((frames.mean(axis=0) - own.mean(axis=0)) / error)[inside].max())
 
     assert largest(left) < min(4.0, largest(found))
-    # nothing else is touched, and nothing by effects that move no rows
+    # nothing else is touched, and nothing by other effects
     assert (left == found).all(axis=2).mean() > 0.7
-    assert without_moved(found, maps, Empirical.typical()) is found
+    assert without_squares(found, maps.usable, Empirical.typical()) is found
 
 
 def test_nothing_is_measured_where_there_is_nothing() -> None:
@@ -244,29 +206,15 @@ def test_samples_are_moved_towards_what_was_delivered_before() -> None:
     assert abs(moved.sum() / (towards != own[1:]).sum() - 0.2) < 0.01
 
 
-@pytest.mark.parametrize("together", ["row", "rest_of_row", "frame", "column"])
-def test_what_is_moved_together_comes_from_one_side(together: Any) -> None:
+@pytest.mark.parametrize(("together", "axes"), [("row", 2), ("frame", (1, 2)), ("column", 1)])
+def test_what_is_moved_together_comes_from_one_side(together: Any, axes: Any) -> None:
     move = Move(towards=(0, 0, 1))
     found, own = simulated(Empirical(share=0.3, moves=(move,), together=together), 400)
     moved, kept = found[:, :, :-1] == own[:, :, 1:], found[:, :, :-1] == own[:, :, :-1]
     assert np.all(moved | kept)
-    axes = {"row": 2, "frame": (1, 2), "column": 1}
-    if together in axes:
-        whole = moved.all(axis=axes[together])
-        assert np.all(whole | kept.all(axis=axes[together]))
-        assert abs(whole.mean() - 0.3) < 5 * np.sqrt(0.21 / whole.size) + 0.01
-    else:
-        # once moved, it is so to the end
-        assert np.all(np.logical_or.accumulate(~kept, axis=2) <= moved)
-
-
-def test_rows_change_places() -> None:
-    move = Move(towards=(0, 1, 0))
-    found, own = simulated(Empirical(share=0.1, moves=(move,), together="row", exchange="odd"), 600)
-    down = (found[:, :-1] == own[:, 1:]).all(axis=2) & (found[:, 1:] == own[:, :-1]).all(axis=2)
-    assert not down[:, ::2].any()
-    assert abs(down[:, 1::2].mean() - 0.1) < 5 * np.sqrt(0.09 / down[:, 1::2].size)
-    np.testing.assert_array_equal(np.sort(found, axis=1).sum(axis=1), np.sort(own, axis=1).sum(axis=1))
+    whole = moved.all(axis=axes)
+    assert np.all(whole | kept.all(axis=axes))
+    assert abs(whole.mean() - 0.3) < 5 * np.sqrt(0.21 / whole.size) + 0.01
 
 
 def test_the_same_frames_at_every_division() -> None:
