@@ -425,7 +425,7 @@ class FrameExplainer:
             code = self.evidence[0].code
             codes = code.first + np.arange(code.observed.size)
             train = frames.numbers[frames.splits.train]
-            expected = expected_codes(maps, frames.effects(self.model), codes, train)
+            expected = expected_codes(maps, frames.effects(self.model), codes, train, self.fit.added)
         model = frames.effects(model)
         try:
             added = added_exposures(model, frames.stack, frames.numbers, plain.maps)
@@ -450,7 +450,9 @@ class FrameExplainer:
             return None
         code, numbers = self.plain.code, self.frames.numbers[self.frames.seen]
         codes = code.first + np.arange(code.observed.size)
-        expected = expected_codes(self.fit.maps, self.frames.effects(self.model), codes, numbers)
+        expected = expected_codes(
+            self.fit.maps, self.frames.effects(self.model), codes, numbers, self.fit.added
+        )
         left = dict(zip(null.names, null.pulls(z.both, 2).tolist(), strict=True))
         return replace(
             self.plain, code=code if expected is None else replace(code, expected=expected), z=left
@@ -464,7 +466,10 @@ class FrameExplainer:
             return Refit(plain.maps, {}, plain.covariance)
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
         frames = self._own_samples(own)
-        fit = refit_maps(frames, plain.maps, own, plain.covariance, numbers=numbers)
+        # where the pixels are drawn anew in every replicate, what they have in the data stays part of H
+        steady = [e for e in own if not e.brightens_anew]
+        added = added_exposures(steady, frames, numbers, plain.maps)
+        fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
         tags = (effect.tag for effect in model)
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
         return fit

@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 
 _UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
-_LEAST_LEFT = 0.2  # of the fitted variance of the read noise, without what effects add to it
+_LEAST_LEFT = 0.2  # of the fitted exposure, or variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
 #: Share of pixels with a mistaken bias from which what is learnt does not rest on their maxima.
 MANY_MISTAKEN = 0.3
@@ -59,6 +59,7 @@ class Refit:
         covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
         components: of the law of a sample, with all effects.
         evaluations: of the likelihood of a pixel, on average.
+        added: exposure beside H that the effects add to each pixel, (j, y, x); None: it counts as part of H.
     """
 
     maps: PixelMaps
@@ -66,6 +67,7 @@ class Refit:
     covariance: NDArray[np.float64]
     components: int = 1
     evaluations: float = 0.0
+    added: AddedExposure | None = None
 
 
 def refit_maps(
@@ -103,6 +105,9 @@ def refit_maps(
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
     near = np.stack(flat, axis=1)
+    if added is not None:
+        mean = (added.flat().exposure_e * added.flat().weight).sum(axis=0)
+        near[:, 0] = np.maximum(near[:, 0] - mean, _LEAST_LEFT * near[:, 0])
 
     def fitted(some: slice | NDArray[np.intp]) -> FitResult:
         origin = histograms.origin.ravel()[some]
@@ -122,11 +127,15 @@ def refit_maps(
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
-    return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()))
+    return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()), added)
 
 
 def expected_codes(
-    maps: PixelMaps, effects: Sequence[Effect], codes: NDArray[np.integer], numbers: NDArray[np.int64]
+    maps: PixelMaps,
+    effects: Sequence[Effect],
+    codes: NDArray[np.integer],
+    numbers: NDArray[np.int64],
+    added: AddedExposure | None = None,
 ) -> NDArray[np.float64] | None:
     """Return the samples that a model expects at each code, all usable pixels together.
 
@@ -135,6 +144,7 @@ def expected_codes(
         effects: of the model.
         codes: successive DN, shape (c,).
         numbers: of the frames in the run, one sample of each pixel in each.
+        added: exposure beside H that the effects add to each pixel, (j, y, x); None: it is part of H.
 
     Returns:
         Shape (c,); None where the effects give no law.
@@ -145,7 +155,8 @@ def expected_codes(
     try:
         shape = maps.usable.shape
         places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers).of(usable)
-        law = sample_law(effects, pixel_maps(flat, usable[usable]), places=places)
+        beside = None if added is None else added.flat().of(usable)
+        law = sample_law(effects, pixel_maps(flat, usable[usable]), beside, places)
     except ConfigError:
         return None
     return np.asarray(numbers.size * sample_mass(law, flat, codes, far_tails=False).sum(axis=0))
@@ -234,7 +245,7 @@ def learn_sensor(
     covariance = fit.covariance.reshape(-1, 4, 4)
     shape = maps.usable.shape
     places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers)
-    law = _law_of_all(effects, parameters, places)
+    law = _law_of_all(effects, parameters, places, fit.added)
     if law is None or law.free_satellites:
         drawn = usable
         posterior = posterior_of_estimates(parameters[drawn], covariance[drawn])
@@ -260,11 +271,13 @@ def learn_sensor(
     )
 
 
-def _law_of_all(effects: Sequence[Effect], parameters: FloatArray, places: PixelPlaces) -> SampleLaw | None:
+def _law_of_all(
+    effects: Sequence[Effect], parameters: FloatArray, places: PixelPlaces, added: AddedExposure | None
+) -> SampleLaw | None:
     """Return the law of all pixels, those without parameters as their middle; None where there is none."""
     middle = np.nanmedian(parameters, axis=0)
     full = np.where(np.isfinite(parameters), parameters, middle)
     try:
-        return sample_law(effects, pixel_maps(list(full.T), np.ones(len(full), np.bool_)), places=places)
+        return sample_law(effects, pixel_maps(list(full.T), np.ones(len(full), np.bool_)), added, places)
     except ConfigError:
         return None

@@ -72,6 +72,7 @@ class Effect(Section):
         separate: for each effect that it is confused with (tag), the measurement that tells them apart.
         erratic: whether its time profile is drawn anew in every simulation, so that a fingerprint is one of
             many and another effect outdoes it only by a clear margin.
+        brightens_anew: whether the pixels to which it adds exposure are drawn anew in every simulation.
         untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
         rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
             of a few pixels do not tell whether they have the effect.
@@ -89,6 +90,7 @@ class Effect(Section):
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {}
     erratic: ClassVar[bool] = False
+    brightens_anew: ClassVar[bool] = False
     untestable: ClassVar[str] = ""
     rough_law: ClassVar[bool] = False
     measured_only: ClassVar[bool] = False

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
 
-from pchem_pipeline.discrepancy.by_simulation.maps import Refit, learn_sensor
+from pchem_pipeline.discrepancy.by_simulation.maps import Refit, learn_sensor, refit_maps
 from pchem_pipeline.discrepancy.by_simulation.population import posterior_of_estimates, to_theta
 from pchem_pipeline.discrepancy.by_simulation.replicate import (
     Acquisition,
@@ -16,6 +16,8 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import (
     truth_of,
 )
 from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.exposure.persistence import Persistence
+from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
@@ -175,3 +177,32 @@ def test_what_an_effect_without_a_law_adds_is_not_simulated_twice():
     again = Replicate("fitted", sensor.draw(5), (effect,), 5, taken).fitted()
     after, error = too_noisy(sensor.corrected(seen.maps, again))
     assert abs(after) < max(3.0 * error, before / 5.0)
+
+
+def test_exposure_that_an_effect_adds_to_a_spot_is_not_simulated_twice():
+    """A ghost of 1.5 e-, fading over the run: half of it would be in the exposure of the pixels, too."""
+    camera = PlainCamera(0.25, 1.5, 12.0, (20, 20), 900, SPREAD)
+    effect = Persistence(peak_e=1.5, decay_frames=450)
+    rng = np.random.default_rng(11)
+    exposure, step, bias, noise = camera.maps(rng)
+    y, x = np.mgrid[:20, :20]
+    spot = np.exp(-0.5 * ((y + 0.5 - 10) ** 2 + (x + 0.5 - 10) ** 2) / 4.0**2)
+    ghost = effect.peak_e * np.exp(-np.arange(900) / 450)[:, None, None] * spot
+    electrons = rng.poisson(exposure + ghost) + noise * rng.standard_normal(ghost.shape)
+    frames = np.rint(bias + step * electrons).astype(np.uint16)
+    numbers = np.arange(900)
+    seen = observe(frames, numbers, n_run=900, block_frames=50)
+    added = added_exposures([effect], frames, numbers, seen.maps)
+    bright = spot > 0.5
+
+    def too_bright(added):
+        fit = refit_maps(frames, seen.maps, [effect], seen.covariance, added, numbers)
+        sensor = learn_sensor(frames, numbers, fit, [effect], seen.ambiguous)
+        drawn = np.mean([sensor.draw(seed).quanta_exposure for seed in range(4)], axis=0)
+        return (drawn - exposure)[bright & sensor.usable]
+
+    before, after = too_bright(None), too_bright(added)
+    error = after.std() / np.sqrt(after.size)
+    assert abs(after.mean()) < 4.0 * error
+    assert before.mean() > 8.0 * error
+    assert after.std() < 0.5 * before.mean()
