@@ -34,7 +34,7 @@ Vector = Mapping[str, float]
 Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 
 _log = logging.getLogger(__name__)
-_MOST_HYPOTHESES = 6  # of one effect
+MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
 _LEFT = 4.0  # deviations that the model leaves of a leading statistic for its effect to be asked for
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
@@ -134,6 +134,7 @@ class ReplicateSimulator:
         evidence: Sequence[Evidence],
         parts: Sequence[tuple[Part, Evidence]] = (),
         beside: Evidence | None = None,
+        most: int = MOST_HYPOTHESES,
     ) -> list[Effect]:
         """Ask every candidate for hypotheses; one that raises is a defect.
 
@@ -141,7 +142,8 @@ class ReplicateSimulator:
         strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
         the sensor or run gives hypotheses that act there only. Beside the effects of the model others stand
         out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
-        leading statistics of its effect deviate, what is typical is a guess.
+        leading statistics of its effect deviate, what is typical is a guess. Of one effect, everywhere, there
+        are ``most`` at most.
         """
         known = [] if beside is None else [beside]
         found: list[Effect] = []
@@ -153,7 +155,7 @@ class ReplicateSimulator:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
                 if not guessed and known and known[0].strongest(*effect.signature[:2]) > _LEFT:
                     guessed = list(effect.typical())
-                found += [window.found(each) for each in guessed[:_MOST_HYPOTHESES]]
+                found += [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     placed = list(effect.estimate(own))[:_MOST_IN_A_PART]
                     found += [window.found(each, part) for each in placed]

@@ -8,7 +8,7 @@ their best fit, do not account for and do not touch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -34,7 +34,11 @@ FloatArray = NDArray[np.float64]
 
 _MOST_SINGLES = 7
 _MOST_OF_ONE = 3  # hypotheses of the same effect
-_MOST_SETS = 4
+_MOST_SETS = 5
+# single effects that sets are grown from, and share of what the best one explains within which another one is
+# as good a beginning; how many of these sets are refitted, by how many effects they have besides
+_MOST_BEGINNINGS, _REACH_SHARE = 2, 0.05
+_MOST_GROWN = {1: 2, 2: 1}
 _MOST_DEAR = 2  # sets whose refit takes long
 _LOOSE = 0.1  # relative error of a fingerprint before its refit
 # nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
@@ -87,6 +91,7 @@ def compare(
     hypotheses: Sequence[Hypothesis],
     choice: Choice,
     before: Refitted | None = None,
+    beside: Callable[[Refitted], Choice | None] = lambda _: None,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
@@ -96,6 +101,7 @@ def compare(
         hypotheses: all new ones, the likeliest first.
         choice: how their sets compare by fingerprints.
         before: the effects held, at their best fit; None: not known.
+        beside: compares new hypotheses by what they do beside a refitted set.
 
     Raises:
         EffortSpentError: the work is at its limit.
@@ -130,8 +136,17 @@ def compare(
     if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
         return None  # nothing beside the effects held explains more than they do by themselves
     if not leaves_nothing(refitter, best):
-        for members in _sets(choice, tried):
-            refit(_begun(members, tried))
+        sets = _of_different_effects([*_grown(refitter, tried, len(held), beside), *_sets(choice, tried)])
+        for number, members in enumerate(sets[:_MOST_SETS]):
+            best = max(tried, key=_worth)
+            if len(held) + len(members) > len(best.hypotheses) and leaves_nothing(refitter, best):
+                continue
+            try:
+                refit(_begun(members, tried))
+            except EffortSpentError:
+                if not number:
+                    raise
+                break
     # the work that led here must not be lost for the little that is left: no limit
     to_choose = replace(refitter, allow=lambda _: None)
     chosen = _chosen(to_choose, tried, [] if before is None else [before])
@@ -154,7 +169,7 @@ def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted
     """
     while True:
         tried.sort(key=_worth, reverse=True)
-        known = {one.tags: one for one in [*before, *tried[::-1]]}
+        known = [*tried, *before]
         chosen = next((one for one in tried if _all_seen(refitter, one, known)), None)
         if chosen is None:
             return None
@@ -261,17 +276,60 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     return chosen
 
 
+def _grown(
+    refitter: Refitter,
+    singles: Sequence[Refitted],
+    held: int,
+    beside: Callable[[Refitted], Choice | None],
+) -> list[tuple[Hypothesis, ...]]:
+    """Return sets that hold one of the best single effects and what stands out beside it.
+
+    One that is strong hides or distorts what the frames show of the others.
+
+    Args:
+        refitter: fits sets.
+        singles: effects refitted alone.
+        held: how many effects of earlier rounds were fitted with each.
+        beside: compares new hypotheses by what they do beside a refitted set.
+    """
+    kinds: dict[frozenset[str], Refitted] = {}
+    for one in sorted(singles, key=_worth, reverse=True):
+        kinds.setdefault(one.tags, one)
+    best = next(iter(kinds.values()))
+    near = best.score - _REACH_SHARE * (best.score - refitter.nothing)
+    begun = [one for one in kinds.values() if one.score >= near][:_MOST_BEGINNINGS]
+    choices = [(one.hypotheses[held:], choice) for one in begun if (choice := beside(one)) is not None]
+    grown: list[tuple[Hypothesis, ...]] = []
+    for size, most in _MOST_GROWN.items():
+        found = [
+            (each.worth, (*own, *each.at_fit()))
+            for own, choice in choices
+            for each in choice.tried
+            if len(each.hypotheses) == size
+        ]
+        found.sort(key=lambda item: item[0], reverse=True)
+        grown += _of_different_effects([members for _, members in found])[:most]
+    return grown
+
+
 def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis, ...]]:
-    """Return sets of several to be refitted, without those that hold another kind of a better effect."""
+    """Return sets of several, the likeliest first, with the better kind of what was refitted alone."""
     kinds: dict[str, Hypothesis] = {}
     for one in sorted(singles, key=_worth, reverse=True):
         kinds.setdefault(one.hypotheses[-1].tag, one.hypotheses[-1])
+    # of an effect that was refitted alone, the kind that did best; its strength is that of the set
+    return [
+        tuple(_kind(h, kinds[h.tag]) if h.tag in kinds else h for h in scored.at_fit())
+        for scored in choice.tried
+        if len(scored.hypotheses) > 1
+    ]
+
+
+def _of_different_effects(sets: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[Hypothesis, ...]]:
+    """Return sets without those of the same effects as one before."""
     found: dict[frozenset[str], tuple[Hypothesis, ...]] = {}
-    for scored in choice.tried:
-        if len(scored.hypotheses) > 1 and len(found) < _MOST_SETS:
-            # of an effect that was refitted alone, the kind that did best; its strength is that of the set
-            members = tuple(h if h.tag not in kinds else _kind(h, kinds[h.tag]) for h in scored.hypotheses)
-            found.setdefault(scored.tags, members)
+    for members in sets:
+        found.setdefault(frozenset(h.tag for h in members), members)
     return list(found.values())
 
 
@@ -295,13 +353,13 @@ def _begun(members: Sequence[Hypothesis], tried: Sequence[Refitted]) -> tuple[Hy
     return tuple(own[h.tag] if h.tag in own and _alike(h, own[h.tag]) else h for h in members)
 
 
-def _all_seen(refitter: Refitter, one: Refitted, known: dict[frozenset[str], Refitted]) -> bool:
+def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
     """Tell whether each effect of a set has a signature of its own beside the best fit of the others.
 
     Args:
         refitter: fits sets.
         one: the set.
-        known: sets at their best fit, by their tags; those that are fitted here come to them.
+        known: sets at their best fit, the best first; those that are fitted here come to them.
     """
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with
@@ -310,20 +368,27 @@ def _all_seen(refitter: Refitter, one: Refitted, known: dict[frozenset[str], Ref
     if not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
     for place, hypothesis in enumerate(one.hypotheses):
-        tags = one.tags - {hypothesis.tag}
-        others = known.get(tags)
+        members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
+        # the same kinds: another kind of one that mimics both is another set
+        others = next((other for other in known if _of_kinds(other, members)), None)
         if others is None and is_dear(h.effect for h in one.hypotheses):
             return False
         if others is None:
             try:
-                others = refitter.refined([h for h in one.hypotheses if h.tag != hypothesis.tag], one.score)
+                others = refitter.refined(members, one.score)
             except NotFittedError:
                 return False
-            known[tags] = others
+            known.append(others)
         part = one.hypotheses[place].fingerprint
         if not own_signature(part, others.parts, others.rest, noise):
             return False
     return True
+
+
+def _of_kinds(one: Refitted, members: Sequence[Hypothesis]) -> bool:
+    """Tell whether a set is of these effects, differing in their strengths only."""
+    own = {h.tag: h for h in one.hypotheses}
+    return own.keys() == {h.tag for h in members} and all(_alike(own[h.tag], h) for h in members)
 
 
 def _untouched(one: Refitted, place: int, noise: FloatArray) -> bool:

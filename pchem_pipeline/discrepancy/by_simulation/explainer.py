@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
     unexplained_of_its_own,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates import (
+    MOST_HYPOTHESES,
     Mapper,
     ReplicateSimulator,
     candidate_classes,
@@ -84,6 +85,8 @@ _CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no s
 # than a single one would by chance
 _ESTABLISHED = 4.5
 _CLEARLY_LESS = 0.5  # of the gap that named effects leave, the most that may stay with another form
+_MOST_BESIDE = 2  # hypotheses of one effect beside a single other one
+_DOUBT = 0.2  # of the logarithm of a factor that was fitted without the effects beside it
 _DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
 
@@ -135,11 +138,19 @@ def find_discrepancies(
 
 @dataclass(frozen=True)
 class _Explanation:
-    """The best set of a round, all hypotheses that it was compared with, and what simulated them."""
+    """All hypotheses of a round, and how their sets compare."""
 
-    simulator: ReplicateSimulator
     hypotheses: tuple[Hypothesis, ...]
     choice: Choice
+
+
+@dataclass
+class _Drawn:
+    """A model's fit, the sensors to draw replicates from, and the statistics of those drawn so far."""
+
+    fit: Refit
+    sensor: Sensor
+    vectors: list[Mapping[str, float]] = field(default_factory=list)
 
 
 @dataclass
@@ -164,6 +175,8 @@ class FrameExplainer:
         self.lost: float | None = None
         self.held: Refitted | None = None
         self.unexplained: Unexplained | None = None
+        self.given = self.model
+        self.drawn: dict[tuple[Effect, ...], _Drawn] = {}
 
     def split(self) -> tuple[Evidence, Examined]:
         """Observe train and test frames together, then each part near their fit."""
@@ -230,34 +243,59 @@ class FrameExplainer:
         """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
         self.effort.check("the candidates were compared" if not self.rounds else "another round of effects")
         self.effort.tried.clear()
-        number = len(self.rounds)
+        hypotheses, choice = self._asked(self.model, _Drawn(self.fit, self.sensor), null, z)
+        if choice is None or not (disagrees or choice.advantage > _CONVINCING):
+            return None
+        return _Explanation(hypotheses, choice)
+
+    def _asked(
+        self,
+        model: tuple[Effect, ...],
+        drawn: _Drawn,
+        null: NullModel,
+        z: Measured,
+        slopes: FloatArray | None = None,
+    ) -> tuple[tuple[Hypothesis, ...], Choice | None]:
+        """Ask every candidate what it would do beside a model, and compare their sets.
+
+        Args:
+            model: effects.
+            drawn: the fit of the pixels with them.
+            null: of that model.
+            z: statistics of the data.
+            slopes: how the statistics go with those of its strengths that are doubtful, shape (e, m).
+        """
+        purpose = "/".join([str(len(self.rounds)), *(e.tag for e in model if slopes is not None)])
         simulator = ReplicateSimulator(
-            self.sensor.usual(self._seed("sensor", number)),
-            self.model,
+            drawn.sensor.usual(self._seed(f"sensor/{purpose}")),
+            model,
             self.frames.acquisition(),
             null.names,
             self._counted,
-            f"r{number}",
-            self._seed("fingerprint", number),
+            f"r{purpose}",
+            self._seed(f"fingerprint/{purpose}"),
             dict(self.defects),
         )
         shifts = (z.train - null.mean, z.test - null.mean)
         apart = self.frames.seen_apart(self.plain)
-        own = (self.plain, *self.evidence[:2])
-        found = [h.effect for this in self.rounds for h in this.added.hypotheses]
+        evidence: tuple[Evidence, ...] = (self.plain, *self.evidence[:2])
+        most = MOST_HYPOTHESES
+        if slopes is not None:
+            # what is worth a refit beside a single effect: as the whole shows it, simulated once
+            evidence, most = (), _MOST_BESIDE
+        beside = self._beside(model, drawn.fit, null, z)
+        found = [effect for effect in model if effect not in self.given]
         guesses = [
             guess
-            for guess in simulator.guesses(self.classes, own, apart, self._beside(null, z))
+            for guess in simulator.guesses(self.classes, evidence, apart, beside, most)
             if not share_place((*found, guess))
         ]
-        placebo = placebo_for(guesses, self.classes)
-        hypotheses = simulator.fingerprints([*guesses, *placebo])
-        hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
-        choice = choose(hypotheses, shifts, self._noise(null, 1)) if hypotheses else None
+        hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
+        if slopes is None:
+            hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
+        choice = choose(hypotheses, shifts, self._noise(null, 1, slopes)) if hypotheses else None
         self.defects |= simulator.defects
-        if choice is None or not (disagrees or choice.advantage > _CONVINCING):
-            return None
-        return _Explanation(simulator, tuple(hypotheses), choice)
+        return tuple(hypotheses), choice
 
     def add(self, explanation: _Explanation, null: NullModel, z: Measured) -> NullModel | None:
         """Put the effects of the best refitted set into the model; None where none is established.
@@ -271,7 +309,14 @@ class FrameExplainer:
         held = tuple(h for this in self.rounds for h in this.added.hypotheses)
         refitter = self._refitter(z, held)
         try:
-            found = compare(refitter, held, explanation.hypotheses, explanation.choice, self.held)
+            found = compare(
+                refitter,
+                held,
+                explanation.hypotheses,
+                explanation.choice,
+                self.held,
+                lambda best: self._left_by(best, refitter, z),
+            )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in self.effort.tried)) from spent
@@ -290,6 +335,13 @@ class FrameExplainer:
             except NotFittedError:
                 break
         return None
+
+    def _left_by(self, best: Refitted, refitter: Refitter, z: Measured) -> Choice | None:
+        """Compare what candidates would do beside a refitted set: what that hid stands out there."""
+        model = refitter.model(best.effects)
+        null = NullModel.from_replicates(self.first.names, best.vectors, self.first)
+        null = null.shifted(np.expm1(best.change) @ best.slopes)
+        return self._asked(model, self.drawn[model], null, z, best.slopes)[1]
 
     def _widens(self, added: Refitted, null: NullModel, z: Measured) -> bool:
         """Tell whether a set, its strengths as the data ask for, leaves a wider gap than without it."""
@@ -441,18 +493,16 @@ class FrameExplainer:
 
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _beside(self, null: NullModel, z: Measured) -> Evidence | None:
-        """Return the evidence of the seen frames beside the effects of the model; None where it has none.
+    def _beside(self, model: tuple[Effect, ...], fit: Refit, null: NullModel, z: Measured) -> Evidence | None:
+        """Return the evidence of the seen frames beside the effects of a model; None where it has none.
 
         Counts per code beside those that the model expects, and the vector as it deviates from the model's.
         """
-        if not self.model:
+        if not model:
             return None
         code, numbers = self.plain.code, self.frames.numbers[self.frames.seen]
         codes = code.first + np.arange(code.observed.size)
-        expected = expected_codes(
-            self.fit.maps, self.frames.effects(self.model), codes, numbers, self.fit.added
-        )
+        expected = expected_codes(fit.maps, self.frames.effects(model), codes, numbers, fit.added)
         left = dict(zip(null.names, null.pulls(z.both, 2).tolist(), strict=True))
         return replace(
             self.plain, code=code if expected is None else replace(code, expected=expected), z=left
@@ -533,9 +583,11 @@ class FrameExplainer:
         text = f"{self.settings.seed}/{purpose}/{index}"
         return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
 
-    def _noise(self, null: NullModel, splits: int) -> Noise:
-        """Return the noise of a shift of the mean of so many splits."""
+    def _noise(self, null: NullModel, splits: int, slopes: FloatArray | None = None) -> Noise:
+        """Return the noise of a shift of the mean of so many splits; ``slopes`` are of doubtful strengths."""
         covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
+        if slopes is not None:
+            covariance = covariance + _DOUBT**2 * slopes.T @ slopes
         events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
         return Noise(covariance, self.settings.model_error, events)
 
@@ -544,16 +596,16 @@ class FrameExplainer:
         found = {h.tag for h in held}
         present = tuple(e for e in self.model if e.tag not in found)
 
-        known: dict[tuple[str, ...], tuple[Refit, Sensor, list[Mapping[str, float]]]] = {}
+        self.drawn = {}
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             model = (*present, *effects)
-            key = tuple(e.model_dump_json() for e in model)
-            if key not in known:
-                known[key] = (*self._mapped(model), [])
-            fit, sensor, vectors = known[key]
-            vectors += self._replicates(model, sensor, "grown", count - len(vectors), len(vectors))
-            return fit, as_matrix(self.first.names, vectors[:count], self.first.mean)
+            if model not in self.drawn:
+                self.drawn[model] = _Drawn(*self._mapped(model))
+            one = self.drawn[model]
+            done = len(one.vectors)
+            one.vectors += self._replicates(model, one.sensor, "grown", count - done, done)
+            return one.fit, as_matrix(self.first.names, one.vectors[:count], self.first.mean)
 
         events = np.asarray(self._noise(self.first, 2).events)
 
@@ -608,10 +660,7 @@ class FrameExplainer:
 
     def _take(self, added: Refitted, change: FloatArray) -> tuple[Hypothesis, ...]:
         """Take a set into the model, its factors changed by shares; fit the pixels with it, and return it."""
-        taken = tuple(
-            Hypothesis(h.rescaled(1.0 + float(c)), h.fingerprint * (1.0 + c))
-            for h, c in zip(added.hypotheses, change, strict=True)
-        )
+        taken = tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
         tags = {h.tag for h in taken}
         model = (*(e for e in self.model if e.tag not in tags), *(h.effect for h in taken))
         self.fit, self.sensor = self._mapped(model)

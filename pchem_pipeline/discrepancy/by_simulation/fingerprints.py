@@ -61,6 +61,10 @@ class Hypothesis:
             return self.effect
         return self.effect.scaled(float(factor) ** (1.0 / self.effect.power))
 
+    def times(self, factor: float) -> Hypothesis:
+        """Return the effect so many times as strong, its fingerprint in proportion."""
+        return Hypothesis(self.rescaled(factor), self.fingerprint * factor)
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -224,6 +228,12 @@ class ScoredSet:
     def tags(self) -> frozenset[str]:
         """Their tags."""
         return frozenset(h.tag for h in self.hypotheses)
+
+    def at_fit(self) -> tuple[Hypothesis, ...]:
+        """Return the set at the strengths fitted to both splits."""
+        factors = np.sqrt(self.fits[0].factors * self.fits[1].factors)
+        factors = np.where(factors > 0.0, factors, 1.0)
+        return tuple(h.times(float(c)) for h, c in zip(self.hypotheses, factors, strict=True))
 
     @property
     def worth(self) -> float:

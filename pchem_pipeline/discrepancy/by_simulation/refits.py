@@ -38,6 +38,9 @@ _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its
 # times what its next step promises to gain
 _REACH, _REACH_SHARE, _MISJUDGED = 30.0, 0.1, 5.0
 _LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the next ones bring less
+_SLIGHT = (
+    0.15  # of what a set leaves beyond chance, gained by a step that leaves it behind another set: in vain
+)
 # nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
 # the logarithm of a factor up to which its promise is believed
 _SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
@@ -182,6 +185,9 @@ class Refitter:
         Steps towards a maximum gain less and less.
         """
         near = rival - _REACH
+        slight = min(_SLIGHT * (one.chance - one.promise), _REACH)
+        if one.promise < rival and one.promise - one.score < slight:
+            return True
         more = min(_REACH_SHARE * (rival - self.nothing), _MISJUDGED * (one.promise - one.score))
         return one.promise + more < near or one.score + gained < near
 
@@ -217,29 +223,39 @@ class Refitter:
             return self._simulated(one.hypotheses, one, replicates)
 
     def _slopes(self, one: Refitted) -> FloatArray | None:
-        """Return the slopes of an effect alone that is strong, from a step beside it; None of all others.
+        """Return the slopes of effects that are strong, each from a step beside it; None where none is.
 
         Replicates share their random numbers, whatever the strength: few of them show a slope.
         """
-        strong = np.max(np.abs(one.parts) / self.null.std) > _STRONG
-        moved = _moved(one.hypotheses, np.copysign([_TRIAL], one.change)) if len(one.tags) == 1 else None
-        if moved is None or not strong or is_dear(one.effects):
+        strong = np.max(np.abs(one.parts) / self.null.std, axis=1) > _STRONG
+        if not strong.any() or is_dear(one.effects):
             return None
-        step = _step(one.effects, tuple(h.effect for h in moved))
-        if abs(step[0]) < _SMALLEST_SECANT:
+        ahead = np.diag(np.where(strong, np.copysign(_TRIAL, one.change), 0.0))
+        found = [self._slope(one, place, ahead[place]) for place in range(strong.size)]
+        if all(slope is None for slope in found):
+            return None
+        return np.array([old if new is None else new for old, new in zip(one.slopes, found, strict=True)])
+
+    def _slope(self, one: Refitted, place: int, ahead: FloatArray) -> FloatArray | None:
+        """Return the slope of one effect of a set, from a step ahead of it alone; None: there is none."""
+        moved = _moved(one.hypotheses, ahead)
+        if moved is None:
+            return None
+        step = float(_step(one.effects, tuple(h.effect for h in moved))[place])
+        if abs(step) < _SMALLEST_SECANT:
             return None
         self.allow(" + ".join(sorted(one.tags)))
         try:
             _, vectors = self.draw(tuple(h.effect for h in moved), len(one.vectors))
         except NotFittedError:
             return None
-        apart = (vectors - one.vectors) / step[0]
+        apart = (vectors - one.vectors) / step
         error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
         # a shift in proportion to the factor has this slope between the two
-        middle = np.exp(step[0] / 2.0)
-        foreseen = middle * one.parts[0]
+        middle = np.exp(step / 2.0)
+        foreseen = middle * one.parts[place]
         slope = foreseen + _beyond_chance(apart.mean(axis=0) - foreseen, error)
-        return np.asarray(slope[None] / middle)
+        return np.asarray(slope / middle)
 
     def _kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
         """Return which statistics tell strengths.
@@ -340,10 +356,7 @@ def is_dear(effects: Iterable[Effect]) -> bool:
 
 def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothesis, ...] | None:
     """Return the hypotheses at other strengths, None where their limits do not let them move."""
-    new = tuple(
-        Hypothesis(h.rescaled(float(np.exp(s))), h.fingerprint * np.exp(s))
-        for h, s in zip(hypotheses, step, strict=True)
-    )
+    new = tuple(h.times(float(np.exp(s))) for h, s in zip(hypotheses, step, strict=True))
     return None if all(a.effect == b.effect for a, b in zip(new, hypotheses, strict=True)) else new
 
 
