@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 _TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
+# widths that are guessed, at a share so small that samples and moments go in proportion to it
+_FACTORS, _SMALL, _MOST = (1.25, 1.4, 1.6, 2.0, 2.5, 3.0, 5.0), 1e-3, 4
 
 
 @register_effect
@@ -85,11 +87,13 @@ class HeavyTailedNoise(Effect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return mixtures with the samples below the codes and the He4 that are seen.
 
-        The share is the weighted mean of what either says; the factor for which they agree best is the first.
+        The share is the weighted mean of what either says; the factors for which they agree best, the best
+        first.
         """
         tail = _TailBelow(evidence)
         found: list[tuple[float, Self]] = []
-        for effect in cls.typical():
+        for width in _FACTORS:
+            effect = cls(share=_SMALL, factor=width)
             factor, error = first_order(evidence, effect, "He4", cut=8.0)
             other, other_error = tail.first_order(effect)
             weight = error**-2.0 + other_error**-2.0
@@ -97,7 +101,7 @@ class HeavyTailedNoise(Effect):
             if mean * np.sqrt(weight) > 2.5:
                 disagreement = (factor - other) ** 2 / (error**2 + other_error**2)
                 found.append((disagreement, effect.scaled(mean)))
-        return [effect for _, effect in sorted(found, key=lambda item: item[0])]
+        return [effect for _, effect in sorted(found, key=lambda item: item[0])[:_MOST]]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with noise of two widths."""
