@@ -29,6 +29,7 @@ _WHERE = 1  # draw of the sample or line from which on others follow
 _ALIKE = 2.0
 # share of the lines that moves make, of those they can make, by which a guess is worth a try
 _WORTH = 0.1
+_HIDDEN = 2.5  # lines there may be for each that is seen
 
 
 @register_effect
@@ -137,24 +138,25 @@ class MisplacedLines(Effect):
         """Return the moves that leave lines where they are found, with the shares found there."""
         if evidence.time is None:
             return ()
-        found: list[Self] = []
+        seen: list[tuple[float, Move, str]] = []
         for lines, shares in evidence.time.misplaced_lines.items():
             share = dict(zip(PLACES, (float(s) for s in shares), strict=True))
-            guesses: dict[str, float] = {"early": share["early"], "late": share["late"]}
-            guesses |= {"sample_lost": share["lost"], "sample_twice": share["twice"]}
             after, before = share["next"], share["before"]
+            guesses: dict[Move, float] = {"early": share["early"], "late": share["late"]}
+            guesses |= {"sample_lost": share["lost"], "sample_twice": share["twice"]}
             if min(after, before) * _ALIKE > max(after, before):
                 guesses["swapped"] = (after + before) / 2.0
             else:
                 # from a random line on: half of them
                 guesses["line_lost"], guesses["line_twice"] = 2.0 * after, 2.0 * before
             most = max(guesses.values())
-            found += [
-                cls.model_validate({"share": min(guess, 0.5), "move": move, "lines": lines})
-                for move, guess in guesses.items()
-                if guess > _WORTH * most
-            ]
-        return sorted(found, key=lambda one: -one.share)
+            seen += [(guess, move, lines) for move, guess in guesses.items() if guess > _WORTH * most]
+        # the histograms hold the misplaced samples, too, so that of many lines few are seen
+        return [
+            cls.model_validate({"share": min(times * guess, 0.5), "move": move, "lines": lines})
+            for guess, move, lines in sorted(seen, key=lambda one: -one[0])
+            for times in (1.0, _HIDDEN)
+        ]
 
 
 def _before(lines: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
