@@ -90,6 +90,9 @@ def test_a_band_that_is_done_holds_no_memory(tmp_path, monkeypatch):
         def array(self, name):
             return SimpleNamespace(chunks=(64, 16))
 
+        def file_shape(self, name):
+            return (64, 16)
+
         def write(self, name, region, data):
             pass
 
