@@ -320,6 +320,8 @@ def _measured_towards(
         return None
     samples, moves = _samples(frames, numbers, laws, best[1], some), _moves_towards(best[1], step)
     used, shares, gain = _mixture(laws, samples, moves, samples.other).needed()
+    if not used:
+        return None  # together they help, none of them is needed
     together, share = _together(laws, samples, moves, shares, frames.shape)
     if together != "sample":
         shares = shares * share / max(float(shares[used].sum()), _LEAST)

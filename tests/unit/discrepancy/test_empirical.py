@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.empirical import measured_moves, without_squares
+from pchem_pipeline.discrepancy.by_simulation.empirical import _Mixture, measured_moves, without_squares
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -170,6 +170,11 @@ def test_pixels_are_fitted_without_samples_that_were_averaged() -> None:
 def test_nothing_is_measured_where_there_is_nothing() -> None:
     found = [measured(plain, seed) for seed in range(4)]
     assert [one for one in found if one is not None and one.share > 1e-3] == []
+
+
+def test_moves_of_which_none_is_needed_are_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Mixture, "needed", lambda self: ([], np.zeros(len(self.mass)), 0.0))
+    assert measured(averaged, 5) is None
 
 
 def simulated(effect: Empirical, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
