@@ -510,12 +510,15 @@ class FrameExplainer:
 
     def _refit(self, model: tuple[Effect, ...]) -> Refit:
         """Return the fit of the seen frames under a model."""
+        return self._refit_of(self._own_samples(model), model)
+
+    def _refit_of(self, frames: NDArray[np.unsignedinteger], model: tuple[Effect, ...]) -> Refit:
+        """Return the fit of frames, each sample that of its pixel, under a model."""
         plain = self.plain
         assert plain.covariance is not None
         if not model:
             return Refit(plain.maps, {}, plain.covariance)
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = self._own_samples(own)
         # where the pixels are drawn anew in every replicate, what they have in the data stays part of H
         steady = [e for e in own if not e.brightens_anew]
         added = added_exposures(steady, frames, numbers, plain.maps)
@@ -524,17 +527,17 @@ class FrameExplainer:
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
         return fit
 
-    def _own_samples(self, effects: Sequence[Effect]) -> NDArray[np.unsignedinteger]:
+    def _own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:
         """Return the seen frames without the samples that effects likely gave to other pixels."""
-        usable = self.plain.maps.usable
+        usable, effects = self.plain.maps.usable, self.frames.effects(model)
         frames = without_squares(self.frames.stack[self.frames.seen], usable, effects)
         return own_lines(frames, usable, effects)
 
     def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
         """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
         own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = self._own_samples(own)
-        fit = self._refit(model)
+        frames = self._own_samples(model)
+        fit = self._refit_of(frames, model)
         sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
         self.lost = sensor.lost
         return fit, self._corrected(sensor, model) if model else sensor

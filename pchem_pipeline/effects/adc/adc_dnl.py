@@ -10,7 +10,6 @@ converter or of a look-up table behind it, is one whose two edges coincide: a DN
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -23,7 +22,6 @@ from pchem_pipeline.effects.estimators.codes import (
     roughness,
     usable_codes,
 )
-from pchem_pipeline.effects.estimators.edges import merged_edges
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -195,8 +193,7 @@ class AdcDnl(Effect):
         first, last = code_range(maps)
         if self.pattern == "edges":
             first, last = self.first_code, self.first_code + len(self.edges) - 1
-        start, shifts = merged_edges(model, first, self._listed(np.arange(first, last + 1)))
-        return replace(model, edge_first=start, edge_shift=shifts)
+        return model.with_edges(first, self._listed(np.arange(first, last + 1)))
 
 
 def _best_bit(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -17,7 +16,6 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.bends import best_bend
 from pchem_pipeline.effects.estimators.codes import code_range
-from pchem_pipeline.effects.estimators.edges import merged_edges
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -112,5 +110,4 @@ class AdcInl(Effect):
         # the slope of the deviation is below 1, so this contracts
         for _ in range(50):
             edges = ideal - self._deviation(edges)
-        start, shifts = merged_edges(model, first, edges - ideal)
-        return replace(model, edge_first=start, edge_shift=shifts)
+        return model.with_edges(first, edges - ideal)

@@ -9,7 +9,6 @@ matched about another point.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -17,7 +16,6 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.bends import Stitch, best_stitch
 from pchem_pipeline.effects.estimators.codes import code_range
-from pchem_pipeline.effects.estimators.edges import merged_edges
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -108,5 +106,4 @@ class GainStitch(Effect):
         below = np.minimum(ideal, self.level_dn)
         crossing = (ideal + self.gain_change * self._origin) / (1.0 + self.gain_change)
         above = np.maximum(crossing, self.level_dn)
-        start, shifts = merged_edges(model, first, below + above - self.level_dn - ideal)
-        return replace(model, edge_first=start, edge_shift=shifts)
+        return model.with_edges(first, below + above - self.level_dn - ideal)

@@ -19,11 +19,13 @@ from pchem_pipeline.effects.framework.evidence import PLACES
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.context import Dim, EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence
 
 Move = Literal["swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice"]
 
+_Y, _X = 1, 2  # axes
+_DIMS: Mapping[int, Dim] = {_Y: "y", _X: "x"}
 _WHERE = 1  # draw of the sample or line from which on others follow
 # of the shares of lines from the line after and before, by which two that are alike differ at most
 _ALIKE = 2.0
@@ -71,48 +73,25 @@ class MisplacedLines(Effect):
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the digital numbers (frame, y, x), DN; at the end of a line the last sample is repeated."""
-        along, across = (2, 1) if self.lines == "rows" else (1, 2)
-        moved = self._by_line(context) if self.move in ("swapped", "line_lost", "line_twice") else 0
-        if isinstance(moved, int):
-            return _taken(values, self._by_sample(context), along)
-        return _taken(values, moved, across)
+        across, along = (_Y, _X) if self.lines == "rows" else (_X, _Y)
+        if self.move == "swapped":
+            return _taken(values, self._exchanged(context, across), across)
+        of_lines = self.move in ("line_lost", "line_twice")
+        axis = across if of_lines else along
+        drawn: tuple[Dim, ...] = ("frame",) if of_lines else ("frame", _DIMS[across])
+        hit = context.random.uniform(drawn) < self.share
+        if self.move not in ("early", "late"):
+            size, place = _places(context, axis)
+            hit = hit & (place >= np.floor(context.random.uniform(drawn, _WHERE) * size))
+        later = self.move in ("early", "sample_lost", "line_lost")
+        return _taken(values, np.where(hit, 1 if later else -1, 0), axis)
 
-    def _by_line(self, context: EffectContext) -> NDArray[np.int64]:
-        """Return from how many lines later the samples of each line come."""
-        rows = self.lines == "rows"
-        if self.move != "swapped":
-            size, at = (
-                (context.shape[0], context.rows) if rows else (context.shape[1], np.arange(context.shape[1]))
-            )
-            from_line = np.floor(context.random.uniform(("frame",), _WHERE) * size)
-            hit = context.random.uniform(("frame",)) < self.share
-            position = at[None, :, None] if rows else at[None, None, :]
-            return np.where(hit & (position >= from_line), 1 if self.move == "line_lost" else -1, 0)
-        hit = context.random.uniform(("frame", "y" if rows else "x")) < self.share
-        axis = 1 if rows else 2
-        last = (
-            context.rows == context.shape[0] - 1
-            if rows
-            else np.arange(context.shape[1]) == context.shape[1] - 1
-        )
-        hit = hit & ~(last[None, :, None] if rows else last[None, None, :])
-        # of overlapping pairs the first one
-        first = hit & ~_before(hit, axis)
-        return np.where(first, 1, np.where(_before(first, axis), -1, 0))
-
-    def _by_sample(self, context: EffectContext) -> NDArray[np.int64]:
-        """Return from how many samples later in its line each sample comes."""
-        rows = self.lines == "rows"
-        line: tuple[Any, ...] = ("frame", "y") if rows else ("frame", "x")
-        hit = context.random.uniform(line) < self.share
-        if self.move in ("sample_lost", "sample_twice"):
-            size, at = (
-                (context.shape[1], np.arange(context.shape[1])[None, None, :])
-                if rows
-                else (context.shape[0], context.rows[None, :, None])
-            )
-            hit = hit & (at >= np.floor(context.random.uniform(line, _WHERE) * size))
-        return np.where(hit, 1 if self.move in ("early", "sample_lost") else -1, 0)
+    def _exchanged(self, context: EffectContext, across: int) -> NDArray[np.int64]:
+        """Return from how many lines later each line comes; of pairs that overlap the first one is exchanged."""
+        size, place = _places(context, across)
+        hit = (context.random.uniform(("frame", _DIMS[across])) < self.share) & (place < size - 1)
+        first = hit & ~_before(hit, across)
+        return np.where(first, 1, np.where(_before(first, across), -1, 0))
 
     def displaced(self) -> Mapping[Literal["rows", "columns"], NDArray[np.float64]]:
         """Return the shares of lines that hold the samples of other pixels."""
@@ -157,6 +136,13 @@ class MisplacedLines(Effect):
             for guess, move, lines in sorted(seen, key=lambda one: -one[0])
             for times in (1.0, _HIDDEN)
         ]
+
+
+def _places(context: EffectContext, axis: int) -> tuple[int, NDArray[np.int64]]:
+    """Return how many rows (columns) the sensor has, and which those here are, (1, y, 1) or (1, 1, x)."""
+    if axis == _Y:
+        return context.shape[0], context.rows[None, :, None]
+    return context.shape[1], np.arange(context.shape[1])[None, None, :]
 
 
 def _before(lines: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
