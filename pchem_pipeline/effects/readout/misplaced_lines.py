@@ -87,7 +87,7 @@ class MisplacedLines(Effect):
         return _taken(values, np.where(hit, 1 if later else -1, 0), axis)
 
     def _exchanged(self, context: EffectContext, across: int) -> NDArray[np.int64]:
-        """Return from how many lines later each line comes; of pairs that overlap the first one is exchanged."""
+        """Return from how many lines later each line comes; of overlapping pairs the first one counts."""
         size, place = _places(context, across)
         hit = (context.random.uniform(("frame", _DIMS[across])) < self.share) & (place < size - 1)
         first = hit & ~_before(hit, across)
