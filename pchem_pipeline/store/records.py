@@ -110,7 +110,10 @@ class Records:
     def done(self, stage: str, fingerprint: str) -> set[str]:
         """Return the keys of the finished units of a stage in its present form."""
         folder = self._marker(stage, fingerprint, "x").parent
-        return {path.name.removesuffix(".json") for path in folder.glob("[!.]*.json")}
+        try:
+            return {path.name.removesuffix(".json") for path in folder.glob("[!.]*.json")}
+        except FileNotFoundError:  # whoever works on the stage removed it meanwhile
+            return set()
 
     def summaries(self, stage: str, fingerprint: str) -> dict[str, dict[str, Any]]:
         """Return the summary that each finished unit left, in the order of the keys."""

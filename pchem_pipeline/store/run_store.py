@@ -277,10 +277,11 @@ class RunStore:
 
     def attributes(self, name: str = "") -> dict[str, Any]:
         """Return the attributes of a group or array (of the root by default); empty where there is none."""
-        if name and not self.has(name):
-            return {}
         with _one_line(self.path, self.path):
-            return dict((self._root[name] if name else self._root).attrs)
+            try:
+                return dict((self._root[name] if name else self._root).attrs)
+            except KeyError:
+                return {}
 
     def set_attributes(self, name: str, values: Mapping[str, Any]) -> None:
         """Add attributes (JSON) to a group, making the group where needed."""

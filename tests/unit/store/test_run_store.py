@@ -1,4 +1,5 @@
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -215,6 +216,20 @@ def test_markers_belong_to_one_fingerprint(tmp_path):
     assert records.summaries("fit", "f" * 64) == {"0.1": {"pixels": 5}}
     records.unmark("fit", "f" * 64, ["0.1"])
     assert records.done("fit", "f" * 64) == set()
+
+
+def test_markers_that_a_writer_removes_while_they_are_listed_are_no_markers(tmp_path, monkeypatch):
+    records, scandir = Records(tmp_path, lambda part: None), os.scandir
+    records.mark("fit", "a" * 64, "0.0", {})
+
+    def removed_first(folder):
+        monkeypatch.setattr(os, "scandir", scandir)
+        records.unmark_all("fit")
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", removed_first)
+    assert records.done("fit", "a" * 64) == set()
+    assert not (tmp_path / "done" / "fit").exists()
 
 
 def test_stage_record_survives_the_disk(tmp_path):
