@@ -82,7 +82,8 @@ class StatisticsGap:
     D_f is the squared distance of the statistics of a family from what the model gives, in their covariance,
     E_f the distance that replicates of the model itself have. One covariance, that of the model before
     anything was added, measures all models of a comparison: otherwise an effect that makes the statistics
-    scatter would shrink the gap by widening the noise.
+    scatter would shrink the gap by widening the noise. Only exact counts scatter as the Poisson counts that
+    the model says they are: without an effect that predicts some there is none.
 
     Attributes:
         null: of the model before anything was added.
@@ -112,9 +113,9 @@ class StatisticsGap:
                 (e, m); they were fitted to other samples, so that a right model, too, is off by that.
         """
         total, families = 0.0, {}
-        own = self._own_distances(replicates, strengths)
+        own, covariance = self._own_distances(replicates, strengths), self._covariance(mean)
         for family, index in self._members().items():
-            squared = _squared_distances((z - mean)[None, index], self.null.covariance[np.ix_(index, index)])
+            squared = _squared_distances((z - mean)[None, index], covariance[np.ix_(index, index)])
             distance = 0.5 * float(squared[0])
             families[family] = (distance - float(own[family].mean())) / self.n_samples
             total += distance
@@ -122,6 +123,11 @@ class StatisticsGap:
         # of a noncentral chi-square: Var(D / 2) beyond chance is the excess of D
         variance = 2.0 * max(total - float(chance.mean()), 0.0)
         return Gap.of(total, chance, self.n_samples, variance=variance, families=families)
+
+    def _covariance(self, mean: FloatArray) -> FloatArray:
+        """Return the covariance that measures a model that gives ``mean``, shape (m, m)."""
+        counts = self.null.events * np.maximum(mean - self.null.mean, 0.0)
+        return np.asarray(self.null.covariance + np.diag(counts))
 
     def _members(self) -> dict[str, list[int]]:
         """Return the places of the statistics of each family that has any."""
@@ -143,9 +149,8 @@ class StatisticsGap:
         random, sides = np.random.default_rng(0), np.array([[1.0], [-1.0]])
         for i in range(replicates.shape[0]):
             others = np.delete(replicates, i, axis=0)
-            mean, _, covariance = (
-                moments(others) if known else (others.mean(axis=0), None, self.null.covariance)
-            )
+            mean = others.mean(axis=0)
+            covariance = moments(others)[2] if known else self._covariance(mean)
             apart = (replicates[i] - mean)[None]
             if strengths is not None:
                 apart = apart + sides * (random.standard_normal(len(strengths)) @ strengths)

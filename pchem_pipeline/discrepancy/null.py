@@ -109,6 +109,11 @@ class NullModel:
         return int(self.replicates.shape[0])
 
     @property
+    def events(self) -> FloatArray:
+        """By how much an event raises each exact count; 0 for all other statistics, shape (m,)."""
+        return np.array([EXACT.get(name, 0.0) for name in self.names])
+
+    @property
     def freedom(self) -> float:
         """Degrees of freedom of the standard deviations."""
         return self.n_replicates - 1 + _PRIOR_WEIGHT

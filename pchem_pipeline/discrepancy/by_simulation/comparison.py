@@ -254,7 +254,7 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
         own: what the effect does, shape (m,).
         others: what the others do, shape (e, m).
         left: what their best fit leaves, in its errors, shape (m,).
-        noise: standard deviations of the statistics, shape (m,).
+        noise: standard deviations of the statistics with the others, shape (m,).
     """
     touched = np.abs(others).max(axis=0, initial=0.0)
     mine = (np.abs(own) > _MOVED * noise) & (touched < _UNTOUCHED * np.abs(own))
@@ -364,7 +364,8 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with
         return len(one.hypotheses) == 1
-    noise = np.sqrt(np.diag(refitter.noise(one.covariance, len(one.vectors)).covariance))
+    # without an effect its own scatter is not there: events of which three are seen scatter by half of that
+    noise = refitter.scatter(refitter.null.covariance, len(one.vectors))
     if not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
     for place, hypothesis in enumerate(one.hypotheses):
@@ -380,6 +381,7 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
                 return False
             known.append(others)
         part = one.hypotheses[place].fingerprint
+        noise = refitter.scatter(others.covariance, len(others.vectors))
         if not own_signature(part, others.parts, others.rest, noise):
             return False
     return True

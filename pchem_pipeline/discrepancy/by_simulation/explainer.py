@@ -62,7 +62,6 @@ from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
-from pchem_pipeline.discrepancy.observe.catalogue import EXACT
 from pchem_pipeline.discrepancy.observe.misplaced import own_lines
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -591,8 +590,7 @@ class FrameExplainer:
         covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
         if slopes is not None:
             covariance = covariance + _DOUBT**2 * slopes.T @ slopes
-        events = np.array([EXACT.get(name, 0.0) for name in null.names]) / splits
-        return Noise(covariance, self.settings.model_error, events)
+        return Noise(covariance, self.settings.model_error, null.events / splits)
 
     def _refitter(self, z: Measured, held: tuple[Hypothesis, ...]) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""

@@ -269,6 +269,10 @@ class Refitter:
         """Return the noise of the data less the mean of so many replicates."""
         return Noise(covariance * (1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
 
+    def scatter(self, covariance: FloatArray, replicates: int) -> FloatArray:
+        """Return standard deviations of the same, by chance alone, shape (m,)."""
+        return np.asarray(np.sqrt(np.diag(self.noise(covariance, replicates).covariance)))
+
     def _simulated(
         self,
         hypotheses: tuple[Hypothesis, ...],

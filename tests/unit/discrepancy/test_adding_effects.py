@@ -355,6 +355,24 @@ def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() 
     assert not own_signature(own, np.eye(M)[1:2] * 40.0, left, noise)
 
 
+def test_few_events_of_an_exact_count_are_a_signature_though_they_scatter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
+    plain = world.draw
+
+    def draw(effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+        fit, vectors = plain(effects, count)
+        if "frame_noise" in {e.tag for e in effects}:  # four events: they scatter by half of what they do
+            vectors[:, 1] += 20.0 * np.random.default_rng(3).standard_normal(count)
+        return fit, vectors
+
+    monkeypatch.setattr(world, "draw", draw)
+    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+
+
 def add(
     world: World,
     monkeypatch: pytest.MonkeyPatch,

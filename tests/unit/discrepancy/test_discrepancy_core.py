@@ -233,6 +233,28 @@ def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
     assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
 
 
+def test_events_that_a_model_predicts_scatter_as_poisson_counts() -> None:
+    # three repeated frames are proof, but three that are expected may be none or six: the floor holds that
+    rng = np.random.default_rng(25)
+    names = ("frame.repeated", *list(STATISTICS)[:39])
+    vectors = rng.normal(size=(40, 40))
+    vectors[:, 0] = 0.0
+    null = NullModel.from_replicates(names, vectors)
+    metric, three = StatisticsGap(null, 1000), 30.0 * np.eye(40)[0]
+
+    def gap(events: float, mean: np.ndarray, replicates: np.ndarray) -> Gap:
+        return metric.gap(null.mean + 10.0 * events * np.eye(40)[0], mean, replicates)
+
+    below = []
+    for _ in range(100):
+        counts = 10.0 * rng.poisson(3.0, 25)[:, None] * np.eye(40)[0]
+        replicates = counts + np.r_[vectors[:12], vectors[:13]]
+        below.append(metric.gap(replicates[0], null.mean + three, replicates[1:]).at_floor)
+    assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
+    assert gap(3.0, null.mean, null.replicates).value > 0.3  # without an effect that predicts some: proof
+    assert gap(0.0, null.mean + three, vectors + three).value < 0.01
+
+
 def test_a_right_model_fitted_to_other_frames_is_below_the_floor_in_19_of_20() -> None:
     # a common mode in few frames scatters a statistic widely; few replicates know it, and the strength was
     # fitted to as many other frames
