@@ -26,7 +26,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.report.inspector.inspector import served_page
+from pchem_pipeline.report.inspector.inspector import packed_facts, served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.stages.report.inspector import (
@@ -165,9 +165,7 @@ class RunView:
         if len(query) != 1 or len(asked) != 1 or asked[0] not in self._maps:
             return _text(HTTPStatus.NOT_FOUND, "this run has no such map")
         packed = packed_map(StoredMaps(self.store), self._maps[asked[0]].variable)
-        scale = packed.scale
-        content = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
-        return _json({**content, "data": base64.b64encode(packed.data).decode("ascii")})
+        return _json({**packed_facts(packed), "data": base64.b64encode(packed.data).decode("ascii")})
 
 
 def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) -> Answer | None:

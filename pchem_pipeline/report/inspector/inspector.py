@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from pchem_pipeline.report.data import MAP_NAMES, ReportData
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
-from pchem_pipeline.report.inspector.packing import pack_counts
+from pchem_pipeline.report.inspector.packing import PackedMap, pack_counts
 from pchem_pipeline.report.style.palette import MAP_COLOURS
 from pchem_pipeline.report.style.wording import symbol, unit_text
 
@@ -168,8 +168,16 @@ def map_facts(entry: MapEntry) -> dict[str, Any]:
     if entry.same_as is not None:
         found |= {"sameAs": entry.same_as[0], "factor": entry.same_as[1]}
     if entry.packed is not None:
-        scale = entry.packed.scale
-        found |= {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": entry.packed.n_odd}
+        found |= packed_facts(entry.packed)
+    return found
+
+
+def packed_facts(packed: PackedMap) -> dict[str, Any]:
+    """Return what the script must know to read a packed map."""
+    scale, bars = packed.scale, packed.bars
+    found = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
+    if bars is not None:
+        found["bars"] = {"first": bars.first, "parts": bars.parts, "counts": bars.counts.tolist()}
     return found
 
 

@@ -31,6 +31,8 @@ _ENOUGH = 500_009
 _AT_ONCE = 1 << 17
 #: Step of logarithmic maps: 2.3 %.
 _LOG_STEP = 0.01
+#: Bars of a map's histogram, at least and at most.
+_FEWEST_BARS, _MOST_BARS = 8, 96
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,21 @@ class Scale:
 
 
 @dataclass(frozen=True)
+class Bars:
+    """Histogram of a map whose codes are too coarse to show one: bars narrower than a step.
+
+    Attributes:
+        first: code with whose values the bars begin.
+        parts: bars of a code.
+        counts: values in each bar.
+    """
+
+    first: int
+    parts: int
+    counts: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
 class PackedMap:
     """A map in few bytes.
 
@@ -50,11 +67,13 @@ class PackedMap:
         scale: meaning of the codes.
         n_odd: values outside the range of the codes, at the end of ``data`` as indices and float32.
         data: gzip of the low bytes, the high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian.
+        bars: its histogram; None where the codes are fine enough.
     """
 
     scale: Scale
     n_odd: int
     data: bytes
+    bars: Bars | None = None
 
 
 def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:
@@ -106,29 +125,65 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     """
     flat = np.asarray(values).ravel()
     codes = np.empty(flat.size, "<u2")
+    bars = _empty_bars(flat, scale)
     for start in range(0, flat.size, _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        codes[part] = _codes(flat[part].astype(np.float64, copy=False), scale)
+        place = _places(flat[part], scale)
+        if bars is not None:
+            _count(place, bars)
+        codes[part] = _codes(place, flat[part])
     outside = (codes == _BELOW) | (codes == _ABOVE)
     if scale.log:  # zeros, which may be many, need no place in the list
         outside &= flat != 0
     odd = np.flatnonzero(outside)
     content = b"".join((codes >> shift).astype(np.uint8).tobytes() for shift in (0, 8))
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
-    return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0))
+    return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0), bars)
 
 
-def _codes(values: FloatArray, scale: Scale) -> FloatArray:
-    """Return the code of each value."""
+def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
+    """Return the place of each value on the scale, in steps: 0 for the first code."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        place = np.log10(values) if scale.log else values.copy()
+        place: FloatArray = np.log10(values, dtype=np.float64) if scale.log else values.astype(np.float64)
         place -= scale.low
         place /= scale.step
+    return place
+
+
+def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
+    """Return the code of each value from its place, which is changed."""
     np.rint(place, out=place)
     place += _FIRST
     np.clip(place, _BELOW, _ABOVE, out=place)
     place[~np.isfinite(values) | np.isnan(place)] = _NONE
     return place
+
+
+def _empty_bars(flat: NDArray[Any], scale: Scale) -> Bars | None:
+    """Return bars over the bulk of a map, empty; None where codes are narrow enough to be bars.
+
+    The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
+    values.
+    """
+    place = _places(some_of(flat), scale)
+    place = place[np.isfinite(place)]
+    if flat.dtype.kind in "iub" or place.size < 2:
+        return None
+    low, high = np.quantile(place, [0.01, 0.99])
+    margin = 0.3 * (high - low)
+    first, last = np.rint([max(low - margin, place.min(), 0.0), min(high + margin, place.max())]).astype(int)
+    wanted = np.clip(2.0 * np.cbrt(flat.size), _FEWEST_BARS, _MOST_BARS)
+    parts = round(float(wanted) / max(int(last - first) + 1, 1))
+    if parts < 2 or not high > low:
+        return None
+    return Bars(int(first) + _FIRST, parts, np.zeros((int(last - first) + 1) * parts, np.int64))
+
+
+def _count(place: FloatArray, bars: Bars) -> None:
+    """Add the values at some places to their bars; those beyond the axis are in none."""
+    bar = (place - (bars.first - _FIRST - 0.5)) * bars.parts
+    inside = bar[(bar >= 0.0) & (bar < bars.counts.size)]
+    bars.counts[:] += np.bincount(inside.astype(np.int64), minlength=bars.counts.size)
 
 
 def varints(values: NDArray[Any]) -> bytes:

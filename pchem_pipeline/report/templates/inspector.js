@@ -113,7 +113,7 @@
     for (let i = 0; i < pack.nOdd; i++) {
       odd.set(view.getUint32(2 * n + 4 * i, true), view.getFloat32(2 * n + 4 * (pack.nOdd + i), true));
     }
-    return { fact, codes, odd, low: pack.low, step: pack.step, log: pack.log };
+    return { fact, codes, odd, low: pack.low, step: pack.step, log: pack.log, bars: pack.bars };
   };
   const load = async (path) => {
     const fact = factOf.get(path);
@@ -121,7 +121,7 @@
       const other = await layer(fact.sameAs), f = fact.factor;
       const odd = new Map([...other.odd].map(([i, value]) => [i, value * f]));
       const low = other.log ? other.low + Math.log10(f) : other.low * f;
-      return { fact, codes: other.codes, odd, low, step: other.log ? other.step : other.step * f, log: other.log };
+      return { ...other, fact, odd, low, step: other.log ? other.step : other.step * f };
     }
     if (fact.here) {
       const block = byId(`map-${facts.maps.indexOf(fact)}`);
@@ -567,27 +567,28 @@
     const there = !categorical(map.fact) && total(map.counts) > 0;
     byId("inspector-brush").hidden = !there;
     if (!there) return;
-    // bins are whole numbers of codes, so that they do not beat with the quantisation
-    const axis = axisOf(map), wanted = clamp(Math.round(2 * Math.cbrt(total(map.counts))), 8, 96);
-    const each = Math.max(1, Math.round((axis.high - axis.low) / map.step / wanted));
-    const firstCode = Math.floor((axis.low - map.low) / map.step + FIRST + 0.5);
+    // bins are whole numbers of codes, or whole parts of one, so that they do not beat with the quantisation
+    const axis = axisOf(map), wanted = clamp(Math.round(2 * Math.cbrt(total(map.counts))), 8, 96), known = map.bars;
+    const each = known ? 1 / known.parts : Math.max(1, Math.round((axis.high - axis.low) / map.step / wanted));
+    const firstCode = known ? known.first : Math.floor((axis.low - map.low) / map.step + FIRST + 0.5);
     const start = map.low + (firstCode - FIRST - 0.5) * map.step;
-    const bins = Math.max(1, Math.ceil((axis.high - start) / (each * map.step)));
+    const bins = known ? known.counts.length : Math.max(1, Math.ceil((axis.high - start) / (each * map.step)));
     axis.low = start;
     axis.high = axis.low + bins * each * map.step;
     const some = selection ? countCodes(map, selection) : null;
     const bin = (counts) => {
-      const heights = new Array(bins).fill(0);
+      const heights = new Array(bins).fill(0), parts = known ? known.parts : 1;
       let outside = counts[BELOW] + counts[ABOVE];
       for (let code = FIRST; code < ABOVE; code++) {
         if (!counts[code]) continue;
-        const b = Math.floor((code - firstCode) / each);
-        if (b >= 0 && b < bins) heights[b] += counts[code]; else outside += counts[code];
+        const b = Math.floor((code - firstCode) / each + 1e-6);
+        if (b < 0 || b >= bins) outside += counts[code];
+        else for (let i = b; i < b + parts; i++) heights[i] += counts[code] / parts; // where in its code is not known
       }
       return [heights, outside];
     };
     const width = Math.max(plot.clientWidth || 480, 200), height = 150, floor = height - 22, left = 8, right = width - 8;
-    const [all, outside] = bin(map.counts);
+    const [coarse, outside] = bin(map.counts), all = known ? known.counts : coarse;
     const logarithmic = byId("inspector-log-counts").checked;
     const top = Math.max(...all, 1);
     const level = (h) => floor - (floor - 8) * (logarithmic ? Math.log1p(h) / Math.log1p(top) : h / top);

@@ -76,6 +76,32 @@ def test_many_zeros_cost_nothing() -> None:
     np.testing.assert_allclose(back, values, rtol=0.0117)
 
 
+@pytest.mark.parametrize("log", [False, True])
+def test_a_map_of_coarse_codes_has_the_bars_of_its_values(log: bool) -> None:
+    values = np.random.default_rng(5).normal(2.0, 0.5, (300, 300))
+    values = 10.0**values if log else values
+    values[0, :3] = np.nan, 1e9, -1e9 if not log else 0.0
+    packed = pack_map(values, Scale(-3.0, 0.5, log))
+    assert packed.bars is not None
+    first, parts, counts = packed.bars.first, packed.bars.parts, packed.bars.counts
+    assert 60 < counts.size < 130
+    edges = -3.0 + 0.5 * (first - 2 - 0.5 + np.arange(counts.size + 1) / parts)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        on_axis = np.log10(values) if log else values
+    assert counts.sum() > 0.98 * values.size
+    np.testing.assert_array_equal(counts, np.histogram(on_axis[np.isfinite(on_axis)], edges)[0])
+    # the codes of the map have no more than a dozen steps there: bars of them would be as many
+    assert np.unique(unpack_map(packed, values.shape)[np.isfinite(values)]).size < 20
+
+
+def test_fine_codes_and_whole_numbers_have_no_bars() -> None:
+    values = np.random.default_rng(6).normal(100.0, 4.0, (100, 100))
+    assert pack_map(values, choose_scale(values)).bars is None
+    assert pack_map(np.full((20, 20), 3.5), Scale(0.0, 1.0)).bars is None
+    few = np.random.default_rng(6).integers(0, 9, (100, 100)).astype(np.uint8)
+    assert pack_map(few, choose_scale(few)).bars is None
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
 def test_whole_numbers_are_exact(dtype: type) -> None:
     values = np.random.default_rng(4).integers(0, 200, (30, 30)).astype(dtype)
