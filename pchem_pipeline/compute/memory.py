@@ -15,6 +15,8 @@ from pchem_pipeline.compute.executor import DaskPoolExecutor, Executor
 
 #: the program with its libraries and compiled kernels
 BASE_BYTES = 260 << 20
+#: the least that a command needs: a run of few pixels, to its report (with matplotlib)
+LEAST_BYTES = 300 << 20
 #: a second program beside it that compiles kernels
 SECOND_PROGRAM_BYTES = 400 << 20
 
@@ -68,9 +70,9 @@ def keep_to_limit(limit: int | None) -> None:
     """
     if limit is None:
         return
-    if limit << 20 < BASE_BYTES:
+    if limit << 20 < LEAST_BYTES:
         raise ConfigError(
-            f"compute.max_memory (--max-memory): {limit} MiB are less than the {BASE_BYTES >> 20} that "
+            f"compute.max_memory (--max-memory): {limit} MiB are less than the {LEAST_BYTES >> 20} that "
             "the program takes with its libraries; raise it"
         )
     keep_memory_tight()

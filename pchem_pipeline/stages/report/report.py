@@ -57,6 +57,8 @@ _NOT_SHOWN = ("quality", "goodness_q")
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
 _SOME_MASSES = 300
+#: Memory that a pixel takes: the maps are held as a whole.
+_PIXEL_BYTES = 430
 
 
 def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
@@ -87,7 +89,7 @@ def run(context: StageContext) -> None:
         # in this process: another would spend more on importing matplotlib than on its share of the figures
         draw_by_workers(1, context.reporter, context.stage),
     )
-    done = context.run_units([WHOLE], task, unit_name="report")
+    done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
         context.note(text)
 
