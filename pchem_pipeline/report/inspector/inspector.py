@@ -175,7 +175,7 @@ def map_facts(entry: MapEntry) -> dict[str, Any]:
 def packed_facts(packed: PackedMap) -> dict[str, Any]:
     """Return what the script must know to read a packed map."""
     scale, bars = packed.scale, packed.bars
-    found = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
+    found: dict[str, Any] = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
     if bars is not None:
         found["bars"] = {"first": bars.first, "parts": bars.parts, "counts": bars.counts.tolist()}
     return found
