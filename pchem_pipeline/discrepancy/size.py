@@ -22,6 +22,7 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 
 _MOST_ROWS = 12  # and columns: what all pixels of a frame share has one draw a frame
 _BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
+_FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24
 _SEED = 1
 _CHANGED = 1e-9
@@ -36,7 +37,11 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         maps: fitted parameters, (y, x) each.
         n_frames: of the run.
     """
-    maps = PixelMaps(*(np.asarray(getattr(maps, name))[:_MOST_ROWS, :_MOST_ROWS] for name in _FIELDS))
+    blocks = _BLOCKS
+    if effect.far_reaching:
+        blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
+    else:
+        maps = PixelMaps(*(np.asarray(getattr(maps, name))[:_MOST_ROWS, :_MOST_ROWS] for name in _FIELDS))
     if not maps.usable.any():
         return None
     seen: list[NDArray[np.float64]] = []
@@ -47,7 +52,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     truth = truth_of(maps)
     last = max(n_frames - _BLOCK_FRAMES, 0)
     try:
-        for first in np.unique(np.linspace(0, last, _BLOCKS).astype(int)).tolist():
+        for first in np.unique(np.linspace(0, last, blocks).astype(int)).tolist():
             simulate_block(truth, settings, (first, min(first + _BLOCK_FRAMES, n_frames)), electron_frames=0)
     except PchEmError:
         return None

@@ -25,6 +25,11 @@ from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
     measured_noise,
     residual_covariances,
 )
+from pchem_pipeline.discrepancy.by_simulation.empirical_response import (
+    Responses,
+    measured_response,
+    residual_responses,
+)
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.maps import Refit, Sensor
@@ -49,11 +54,12 @@ _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
 
 class _Shared(NamedTuple):
-    """How samples vary together: products of their residuals, sums of their scores, chances of electrons."""
+    """How samples vary together: products of residuals, sums of scores, chances of electrons, responses."""
 
     covariances: Covariances
     scores: dict[tuple[Shared, Changed], Sums]
     electrons: Electrons
+    responses: Responses | None
 
 
 SharedBy = Callable[[Part], _Shared]
@@ -103,6 +109,7 @@ class Unexplained:
         forms: dict[str, Measure] = {
             "empirical": self._moves,
             "empirical_noise": functools.partial(self._noise_of_samples, data, known),
+            "empirical_response": functools.partial(self._response, data, known),
             "empirical_electrons": functools.partial(self._electrons, data, known),
         }
         return {tag: form for tag, form in forms.items() if tag not in {e.tag for e in self.refitter.present}}
@@ -252,6 +259,13 @@ class Unexplained:
         """Measure what electrons of a part do to each other beyond what effects make of them."""
         return measured_electrons(data(part).electrons, self._made(known, beside)(part).electrons)
 
+    def _response(
+        self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
+    ) -> Measurement | None:
+        """Measure which samples of a part follow which beyond what effects make of them."""
+        model, inside = self._made(known, beside)(part).responses, self.frames.inside(part)
+        return measured_response(data(part).responses, model, self.plain, inside)
+
     def _made(self, known: dict[str, SharedBy], model: Model) -> SharedBy:
         """Return the same of frames simulated with a model; ``known`` are those of other models."""
         key = "|".join(e.model_dump_json() for e in model)
@@ -279,6 +293,7 @@ class Unexplained:
                 # the shape of a line beyond the window is not known
                 found = found._replace(lines={})
             electrons = electron_chances(frames[some], numbers[some], maps, self.plain, inside)
-            return _Shared(found, common_scores(frames[some], maps, inside), electrons)
+            responses = residual_responses(frames[some], numbers[some], maps, inside)
+            return _Shared(found, common_scores(frames[some], maps, inside), electrons, responses)
 
         return of

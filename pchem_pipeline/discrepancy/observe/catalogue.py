@@ -90,6 +90,16 @@ def _time() -> list[Statistic]:
         ),
         Statistic("time.cross.charge_readout", "cross", "charge follows the residual of the frame before"),
     ]
+    found += [
+        Statistic(
+            "time.follows.sample", "cross", "residuals follow the charge of another pixel one frame before"
+        ),
+        Statistic(
+            "time.follows.line",
+            "cross",
+            "residuals follow the charge of a row, column or frame one frame before",
+        ),
+    ]
     found += _of_channels("time.block.{}.chi", "block means of the {} wander, each pixel by itself")
     found += _of_channels("time.block.{}.cnt", "block means of the {} wander, in few pixels strongly")
     return found
@@ -144,6 +154,10 @@ def _space() -> list[Statistic]:
         Statistic("space.predicted.above", "digital", "samples far exceed what their neighbours predict"),
         Statistic("space.equal.squares", "digital", "samples of squares of 2 x 2 pixels are all equal"),
         Statistic("space.x.bits", "digital", "samples follow bits of the sample read before"),
+        Statistic(
+            "space.follows.sample", "cross", "residuals follow the charge of another sample of the frame"
+        ),
+        Statistic("space.follows.line", "cross", "residuals follow the charge of a row, column or frame"),
         Statistic("space.misplaced.rows", "digital", "rows hold the samples of other pixels"),
         Statistic("space.misplaced.columns", "digital", "columns hold the samples of other pixels"),
         Statistic("space.repeated.rows", "digital", "rows repeat the one above exactly"),

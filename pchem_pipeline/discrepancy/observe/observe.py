@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares, square_statistics
+from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.predicted import predicted_samples, predicted_statistics
@@ -118,6 +119,7 @@ def observe(
         **space_statistics(view),
         **predicted_statistics(predicted),
         **bit_statistics(bits),
+        **follow_statistics(frames, edges, laws, maps),
         **line_statistics(lines, alike, len(frames)),
         **square_statistics(squares, counts, origin, maps.usable),
         **misplaced_z,

@@ -77,6 +77,18 @@ class Stack:
             yield self.frames[begin : begin + size]
 
 
+def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
+    """Compare the histograms of frames (n, y, x) with the fit of their pixels."""
+    histograms = histogram_frames(frames)
+    return pixel_laws(
+        histograms.counts.reshape(-1, histograms.counts.shape[2]),
+        histograms.origin.ravel().astype(np.int64),
+        np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64),
+        maps.columns,
+        maps.usable.ravel(),
+    )
+
+
 @dataclass(frozen=True)
 class Samples:
     """Frames as standardised deviations of their pixels, of both channels.
@@ -101,17 +113,7 @@ class Samples:
     @classmethod
     def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
         """Prepare frames by the fit of their pixels."""
-        histograms = histogram_frames(frames)
-        outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
-        known = maps.maps
-        laws = pixel_laws(
-            histograms.counts.reshape(-1, histograms.counts.shape[2]),
-            histograms.origin.ravel().astype(np.int64),
-            outside,
-            np.stack([values.ravel() for values in known], axis=1),
-            maps.usable.ravel(),
-        )
-        return cls.by_laws(Stack(frames), laws, maps)
+        return cls.by_laws(Stack(frames), laws_of_frames(frames, maps), maps)
 
     @classmethod
     def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:

@@ -77,6 +77,8 @@ class Effect(Section):
         rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
             of a few pixels do not tell whether they have the effect.
         measured_only: whether it is no hypothesis, but what is measured where all of those have failed.
+        far_reaching: whether samples depend on others anywhere in their frame, so that a part of the sensor
+            by itself does not show it.
         attained: parameters that may well be at a limit: a frequency at half a cycle, a missing code. A fit
             that drives any other one there has taken another effect for this one.
     """
@@ -94,6 +96,7 @@ class Effect(Section):
     untestable: ClassVar[str] = ""
     rough_law: ClassVar[bool] = False
     measured_only: ClassVar[bool] = False
+    far_reaching: ClassVar[bool] = False
     attained: ClassVar[tuple[str, ...]] = ()
     region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
     when: When | None = Field(default=None, description="in which frames it acts; null: in all")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,9 +25,7 @@ def neighbour_words(place: tuple[int, int, int]) -> str:
     return f"the sample {' and '.join(parts)}"
 
 
-def neighbours(
-    values: NDArray[np.int64], place: tuple[int, int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def neighbours(values: NDArray[Any], place: tuple[int, int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Return the samples at a place beside those of frames (frame, y, x), and where there are any."""
     to, source = [], []
     for shift, size in zip(place, values.shape, strict=True):

@@ -1,0 +1,196 @@
+"""The empirical component: which samples follow the charge of which others, by distance and as whole lines.
+
+The map of all distances is searched for what stands out most: one distance, or all samples of a row, a column
+or a frame alike. Its part is taken off, and the rest searched again (matching pursuit, Mallat and Zhang 1993;
+electrons of different samples are independent, so that what is found first does not move what comes later).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
+from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows, Source
+from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
+from pchem_pipeline.discrepancy.observe.sums import blocks_of
+from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.neighbours import neighbours
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Place = tuple[int, int, int]
+
+_CLEAR = 10.0  # nats that a term must be worth beyond the number of those that are tried
+_CERTAIN = 3.0  # standard errors of a model's, in simulated frames: less is taken for none
+_DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
+_MOST_TERMS = 16
+
+
+class Responses(NamedTuple):
+    """How the residuals of frames follow the charge of other samples.
+
+    Attributes:
+        samples: the frames.
+        follows: sums of products of all of them.
+    """
+
+    samples: FollowingSamples
+    follows: Follows
+
+
+def residual_responses(
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, inside: BoolArray
+) -> Responses | None:
+    """Measure how the residuals of samples follow the charge of others; None where frames are too few.
+
+    Args:
+        frames: (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, shape (frame,).
+        maps: plain fit of these frames.
+        inside: pixels whose residuals are looked at, shape (y, x).
+    """
+    edges = blocks_of(numbers, numbers.size)
+    samples = FollowingSamples.of(frames, edges, laws_of_frames(frames, maps), maps, inside)
+    return None if samples is None else Responses(samples, samples.by_distance())
+
+
+class _Term(NamedTuple):
+    """What is followed, the mean product, what it is worth, nats, and the columns that follow; None: all."""
+
+    of: Source
+    place: Place
+    value: float
+    gain: float
+    columns: tuple[int, int] | None = None
+
+
+def measured_response(
+    data: Responses | None, model: Responses | None, evidence: Evidence, inside: BoolArray
+) -> Measurement | None:
+    """Return which samples follow which beyond what a model makes; None where none is clear.
+
+    Args:
+        data: of the frames.
+        model: of frames simulated with it.
+        evidence: of the frames.
+        inside: pixels that were looked at, shape (y, x).
+    """
+    if data is None:
+        return None
+    left = _Left.of(data.follows, None if model is None else model.follows)
+    terms: list[_Term] = []
+    while len(terms) < _MOST_TERMS:
+        term = left.clearest()
+        if term is None or (terms and term.gain < _DETAIL * terms[0].gain):
+            break
+        left.take_off(term)
+        terms.append(_in_columns(data.samples, term))
+    if not terms:
+        return None
+    responses = [term.value / _response_of_one(evidence, inside, term) for term in terms]
+    largest = max(abs(response) for response in responses)
+    effect = EmpiricalResponse(
+        response=min(largest, 1.0),
+        terms=tuple(
+            ResponseTerm(
+                of=term.of,
+                place=term.place,
+                weight=round(response / largest, 4),
+                number=_number(term.of, inside.shape),
+                columns=term.columns,
+            )
+            for term, response in zip(terms, responses, strict=True)
+        ),
+    )
+    return Measurement(effect, sum(term.gain for term in terms))
+
+
+@dataclass
+class _Left:
+    """Sums of products that are not explained yet, and their variances; see :class:`Follows`."""
+
+    products: FloatArray
+    pairs: FloatArray
+    wider: dict[Source, float]
+
+    @classmethod
+    def of(cls, data: Follows, model: Follows | None) -> _Left:
+        """Return what is left of the products of the data beyond those of a model that are certain."""
+        products = data.products.copy()
+        if model is not None:
+            sure = np.abs(np.nan_to_num(model.z("sample"))) > _CERTAIN
+            products -= np.where(sure, model.products / np.maximum(model.pairs, 1.0) * data.pairs, 0.0)
+        return cls(products, data.pairs, data.wider)
+
+    def clearest(self) -> _Term | None:
+        """Return what is followed most clearly, if anything is."""
+        best: _Term | None = None
+        now = Follows(self.products, self.pairs, self.wider)
+        for source in SOURCES:
+            z: FloatArray = np.nan_to_num(now.z(source))
+            at = tuple(int(i) for i in np.unravel_index(int(np.argmax(np.abs(z))), z.shape))
+            gain = 0.5 * float(z[at]) ** 2 - math.log(max(int(np.count_nonzero(z)), 1))
+            if gain > (_CLEAR if best is None else best.gain):
+                products, pairs = now.of(source)
+                place = (-at[0], at[1] - z.shape[1] // 2, at[2] - z.shape[2] // 2)
+                best = _Term(source, place, float(products[at] / pairs[at]), gain)
+        return best
+
+    def take_off(self, term: _Term) -> None:
+        """Take off what a term makes of all distances that it holds."""
+        y, x = (size // 2 for size in self.products.shape[1:])
+        rows = slice(None) if term.of in ("column", "frame") else y + term.place[1]
+        columns = slice(None) if term.of in ("row", "frame") else x + term.place[2]
+        here = -term.place[0], rows, columns
+        self.products[here] -= term.value * self.pairs[here]
+
+
+def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
+    """Return a term with the range of columns that follow, where that is clearer than that all do."""
+    if term.of != "sample":
+        return term
+    products, pairs = samples.by_column(term.place)
+    sums, counts = (np.concatenate([[0.0], np.cumsum(values)]) for values in (products, pairs))
+    first, last = np.triu_indices(sums.size, 1)
+    number = np.maximum(counts[last] - counts[first], 1.0)
+    gains = 0.5 * (sums[last] - sums[first]) ** 2 / number
+    best = int(np.argmax(gains))
+    if gains[best] < 0.5 * sums[-1] ** 2 / max(counts[-1], 1.0) + _CLEAR + np.log(first.size):
+        return term
+    a, b = int(first[best]), int(last[best])
+    return term._replace(
+        value=float((sums[b] - sums[a]) / number[best]), gain=float(gains[best]), columns=(a, b)
+    )
+
+
+def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> float:
+    """Return the mean product where samples follow by all of the charge.
+
+    A shift of i by K_j changes ``E[R_i | x]`` by ``K_j Var(r_i) / sigma_i^2`` on average, and K_j varies with
+    the part of k_j that r_j does not hold by the variance of that part.
+    """
+    maps = evidence.maps
+    gain = np.where(maps.usable, maps.conversion_gain, np.nan)
+    noise = (maps.read_noise_dn * gain) ** 2
+    readout, charge = (evidence.readout_std * gain) ** 2, evidence.charge_std**2
+    mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
+    shift = np.where(inside, np.sqrt(readout) / noise, np.nan)
+    apart = np.sqrt(np.maximum(charge - mixed**2 / readout, 0.0))
+    columns = slice(*term.columns) if term.columns else slice(None)
+    if term.of != "sample":
+        return float(np.nanmean(shift) * np.nanmean(apart))
+    source, known = neighbours(apart[None], (0, *term.place[1:]))
+    pairs = np.where(known[0], source[0], np.nan) * shift
+    return float(np.nanmean(pairs[:, columns]))
+
+
+def _number(source: Source, shape: tuple[int, ...]) -> int:
+    """Return how many samples a row, a column or a frame has."""
+    return {"sample": 1, "row": shape[1], "column": shape[0], "frame": shape[0] * shape[1]}[source]

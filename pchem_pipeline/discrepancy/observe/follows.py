@@ -1,0 +1,243 @@
+"""How readout residuals follow the charge of other samples: by distance, and of whole rows, columns, frames.
+
+Residuals are multiplied with the charge of all samples of the same frame and of the one before, and summed
+by distance through Fourier transforms. Of the charge only that part counts which its own sample's residual
+does not hold: noise that samples share moves both, and leaves such products alone. Given the histograms,
+frames without an effect are in random order, so that the sum of N products of different pixels has mean 0 and
+variance N. The largest of all distances counts, by how many there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from pchem_pipeline.discrepancy.observe import laws as laws_of
+from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.discrepancy.observe.predicted import GROUP, groups_of
+from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Source = Literal["sample", "row", "column", "frame"]
+
+SOURCES: tuple[Source, ...] = ("sample", "row", "column", "frame")
+STEPS = 2  # the same frame, and the one before
+_MOST_SAMPLES = 1 << 18
+_AT_ONCE = 1 << 18  # samples that are transformed together
+_FEWEST = 3000  # products of a distance
+_RESOLVED = 0.05  # of the variance of the charge, at least, that its residual does not hold
+
+
+@dataclass(frozen=True)
+class Follows:
+    """Sums of products of residuals with the charge of other samples, each in its standard deviation.
+
+    Attributes:
+        products: by frames before, rows and columns from the residual to the charge, the distance 0 in the
+            middle, shape (2, 2 y - 1, 2 x - 1); 0 for a sample with itself.
+        pairs: how many they are.
+        wider: for each of `SOURCES`, by how much more than that of independent products their sum scatters.
+    """
+
+    products: FloatArray
+    pairs: FloatArray
+    wider: dict[Source, float]
+
+    def of(self, source: Source) -> tuple[FloatArray, FloatArray]:
+        """Return the products and pairs of single samples, or of all of a row, column or frame."""
+        axes = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}[source]
+        return (
+            self.products.sum(axis=axes, keepdims=True) if axes else self.products,
+            self.pairs.sum(axis=axes, keepdims=True) if axes else self.pairs,
+        )
+
+    def z(self, source: Source) -> FloatArray:
+        """Return the deviations from 0, standard errors; NaN where products are too few."""
+        products, pairs = self.of(source)
+        known = pairs >= _FEWEST
+        return np.where(known, products / np.sqrt(np.where(known, pairs, 1.0)), np.nan) / self.wider[source]
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Groups of successive frames, one after the other; see :class:`~.pairs.FrameBlocks`."""
+
+    frames: NDArray[np.unsignedinteger[Any]]
+    first: IntArray
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return GROUP * self.first.size
+
+    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+        """Yield about so many frames at a time, whole groups."""
+        some = max(size // GROUP, 1)
+        for begin in range(0, self.first.size, some):
+            yield self.frames[(self.first[begin : begin + some, None] + np.arange(GROUP)).ravel()]
+
+
+@dataclass(frozen=True)
+class FollowingSamples:
+    """Frames as residuals and as the charge that these do not hold, each in its standard deviation.
+
+    Attributes:
+        samples: groups of successive frames.
+        inside: pixels whose residuals count, (y, x).
+        mixed: correlation of charge and residual of a sample, (y, x).
+        scale: of what the residual leaves of the charge, 0 where too little, (y, x).
+    """
+
+    samples: Samples
+    inside: BoolArray
+    mixed: Float32Array
+    scale: Float32Array
+
+    @classmethod
+    def of(
+        cls,
+        frames: NDArray[np.unsignedinteger[Any]],
+        edges: IntArray,
+        laws: PixelLaws,
+        maps: PixelMaps,
+        inside: BoolArray | None = None,
+        most: int | None = None,
+    ) -> FollowingSamples | None:
+        """Prepare frames; None where they are too few.
+
+        Args:
+            frames: codes (frame, y, x), DN.
+            edges: positions of the blocks, (b + 1,).
+            laws: of the pixels' samples.
+            maps: parameters of the pixels.
+            inside: pixels whose residuals count, (y, x); None: all.
+            most: samples that are looked at, in frames evenly spread; None: all.
+        """
+        first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
+        if not first.size:
+            return None
+        samples = replace(Samples.by_laws(_Groups(frames, first), laws, maps), most=_AT_ONCE)
+        inside = samples.usable if inside is None else samples.usable & inside
+        return cls(samples, inside, *_held_by_residual(laws, maps))
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of frames."""
+        return self.samples.n_frames // GROUP
+
+    def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
+        """Yield residuals and charge of some groups at a time, (frame, y, x), 0 where they do not count."""
+        for charge, residual in self.samples.chunks():
+            yield residual * self.inside, (charge - self.mixed * residual) * self.scale
+
+    def by_distance(self) -> Follows:
+        """Sum the products of residuals with the charge of other samples."""
+        ny, nx = self.inside.shape
+        size = fft.next_fast_len(2 * ny - 1, real=True), fft.next_fast_len(2 * nx - 1, real=True)
+        sums = np.zeros((STEPS, size[0], size[1] // 2 + 1), np.complex128)
+        scatter = np.zeros((2, len(SOURCES)))
+        for chunk in self.chunks():
+            scatter += [_scatter(u) for u in chunk]
+            one, two = (fft.rfftn(u, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[1:]) for u in chunk)
+            for step in range(STEPS):
+                sums[step] += np.einsum("gtyx,gtyx->yx", one[:, step:].conj(), two[:, : GROUP - step])
+        to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, self.scale > 0.0))
+        number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
+        products = _centred(sums, size, (ny, nx))
+        pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
+        products[0, ny - 1, nx - 1] = pairs[0, ny - 1, nx - 1] = 0.0
+        ratio = scatter / np.maximum(scatter[:, :1], 1e-300)
+        wider = np.sqrt(np.maximum(ratio.prod(axis=0), 1e-300))
+        return Follows(products, pairs, dict(zip(SOURCES, wider.tolist(), strict=True)))
+
+    def by_column(self, place: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of products with the sample at a place, and how many, by the residual's column.
+
+        Args:
+            place: frames, rows and columns from the residual to the charge.
+        """
+        step, (ny, nx) = -place[0], self.inside.shape
+        here, there = (
+            tuple(
+                slice(max(-sign * d, 0), n - max(sign * d, 0))
+                for d, n in zip(place[1:], (ny, nx), strict=True)
+            )
+            for sign in (1, -1)
+        )
+        products, pairs = np.zeros(nx), np.zeros(nx)
+        for one, two in self.chunks():
+            residual = one.reshape(-1, GROUP, ny, nx)[:, step:, *here]
+            charge = two.reshape(-1, GROUP, ny, nx)[:, : GROUP - step, *there]
+            products[here[1]] += np.einsum("gtyx,gtyx->x", residual, charge)
+        both = self.inside[here] & (self.scale > 0.0)[there]
+        pairs[here[1]] = both.sum(axis=0) * self.groups * (GROUP - step)
+        return products, pairs
+
+
+def _held_by_residual(laws: PixelLaws, maps: PixelMaps) -> tuple[Float32Array, Float32Array]:
+    """Return the correlation of charge and residual of a sample, and the scale of what it leaves, (y, x)."""
+    shape = maps.usable.shape
+    pixels = pixel_statistics(
+        laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), (shape[0], shape[1])
+    )
+    usable = pixels.usable
+    correlation = pixels.cross / np.sqrt(np.where(usable, pixels.charge * pixels.readout, 1.0))
+    left = 1.0 - correlation**2
+    resolved = usable & (left > _RESOLVED)
+    scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
+    return correlation.astype(np.float32), scale.astype(np.float32)
+
+
+def _scatter(u: Float32Array) -> FloatArray:
+    """Return the sums of squares of frames (t, y, x): of samples, row, column and frame sums."""
+    rows, columns = u.sum(axis=2, dtype=np.float64), u.sum(axis=1, dtype=np.float64)
+    return np.array(
+        [
+            float((u**2).sum(dtype=np.float64)),
+            *(float((s**2).sum()) for s in (rows, columns, rows.sum(axis=1))),
+        ]
+    )
+
+
+def _centred(
+    spectra: NDArray[np.complexfloating], size: tuple[int, int], shape: tuple[int, int]
+) -> FloatArray:
+    """Return the sums by distance, that of 0 in the middle, (n, 2 y - 1, 2 x - 1)."""
+    found = fft.irfftn(spectra, size, axes=(1, 2))
+    rows, columns = (np.arange(1 - n, n) for n in shape)
+    return np.asarray(found[:, rows[:, None], columns], np.float64)
+
+
+def follow_statistics(
+    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, laws: PixelLaws, maps: PixelMaps
+) -> dict[str, float]:
+    """Return the statistics of residuals that follow the charge of other samples, in space and in time.
+
+    Left out are the samples next to it in the same frame and its own one frame before, which have their own.
+    Arguments as of :meth:`FollowingSamples.of`.
+    """
+    prepared = FollowingSamples.of(frames, edges, laws, maps, most=_MOST_SAMPLES)
+    if prepared is None:
+        return {}
+    found = prepared.by_distance()
+    y, x = (size // 2 for size in found.products.shape[1:])
+    of_samples = found.z("sample")
+    of_samples[0, y, x - 1 : x + 2] = of_samples[0, y - 1 : y + 2, x] = of_samples[1, y, x] = np.nan
+    statistics = {}
+    for step, family in enumerate(("space", "time")):
+        of_lines = [found.z(source)[step].ravel() for source in SOURCES[1:]]
+        for name, values in (("sample", of_samples[step]), ("line", np.concatenate(of_lines))):
+            known = values[np.isfinite(values)]
+            if known.size:
+                statistics[f"{family}.follows.{name}"] = laws_of.largest_normal(known)
+    return statistics

@@ -1,0 +1,170 @@
+"""What is measured and not understood: samples that follow the charge of others, here, there or before.
+
+Whatever hands signal from one sample to another without noise of its own is, to first order, a linear
+response (Volterra 1930; Priestley 1981, transfer functions): so much of the charge of the sample at this
+distance, of each other sample of the row, of the frame before. Nothing is said about why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from pchem_pipeline.effects.framework.context import EffectContext
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.region import Span
+    from pchem_pipeline.model.law.sample_law import SampleLaw
+
+#: What a sample follows: another one, or each other one of a row, a column or a frame.
+Source = Literal["sample", "row", "column", "frame"]
+_ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
+_ALL_ROWS = 1 << 20
+_FEW = 4  # terms that are told in words
+
+
+class ResponseTerm(Section):
+    """A sample, or a row, column or frame of samples, that others follow."""
+
+    of: Source = Field(default="sample", description="what is followed: a sample, or a row, column, frame")
+    place: tuple[int, int, int] = Field(
+        default=(0, 0, 0),
+        description="where it is from the sample that follows: frames, rows, columns (before it: negative)",
+    )
+    weight: float = Field(default=1.0, ge=-1, le=1, description="relative response, no unit")
+    number: int = Field(
+        default=1, ge=1, description="how many samples a row, column or frame has, for the law of the pixels"
+    )
+    columns: tuple[int, int] | None = Field(
+        default=None, description="first column of those that follow, and the one behind; null: all"
+    )
+
+    @model_validator(mode="after")
+    def _of_the_past(self) -> Self:
+        if self.place[0] > 0 or any(self.place[axis] for axis in _ALONG[self.of]):
+            raise ValueError("place: of this frame or before it; 0 along what is followed as a whole")
+        if self.of == "sample" and not any(self.place):
+            raise ValueError("place: a sample does not follow itself")
+        return self
+
+    def words(self, response: float) -> str:
+        """Return in words what follows with a response."""
+        if self.of == "sample":
+            what = neighbour_words(self.place)
+        else:
+            where = neighbour_words(self.place).removeprefix("the sample ").strip()
+            what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
+            what += f" {where}" if any(self.place) else ""
+        only = f" (in columns {self.columns[0]} to {self.columns[1] - 1})" if self.columns else ""
+        return f"{100.0 * response:+.2g} % of {what}{only}"
+
+    def seen(self, charge: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the charge that each sample follows (frame, y, x), e-, of charges about their means."""
+        axes = _ALONG[self.of]
+        sums = np.broadcast_to(charge.sum(axis=axes, keepdims=True), charge.shape) if axes else charge
+        if not any(self.place):
+            return np.asarray(sums - charge)
+        found, known = neighbours(np.ascontiguousarray(sums), self.place)
+        return np.where(known, found, 0.0)
+
+
+@register_effect
+class EmpiricalResponse(Effect):
+    """Samples that follow the charge of others by parts that are measured.
+
+    Signature: none of its own; it is measured where the data disagree with all that is known, and describes
+    which samples follow which without a name for what makes them so.
+    """
+
+    tag: Literal["empirical_response"] = Field(default="empirical_response", description="name of the effect")
+    plane: ClassVar[Plane] = Plane.ANALOG
+    title: ClassVar[str] = "Measured response to the charge of other samples, without an explanation"
+    source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
+    strength: ClassVar[str] = "response"
+    measured_only: ClassVar[bool] = True
+    far_reaching: ClassVar[bool] = True
+    response: float = Field(
+        ge=0,
+        le=1,
+        description="part of the charge of another sample that a sample gets, for weight 1, no unit",
+    )
+    terms: tuple[ResponseTerm, ...] = Field(
+        min_length=1,
+        max_length=32,
+        description="what samples follow: `of` (sample, row, column, frame), `place`, relative `weight`",
+    )
+
+    def halo(self) -> int:
+        """Return how far across rows samples follow others, px."""
+        return max(_ALL_ROWS if 1 in _ALONG[term.of] else abs(term.place[1]) for term in self.terms)
+
+    def history(self) -> int:
+        """Return how many frames before it matter."""
+        return max(-term.place[0] for term in self.terms)
+
+    @property
+    def unlisted(self) -> bool:
+        """Whether samples follow others than their neighbours and their own one frame before."""
+        return any(term.of != "sample" or sum(map(abs, term.place)) > 1 for term in self.terms)
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the signal (frame, y, x), e-, with parts of the charge of other samples about its mean."""
+        charge = np.asarray(context.charge, np.float64) - context.truth["quanta_exposure"]
+        found = np.array(values, np.float64)
+        for term in self.terms:
+            columns = slice(*term.columns) if term.columns else slice(None)
+            found[..., columns] += self.response * term.weight * term.seen(charge)[..., columns]
+        return found
+
+    @classmethod
+    def typical(cls) -> Sequence[Self]:
+        """Return a sample that follows the one read four before it."""
+        return (cls(response=0.01, terms=(ResponseTerm(place=(0, 0, -4)),)),)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return none: it is measured where all else has failed, and competes with nothing."""
+        return ()
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with the columns of its terms counted from the first one of a window."""
+        return self._moved(-columns[0], columns[1] - columns[0])
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with the columns of its terms counted on the sensor."""
+        return self._moved(columns[0], shape[1])
+
+    def _moved(self, by: int, end: int) -> Self:
+        def moved(term: ResponseTerm) -> ResponseTerm:
+            if term.columns is None:
+                return term
+            first, last = (min(max(edge + by, 0), end) for edge in term.columns)
+            return term.model_copy(update={"columns": (first, last)})
+
+        return self.model_copy(update={"terms": tuple(moved(term) for term in self.terms)})
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law with the variance of what samples follow, of electrons as many as the pixel's own.
+
+        Terms of some columns only are left out: the pixels of the others have none of it.
+        """
+        power = sum(term.number * term.weight**2 for term in self.terms if term.columns is None)
+        return model.with_variance(e2=self.response**2 * power * np.nan_to_num(maps.quanta_exposure))
+
+    def words(self) -> str:
+        """Return what is known of it."""
+        place = f" in {place_words(self)}" if place_words(self) else ""
+        order = sorted(self.terms, key=lambda term: -abs(term.weight))
+        told = [term.words(self.response * term.weight) for term in order[:_FEW]]
+        more = f", and {len(order) - _FEW} more" if len(order) > _FEW else ""
+        return f"samples{place} that follow the charge of others (by {', '.join(told)}{more})"

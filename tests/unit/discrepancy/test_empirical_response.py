@@ -1,0 +1,228 @@
+"""Which samples follow which is measured in frames made by plain numpy, and simulated as it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
+from pchem_pipeline.discrepancy.by_simulation.empirical_response import measured_response, residual_responses
+from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.size import size_of
+from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+from pchem_pipeline.simulate.truth import TruthMaps
+
+SHAPE, FRAMES, STEP, NOISE = (14, 18), 1200, 14.0, 0.25
+EVERYWHERE = np.ones(SHAPE, bool)
+EXPOSURE = np.exp(np.random.default_rng(20).normal(0.6, 0.25, SHAPE))
+Response = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def alone(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals as they are."""
+    return v
+
+
+def distant(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals with 2 % of the one five columns before."""
+    found = v.copy()
+    found[:, :, 5:] += 0.02 * v[:, :, :-5]
+    return found
+
+
+def drooping(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals less 10 % of the mean of their row."""
+    return np.asarray(v - 0.1 * v.mean(axis=2, keepdims=True))
+
+
+def earlier(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals with 2 % of the one of the frame before, a row below."""
+    found = v.copy()
+    found[1:, :-1] += 0.02 * v[:-1, 1:]
+    return found
+
+
+def settling(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals whose first and second in a row have 10 and 5 % of the last of the row above."""
+    found = v.copy()
+    for column, part in enumerate((0.1, 0.05)):
+        found[:, 1:, column] += part * v[:, :-1, -1]
+    return found
+
+
+def noisy(v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return signals with noise of their row and of their frame."""
+    rows, frames = ((FRAMES, size, 1) for size in (SHAPE[0], 1))
+    return np.asarray(v + 0.1 * rng.standard_normal(rows) + 0.05 * rng.standard_normal(frames))
+
+
+def drawn(response: Response, seed: int, noise: float = NOISE) -> np.ndarray:
+    """Return frames whose signals follow others."""
+    rng = np.random.default_rng(seed)
+    signal = response(rng.poisson(EXPOSURE, (FRAMES, *SHAPE)).astype(float), rng)
+    signal += noise * rng.standard_normal(signal.shape)
+    return np.floor(100.0 + STEP * signal + 0.5).astype(np.uint16)
+
+
+def measured(frames: np.ndarray) -> Measurement | None:
+    """Return what is measured of frames beside no effect."""
+    numbers = np.arange(len(frames))
+    evidence = observe(frames, numbers, n_run=len(frames), block_frames=100)
+    data = residual_responses(frames, numbers, evidence.maps, EVERYWHERE)
+    return measured_response(data, None, evidence, EVERYWHERE)
+
+
+@pytest.mark.parametrize(
+    ("response", "source", "place", "part"),
+    [
+        (distant, "sample", (0, 0, -5), 0.02),
+        (drooping, "row", (0, 0, 0), -0.1 / SHAPE[1]),
+        (earlier, "sample", (-1, 1, 0), 0.02),
+    ],
+)
+@pytest.mark.parametrize("noise", [0.2, 0.35])
+def test_what_samples_follow_is_told_with_its_part(
+    response: Response, source: str, place: tuple[int, int, int], part: float, noise: float
+) -> None:
+    found = measured(drawn(response, 2, noise))
+    assert found is not None
+    assert isinstance(found.effect, EmpiricalResponse)
+    (term,) = found.effect.terms
+    assert (term.of, term.place, term.columns) == (source, place, None)
+    # to first order; refits make it exact
+    assert found.effect.response * term.weight == pytest.approx(part, rel=0.3)
+    assert found.unlisted
+
+
+def test_what_only_some_columns_follow_is_told_with_these() -> None:
+    found = measured(drawn(settling, 3))
+    assert found is not None
+    assert isinstance(found.effect, EmpiricalResponse)
+    first, second = found.effect.terms
+    last = SHAPE[1] - 1
+    # at the first distance the sensor has one pair of columns only
+    assert (first.place, first.columns) == ((0, -1, last), None)
+    assert (second.place, second.columns) == ((0, -1, last - 1), (1, 2))
+    assert second.weight == pytest.approx(0.5, rel=0.2)
+
+
+@pytest.mark.parametrize("response", [alone, noisy])
+def test_samples_that_follow_none_need_nothing(response: Response) -> None:
+    assert measured(drawn(response, 4)) is None
+
+
+def test_what_a_model_makes_is_not_measured_again() -> None:
+    numbers = np.arange(FRAMES)
+    first, second = (drawn(distant, seed) for seed in (5, 6))
+    evidence = [observe(f, numbers, n_run=FRAMES, block_frames=100) for f in (first, second)]
+    data, model = (
+        residual_responses(frames, numbers, each.maps, EVERYWHERE)
+        for frames, each in zip((first, second), evidence, strict=True)
+    )
+    assert measured_response(data, None, evidence[0], EVERYWHERE) is not None
+    assert measured_response(data, model, evidence[0], EVERYWHERE) is None
+
+
+def test_sums_by_distance_are_those_of_all_pairs() -> None:
+    frames = drawn(distant, 7)[:24, :5, :6]
+    evidence = observe(drawn(distant, 7)[:, :5, :6], np.arange(FRAMES), n_run=FRAMES, block_frames=100)
+    laws, edges = laws_of_frames(frames, evidence.maps), np.array([0, 24])
+    inside = np.ones((5, 6), bool)
+    inside[1, 2] = False
+    prepared = FollowingSamples.of(frames, edges, laws, evidence.maps, inside)
+    assert prepared is not None
+    found = prepared.by_distance()
+    residual, charge = (np.concatenate(parts).astype(float) for parts in zip(*prepared.chunks(), strict=True))
+    groups = [u.reshape(-1, 4, 5, 6) for u in (residual, charge)]
+    for step, dy, dx in ((0, 0, 1), (0, -2, 3), (1, 0, 0), (1, 4, -5), (1, -1, 2)):
+        total, number = np.zeros(6), np.zeros(6)
+        for y, x in np.ndindex(5, 6):
+            if 0 <= y + dy < 5 and 0 <= x + dx < 6 and inside[y, x]:
+                pairs = groups[0][:, step:, y, x] * groups[1][:, : 4 - step, y + dy, x + dx]
+                total[x] += pairs.sum()
+                number[x] += pairs.size
+        assert found.products[step, dy + 4, dx + 5] == pytest.approx(total.sum(), abs=1e-3)
+        assert found.pairs[step, dy + 4, dx + 5] == number.sum()
+        products, many = prepared.by_column((-step, dy, dx))
+        np.testing.assert_allclose(products, total, atol=1e-3)
+        np.testing.assert_array_equal(many, number)
+    assert found.pairs[0, 4, 5] == 0.0  # no sample follows itself
+    for source in SOURCES:
+        assert found.of(source)[0].sum() == pytest.approx(found.products.sum())
+
+
+def simulated(*terms: ResponseTerm, response: float, region: Any = None) -> np.ndarray:
+    """Return signals of a sensor of next to no read noise under the effect, e-."""
+    values = (2.0, 1 / STEP, 100.0, 1e-6)
+    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    effect = EmpiricalResponse(response=response, terms=terms, region=region)
+    how = SimulateSettings(shape=SHAPE, n_frames=400, seed=5, bit_depth=14, effects=(effect,))
+    return (simulate_block(truth, how, (0, 400))[0] - 100.0) / STEP
+
+
+@pytest.mark.parametrize(
+    ("term", "power"),
+    [
+        (ResponseTerm(place=(0, 0, -3)), 1),
+        (ResponseTerm(place=(-2, 1, 0), weight=-1.0), 1),
+        (ResponseTerm(of="row", number=SHAPE[1]), SHAPE[1] - 1),
+        (ResponseTerm(of="column", place=(0, 0, 1), number=SHAPE[0]), SHAPE[0]),
+        (ResponseTerm(of="frame", place=(-1, 0, 0), number=SHAPE[0] * SHAPE[1]), SHAPE[0] * SHAPE[1]),
+    ],
+)
+def test_simulated_samples_follow_what_is_told(term: ResponseTerm, power: int) -> None:
+    plain, found = (simulated(term, response=part) for part in (0.0, 0.02))
+    change = found - plain
+    charge = np.rint(plain) - 2.0
+    # where a frame, row and column before it exist
+    inner = np.s_[2:, 1:-1, 4:-1]
+    followed = term.seen(charge)[inner]
+    rounding = 2.0 / STEP / np.sqrt(12.0)
+    np.testing.assert_allclose(change[inner], 0.02 * term.weight * followed, atol=1.01 / STEP)
+    assert change[inner].std() == pytest.approx(
+        0.02 * np.sqrt(2.0 * power), abs=rounding + 0.1 * 0.02 * power**0.5
+    )
+
+
+def test_its_size_is_that_of_all_the_sensor() -> None:
+    maps = PixelMaps.known((np.full(SHAPE, v) for v in (2.1, 1 / STEP, 100.0, 4.0)), EVERYWHERE)
+    effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -SHAPE[1] + 1)),))
+    size = size_of(effect, maps, FRAMES)
+    assert size is not None
+    assert size.samples == pytest.approx(1 / SHAPE[1], rel=0.1)  # of the last column only
+    assert size.electrons == pytest.approx(0.1 * 2.1**0.5, rel=0.1)
+
+
+def test_it_is_no_candidate_and_says_what_follows() -> None:
+    assert "empirical_response" not in candidate_classes(DiscrepancySettings())
+    terms = ResponseTerm(place=(0, 0, -16)), ResponseTerm(of="row", weight=-0.5, number=32)
+    assert EmpiricalResponse(response=0.004, terms=terms).words() == (
+        "samples that follow the charge of others (by +0.4 % of the sample 16 columns to the left, "
+        "-0.2 % of each other sample of the row)"
+    )
+    near = EmpiricalResponse(response=0.004, terms=(ResponseTerm(place=(0, 0, -1)),))
+    assert not near.unlisted
+
+
+def test_columns_of_a_window_are_told_on_the_sensor() -> None:
+    effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, 3), columns=(2, 5)),))
+    there = effect.found_in((0, 8), (10, 20), (32, 32))
+    assert there.terms[0].columns == (12, 15)
+    assert there.seen_in((0, 8), (10, 20), (32, 32)) == effect
+
+
+@pytest.mark.parametrize("how", [{}, {"place": (1, 0, 0)}, {"of": "row", "place": (0, 0, 2)}])
+def test_a_sample_follows_neither_itself_nor_the_future(how: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="place"):
+        ResponseTerm(**how)
