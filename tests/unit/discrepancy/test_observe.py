@@ -318,7 +318,8 @@ def test_a_line_of_pixels_has_no_neighbours_across(shape: tuple[int, int]) -> No
     across, along = ("row", "x") if shape[0] == 1 else ("column", "y")
     assert not [name for name in z if name.startswith(f"space.{across}.")]
     assert {name.split(".")[1] for name in z if len(name.split(".")) == 3 and name.startswith("space.")} == {
-        along
+        along,
+        "follows",
     }
     assert np.isfinite(list(z.values())).all()
 
