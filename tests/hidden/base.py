@@ -19,6 +19,7 @@ class Hidden:
         scaling: powers of 64 / rows, 64 / columns and 4000 / frames with which s95 goes.
         most: largest strength that makes sense.
         warmup: frames to run before the first one is kept.
+        order: of what has the same hook: what stands later along the chain comes later.
     """
 
     tag: ClassVar[str] = ""
@@ -26,6 +27,7 @@ class Hidden:
     scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
     most: ClassVar[float] = np.inf
     warmup: ClassVar[int] = 0
+    order: ClassVar[int] = 0
 
     def __init__(self, rng: np.random.Generator, sensor: Sensor, level: float):
         """Draw the sub-parameters of the effect for a sensor."""

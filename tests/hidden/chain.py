@@ -89,7 +89,9 @@ def hide(
     streams = np.random.SeedSequence(seed).spawn(3)
     sensor = draw_sensor(np.random.default_rng(streams[0]), shape, n_frames)
     # each effect has the same numbers whatever it is hidden with
-    effects = tuple(ALL[tag](np.random.default_rng([seed, *tag.encode()]), sensor, level) for tag in tags)
+    hidden = (ALL[tag](np.random.default_rng([seed, *tag.encode()]), sensor, level) for tag in tags)
+    # lines that are repeated are codes, and not converted again
+    effects = tuple(sorted(hidden, key=lambda effect: effect.order))
     light, dark = (np.random.default_rng(stream) for stream in streams[1:])
     frames = np.zeros((n_frames, *shape), np.uint16)
     for t in range(-max([e.warmup for e in effects], default=0), n_frames):

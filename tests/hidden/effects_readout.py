@@ -126,6 +126,7 @@ class AdcDnl(Hidden):
     """
 
     tag: ClassVar[str] = "adc_dnl"
+    order: ClassVar[int] = 2
     s95: ClassVar[float] = 0.0015
     most: ClassVar[float] = 0.9
 
@@ -162,6 +163,7 @@ class AdcInl(Hidden):
     """The converter's curve bends smoothly; strength: amplitude, LSB."""
 
     tag: ClassVar[str] = "adc_inl"
+    order: ClassVar[int] = 2
     s95: ClassVar[float] = 0.016
 
     def draw(self):
@@ -235,6 +237,7 @@ class PixelCorrection(Hidden):
     """
 
     tag: ClassVar[str] = "pixel_correction"
+    order: ClassVar[int] = 5
     s95: ClassVar[float] = 0.05
     most: ClassVar[float] = 1.0
 
@@ -257,6 +260,7 @@ class BitErrors(Hidden):
     """A bit of the converter reads 0, or its opposite, in some of the samples; strength: their share."""
 
     tag: ClassVar[str] = "bit_errors"
+    order: ClassVar[int] = 4
     s95: ClassVar[float] = 1e-3
     most: ClassVar[float] = 1.0
 
@@ -275,6 +279,7 @@ class BinaryOffset(Hidden):
     """An offset that follows one bit of the sample read before in the row; strength: DN."""
 
     tag: ClassVar[str] = "binary_offset"
+    order: ClassVar[int] = 3
     s95: ClassVar[float] = 0.1
     scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
 
@@ -286,7 +291,8 @@ class BinaryOffset(Hidden):
         found = code.copy()
         for x in range(1, code.shape[1]):
             one = found[:, x - 1] // 2**self.bit % 2 == 1
-            found[:, x] = np.floor(dn[:, x] + self.side * self.strength * np.where(one, 0.5, -0.5) + 0.5)
+            moved = dn[:, x] + self.side * self.strength * np.where(one, 0.5, -0.5)
+            found[:, x] += (np.floor(moved + 0.5) - np.floor(dn[:, x] + 0.5)).astype(code.dtype)
         return found
 
 
@@ -294,6 +300,7 @@ class RepeatedLines(Hidden):
     """Rows or columns that repeat the one before; strength: share of them."""
 
     tag: ClassVar[str] = "repeated_lines"
+    order: ClassVar[int] = 6
     s95: ClassVar[float] = 1e-4
     scaling: ClassVar[tuple[float, float, float]] = (1.0, 0.0, 1.0)
     most: ClassVar[float] = 0.2
@@ -313,6 +320,7 @@ class MisplacedLines(Hidden):
     """Rows or columns that hold the samples of other pixels; strength: share of them, or of the frames."""
 
     tag: ClassVar[str] = "misplaced_lines"
+    order: ClassVar[int] = 6
     s95: ClassVar[float] = 5e-3
     most: ClassVar[float] = 0.3
 
@@ -349,6 +357,7 @@ class GainStitch(Hidden):
     """
 
     tag: ClassVar[str] = "gain_stitch"
+    order: ClassVar[int] = 2
     s95: ClassVar[float] = 3e-3
     most: ClassVar[float] = 0.4
 
@@ -372,6 +381,7 @@ class BlackClamp(Hidden):
     """
 
     tag: ClassVar[str] = "black_clamp"
+    order: ClassVar[int] = 1
     s95: ClassVar[float] = 0.018
     scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.5)
     most: ClassVar[float] = 1.0

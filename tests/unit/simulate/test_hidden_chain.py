@@ -421,6 +421,19 @@ def test_the_sensor_does_not_depend_on_what_is_hidden():
         hide(("ghost",), 4.0, 1)
 
 
+@pytest.mark.parametrize("other", ["adc_dnl", "binary_offset", "bit_errors"])
+def test_lines_are_repeated_as_they_were_converted_in_whatever_order_they_are_hidden(other):
+    seen = []
+    for tags in (("repeated_lines", other), (other, "repeated_lines")):
+        hiding = hide(tags, 400.0, SEED, SHAPE, 100)
+        axis = 1 if hiding.effects[-1].parameters["lines"] == "rows" else 2
+        frames = np.moveaxis(hiding.frames, axis, 1)
+        seen.append((frames[:, 1:] == frames[:, :-1]).all(axis=2).mean())
+        share = hiding.effects[-1].strength
+        assert seen[-1] == pytest.approx(share, abs=5 * np.sqrt(share / (100 * 19)))
+    assert seen[0] == seen[1]
+
+
 def test_a_process_of_its_own_writes_the_stack_and_seals_the_key_elsewhere(tmp_path):
     out = tmp_path / "stack"
     small = ["--shape", "6", "5", "--frames", "30", "--seed", "3"]
