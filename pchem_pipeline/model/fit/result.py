@@ -105,6 +105,11 @@ class FitResult(PixelParameters):
         more = self.bias.size - len(rows)
         return html_table(head, rows) + (f"<p>and {more:,} more</p>" if more else "")
 
+    def of(self, pixels: NDArray[np.intp]) -> FitResult:
+        """Return the fit of some pixels."""
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{name: None if a is None else a[pixels] for name, a in arrays.items()})
+
     def with_pixels(self, pixels: NDArray[np.intp], part: FitResult) -> FitResult:
         """Return a copy with the fit of some pixels in their places."""
         arrays: dict[str, Any] = {}

@@ -16,6 +16,7 @@ from pchem_pipeline.discrepancy.by_simulation.replicate import (
     truth_of,
 )
 from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect, Plane
@@ -206,3 +207,22 @@ def test_exposure_that_an_effect_adds_to_a_spot_is_not_simulated_twice():
     assert abs(after.mean()) < 4.0 * error
     assert before.mean() > 8.0 * error
     assert after.std() < 0.5 * before.mean()
+
+
+def test_a_bias_that_the_plain_fit_has_off_by_an_electron_is_found_under_the_right_law():
+    """Noise with a long tail to low DN has a peak more to the plain law: bias and exposure are off by one."""
+    camera = PlainCamera(0.32, 2.5, 14.0, (8, 8), 900, SPREAD)
+    rng, share = np.random.default_rng(6), 0.94
+    exposure, step, bias, noise = camera.maps(rng)
+    shape = (900, 8, 8)
+    late = rng.standard_exponential(shape) - 1
+    skewed = np.sqrt(1 - share**2) * rng.standard_normal(shape) - share * late
+    frames = np.rint(bias + step * (rng.poisson(exposure, shape) + noise * skewed)).astype(np.uint16)
+    seen = observe(frames, np.arange(900), n_run=900, block_frames=50)
+    fit = refit_maps(frames, seen.maps, [NoiseSkew(share=-share)], seen.covariance)
+
+    def off(maps):
+        return np.abs(maps.quanta_exposure - exposure)[maps.usable] > 0.5
+
+    assert np.mean(off(seen.maps)) > 0.2
+    assert np.mean(off(fit.maps)) < 0.03
