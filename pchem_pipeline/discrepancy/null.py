@@ -111,7 +111,7 @@ class NullModel:
     @property
     def events(self) -> FloatArray:
         """By how much an event raises each exact count; 0 for all other statistics, shape (m,)."""
-        return np.array([EXACT.get(name, 0.0) for name in self.names])
+        return np.array([EXACT.get(name.partition("@")[0], 0.0) for name in self.names])
 
     @property
     def freedom(self) -> float:

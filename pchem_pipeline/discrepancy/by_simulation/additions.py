@@ -139,7 +139,7 @@ class AddedRounds:
         agrees, with every effect in it, is not judged a second time by fewer statistics.
         """
         added, parts = this.added.hypotheses[member], this.added.parts
-        allowed = tolerance(parts, self.allowed)
+        allowed = tolerance(parts, self.allowed, this.null.events)
         wrong = still and misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
         return added.effect.stuck_words() or ("it does not account for what it moves itself" if wrong else "")
 
@@ -254,7 +254,8 @@ def left_of(rounds: Sequence[Round], last: NullModel, z: Measured, allowed: floa
         z: statistics of the data.
         allowed: see :class:`AddedRounds`.
     """
-    of_effects = tolerance(np.concatenate([this.added.parts for this in rounds]), allowed)
+    parts = np.concatenate([this.added.parts for this in rounds])
+    of_effects = tolerance(parts, allowed, last.events)
     chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
     return np.asarray((z.both - last.mean) / np.hypot(chance, of_effects))
 

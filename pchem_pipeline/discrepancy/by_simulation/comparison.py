@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Contender,
     Hypothesis,
     fit_set,
+    seen_among,
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
@@ -356,6 +357,8 @@ def _begun(members: Sequence[Hypothesis], tried: Sequence[Refitted]) -> tuple[Hy
 def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
     """Tell whether each effect of a set has a signature of its own beside the best fit of the others.
 
+    Or, of a set that leaves nothing, whether it is seen beside them.
+
     Args:
         refitter: fits sets.
         one: the set.
@@ -366,7 +369,8 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         return len(one.hypotheses) == 1
     # without an effect its own scatter is not there: events of which three are seen scatter by half of that
     noise = refitter.scatter(refitter.null.covariance, len(one.vectors))
-    if not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
+    complete = leaves_nothing(refitter, one)
+    if not complete and not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
     for place, hypothesis in enumerate(one.hypotheses):
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
@@ -382,9 +386,21 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
             known.append(others)
         part = one.hypotheses[place].fingerprint
         noise = refitter.scatter(others.covariance, len(others.vectors))
-        if not own_signature(part, others.parts, others.rest, noise):
+        seen = own_signature(part, others.parts, others.rest, noise)
+        if not seen and not (complete and _seen_beside(refitter, part, others)):
             return False
     return True
+
+
+def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool:
+    """Tell whether others leave a statistic that an effect moves, by more than their details may be wrong.
+
+    Where a set leaves nothing at all, its effects may move the same statistics: those that merely mimic
+    something else mend each other, and do not do so everywhere.
+    """
+    noise = replace(refitter.noise(others.covariance, len(others.vectors)), model_error=_LOOSE)
+    shift = refitter.target - others.mean + others.parts.sum(axis=0)
+    return seen_among(part, others.parts, shift, noise)
 
 
 def _of_kinds(one: Refitted, members: Sequence[Hypothesis]) -> bool:

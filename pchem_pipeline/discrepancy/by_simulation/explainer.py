@@ -450,7 +450,7 @@ class FrameExplainer:
         if not self.rounds:
             return 0.0
         parts = np.concatenate([this.added.parts for this in self.rounds])
-        return tolerance(parts, self._allowed)
+        return tolerance(parts, self._allowed, self.first.events)
 
     @property
     def _allowed(self) -> float:

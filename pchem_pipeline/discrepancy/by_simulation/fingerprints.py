@@ -90,7 +90,8 @@ class Noise:
     def of(self, prediction: FloatArray) -> FloatArray:
         """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
         counts = self.events * np.abs(prediction.sum(axis=0))
-        return self.covariance + np.diag(tolerance(prediction, self.model_error) ** 2 + counts)
+        allowed = tolerance(prediction, self.model_error, self.events)
+        return self.covariance + np.diag(allowed**2 + counts)
 
 
 @dataclass(frozen=True)
@@ -162,18 +163,20 @@ def correction(
     return np.clip(asked(residual), -_LARGEST_DECREASE, _LARGEST_INCREASE), stderr
 
 
-def tolerance(parts: FloatArray, model_error: float) -> FloatArray:
+def tolerance(parts: FloatArray, model_error: float, events: FloatArray | float) -> FloatArray:
     """Return the deviations that are not held against effects, shape (m,).
 
     A fraction of what they do to each statistic, and a tenth of that of the largest that they do to any: the
-    details of a very strong effect show where the effect itself does not.
+    details of a very strong effect show where the effect itself does not. An exact count has no details:
+    however many lines are repeated, the others are what they are.
 
     Args:
         parts: shifts of the statistics by effect, shape (e, m).
         model_error: the fraction.
+        events: see :class:`Noise`.
     """
     own = np.sum(parts**2, axis=0)
-    leaked = np.sum((_LEAK * np.max(np.abs(parts), axis=1)) ** 2)
+    leaked = np.sum((_LEAK * np.max(np.where(np.equal(events, 0.0), np.abs(parts), 0.0), axis=1)) ** 2)
     return np.asarray(model_error * np.sqrt(own + leaked))
 
 
@@ -448,7 +451,7 @@ def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: N
         shift: what is seen of all, shape (m,).
         noise: of the shift.
     """
-    blur = _BLUR * tolerance(others, noise.model_error)
+    blur = _BLUR * tolerance(others, noise.model_error, noise.events)
     scale = np.sqrt(np.diag(noise.covariance) + blur**2)
     left, own = (shift - others.sum(axis=0)) / scale, part / scale
     return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)))

@@ -373,6 +373,21 @@ def test_few_events_of_an_exact_count_are_a_signature_though_they_scatter(
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
+@pytest.mark.parametrize("rest", [0.0, 9.0])
+def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing(
+    monkeypatch: pytest.MonkeyPatch, rest: float
+) -> None:
+    # a clamp takes back what a common noise does to the means of frames: nothing of that is its own
+    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0 + np.eye(M)[1] * 20.0, 1.0))
+    monkeypatch.setitem(TRUTH, "frame_noise", (-np.eye(M)[1] * 20.0, 1.0))
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
+    left = rest * np.eye(M)[5]
+    world.z = Measured(world.z.train + left, world.z.test + left, world.z.final + left)
+    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
+    assert found is not None
+    assert found.chosen.tags == ({"row_noise"} if rest else {"row_noise", "frame_noise"})
+
+
 def add(
     world: World,
     monkeypatch: pytest.MonkeyPatch,

@@ -15,6 +15,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     choose,
     fit_set,
     score_set,
+    tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
@@ -201,6 +202,12 @@ def test_a_wrong_effect_scores_below_the_right_one_on_frames_that_it_did_not_see
         for tag, f in (("row_noise", right), ("frame_noise", wrong))
     ]
     assert scores[0] > scores[1] + 10
+
+
+def test_the_details_of_an_exact_count_show_nowhere_else() -> None:
+    parts = 3000.0 * np.eye(4)[:1]
+    assert tolerance(parts, 0.03, 10.0 * np.eye(4)[0])[1:].max() == 0.0
+    assert tolerance(parts, 0.03, 0.0)[1:] == pytest.approx(0.03 * 0.1 * 3000.0)
 
 
 # -- gap --------------------------------------------------------------------------------------------

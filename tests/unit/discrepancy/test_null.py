@@ -25,6 +25,12 @@ def counts(rng, n):
     return table[seen]
 
 
+def test_events_of_exact_counts_are_those_of_their_parts_too() -> None:
+    names = ("frame.repeated", "frame.repeated@rows=0:4", "shape.C2.mean")
+    null = NullModel.from_replicates(names, np.random.default_rng(1).normal(size=(12, 3)))
+    assert null.events.tolist() == [10.0, 10.0, 0.0]
+
+
 def drawn_p_values(draw, names, seed):
     """Draw p-values of the mean of two parts of clean data, and those by a symmetric tail."""
     rng, found, before = np.random.default_rng(seed), [], []
