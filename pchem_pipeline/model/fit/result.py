@@ -107,8 +107,8 @@ class FitResult(PixelParameters):
 
     def of(self, pixels: NDArray[np.intp]) -> FitResult:
         """Return the fit of some pixels."""
-        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
-        return replace(self, **{name: None if a is None else a[pixels] for name, a in arrays.items()})
+        arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{name: a[pixels] for name, a in arrays.items() if a is not None})
 
     def with_pixels(self, pixels: NDArray[np.intp], part: FitResult) -> FitResult:
         """Return a copy with the fit of some pixels in their places."""
